@@ -1,0 +1,86 @@
+"""The one table of channels: canonical name, unit, meaning and the range that a road vehicle can reach.
+
+Axes are those of ISO 8855 (x forward, y left, z up, counter-clockwise positive), units are SI, angles are radians.
+Channels whose name ends in ``_ref`` come from a reference sensor; estimators never see them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from vehest.data.errors import DataError
+
+REFERENCE_SUFFIX = "_ref"
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One quantity of a recording.
+
+    Args:
+        name: canonical name.
+        unit: SI unit, ``1`` where the quantity has none.
+        meaning: what is measured, with its sign convention.
+        low: smallest value that a road vehicle can produce [unit].
+        high: largest value that a road vehicle can produce [unit].
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    low: float
+    high: float
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether the channel comes from a reference sensor."""
+        return self.name.endswith(REFERENCE_SUFFIX)
+
+    @property
+    def is_angular(self) -> bool:
+        """Whether the unit is an angle or angular rate, which files often give in degrees."""
+        return self.unit in {"rad", "rad/s"} and not self.name.startswith(("wheel_speed", "motor_speed"))
+
+
+def _table() -> dict[str, Channel]:
+    corners = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}
+    rows = [
+        Channel("vx", "m/s", "measured forward velocity at the centre of gravity", -40.0, 140.0),
+        Channel("yaw_rate", "rad/s", "measured yaw rate, positive in a left turn", -8.0, 8.0),
+        Channel("ax", "m/s²", "measured longitudinal acceleration at the centre of gravity", -80.0, 80.0),
+        Channel("ay", "m/s²", "measured lateral acceleration at the centre of gravity, positive to the left", -80.0, 80.0),
+        Channel("steer", "rad", "mean road-wheel steering angle, positive to the left", -1.3, 1.3),
+        Channel("roll_rate", "rad/s", "measured roll rate", -8.0, 8.0),
+        Channel("pitch_rate", "rad/s", "measured pitch rate", -8.0, 8.0),
+        Channel("motor_speed", "rad/s", "speed of the drive motor, referred to the wheel", -3000.0, 3000.0),
+        Channel("motor_current", "A", "torque-producing motor current", -2000.0, 2000.0),
+    ]
+    for corner, place in corners.items():
+        rows.append(Channel(f"wheel_speed_{corner}", "rad/s", f"rotational speed of the {place} wheel", -500.0, 1000.0))
+    for axis, direction in {"x": "longitudinal", "y": "lateral", "z": "vertical"}.items():
+        for corner, place in corners.items():
+            rows.append(Channel(f"f{axis}_{corner}", "N", f"{direction} tyre force, {place}", -2e5, 2e5))
+    rows += [
+        Channel("vx_ref", "m/s", "reference forward velocity at the centre of gravity", -40.0, 140.0),
+        Channel("vy_ref", "m/s", "reference lateral velocity at the centre of gravity, positive to the left", -40.0, 40.0),
+        Channel("yaw_rate_ref", "rad/s", "reference yaw rate", -8.0, 8.0),
+        Channel("sideslip_ref", "rad", "reference sideslip angle, atan2(vy, vx)", -math.pi, math.pi),
+    ]
+    return {channel.name: channel for channel in rows}
+
+
+CHANNELS: dict[str, Channel] = _table()
+
+
+def channel(name: str) -> Channel:
+    """Look up a channel.
+
+    Raises:
+        DataError: the name is not in the table.
+    """
+    try:
+        return CHANNELS[name]
+    except KeyError:
+        known = ", ".join(sorted(CHANNELS))
+        raise DataError(f"channel '{name}' is not known to vehest; known channels: {known}") from None

@@ -1,0 +1,273 @@
+"""What may be wrong with a recording: each check looks for one thing and says where it found it.
+
+``checks_of_clock`` looks at the raw time stamps of a file, ``checks_of_recording`` at the samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import signal
+
+from vehest.data.channels import CHANNELS
+from vehest.data.recording import FloatArray, Recording
+
+Level = Literal["error", "warning", "note"]
+
+STUCK_SECONDS = 1.0
+SATURATED_FRACTION = 2e-3
+KINEMATIC_BAND_HZ = (0.1, 2.0)
+SIGN_CORRELATION = 0.3
+DEGREES_PER_RADIAN = 180.0 / np.pi
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check found.
+
+    Args:
+        level: ``error`` stops an ingest, ``warning`` needs a look, ``note`` is information.
+        check: name of the check.
+        channel: the channel concerned, empty if it is not about one.
+        message: what was found, where, and what to do.
+    """
+
+    level: Level
+    check: str
+    channel: str
+    message: str
+
+
+def checks_of_clock(time: FloatArray) -> list[Finding]:
+    """Look at raw time stamps: order, repeats, gaps and jitter.
+
+    Args:
+        time: time stamps [s], shape (T,).
+    """
+    findings: list[Finding] = []
+    steps = np.diff(time)
+    if len(steps) == 0:
+        return [Finding("error", "clock", "time", "fewer than two time stamps")]
+    if not np.isfinite(time).all():
+        row = int(np.flatnonzero(~np.isfinite(time))[0])
+        return [Finding("error", "clock", "time", f"time stamp of sample {row} is not a number")]
+    for what, bad in (("goes backwards", steps < 0), ("repeats", steps == 0)):
+        if bad.any():
+            where = np.flatnonzero(bad)
+            findings.append(
+                Finding(
+                    "error", "clock", "time", f"time {what} {len(where)} times, first at sample {where[0] + 1} ({time[where[0] + 1]:.6g} s)"
+                )
+            )
+    if findings:
+        return findings
+    interval = float(np.median(steps))
+    gaps = np.flatnonzero(steps > 1.5 * interval)
+    if len(gaps):
+        longest = gaps[np.argmax(steps[gaps])]
+        findings.append(
+            Finding(
+                "error",
+                "gap",
+                "time",
+                f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {time[longest]:.6g} s (interval {interval:.6g} s)",
+            )
+        )
+    jitter = float(np.abs(steps[steps <= 1.5 * interval] - interval).max() / interval)
+    if jitter > 0.01:
+        findings.append(
+            Finding("warning", "jitter", "time", f"intervals deviate by up to {100 * jitter:.2g} % from the median of {interval:.6g} s")
+        )
+    return findings
+
+
+def checks_of_recording(recording: Recording) -> list[Finding]:
+    """All checks of a recording's samples, the gravest findings first."""
+    findings = [finding for check in _CHECKS for finding in check(recording)]
+    order = {"error": 0, "warning": 1, "note": 2}
+    return sorted(findings, key=lambda finding: order[finding.level])
+
+
+def _impossible_values(recording: Recording) -> list[Finding]:
+    findings = []
+    for name, samples in recording.channels.items():
+        described = CHANNELS[name]
+        outside = np.flatnonzero((samples < described.low) | (samples > described.high))
+        if not len(outside):
+            continue
+        worst = outside[np.argmax(np.abs(samples[outside]))]
+        hint = "is the column in degrees? then say so in its unit" if described.is_angular else "check its unit and its column"
+        findings.append(
+            Finding(
+                "error",
+                "impossible",
+                name,
+                f"{len(outside)} samples beyond what a vehicle can do, {samples[worst]:.6g} {described.unit} at "
+                f"{recording.time[worst]:.6g} s (possible: {described.low:.4g} to {described.high:.4g}); {hint}",
+            )
+        )
+    return findings
+
+
+def _yaw_rate_unit(recording: Recording) -> list[Finding]:
+    """In steady driving ay ≈ vx·yaw_rate; a slope near π/180 or a negative one gives the unit or the sign away."""
+    if not {"vx", "yaw_rate", "ay"} <= set(recording.channels):
+        return []
+    expected = recording["vx"] * recording["yaw_rate"]
+    measured = recording["ay"]
+    known = np.isfinite(expected) & np.isfinite(measured)
+    expected, measured = expected[known] - expected[known].mean(), measured[known] - measured[known].mean()
+    scatter = expected.std() * measured.std()
+    if known.sum() < 100 or scatter == 0.0 or measured.std() < 0.2:
+        return []
+    correlation = float((expected * measured).mean() / scatter)
+    slope = float((expected * measured).sum() / (expected**2).sum())
+    if abs(correlation) < 0.7:
+        return []
+    ratio = abs(slope) * DEGREES_PER_RADIAN
+    if 0.4 < ratio < 2.5:
+        return [
+            Finding(
+                "error", "unit", "yaw_rate", f"ay is {slope:.3g} times vx·yaw_rate: yaw_rate is in degrees a second; set its unit to deg/s"
+            )
+        ]
+    if slope < 0:
+        return [
+            Finding(
+                "warning",
+                "sign",
+                "yaw_rate",
+                f"ay runs against vx·yaw_rate (slope {slope:.3g}, correlation {correlation:.2f}): the sign of ay or of yaw_rate is not ISO 8855's; "
+                f"set sign: -1 for it",
+            )
+        ]
+    if not 0.5 < slope < 2.0:
+        return [
+            Finding(
+                "warning", "unit", "ay", f"ay is {slope:.3g} times vx·yaw_rate, about 1 is expected: check the units of ay, vx and yaw_rate"
+            )
+        ]
+    return []
+
+
+def _kinematic_sign(recording: Recording) -> list[Finding]:
+    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
+    if not {"vx", "yaw_rate", "ay", "vy_ref"} <= set(recording.channels):
+        return []
+    names = ("vx", "yaw_rate", "ay", "vy_ref")
+    if any(np.isnan(recording[name]).any() for name in names) or recording.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
+        return []
+    band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=recording.rate_hz, output="sos")
+    if len(recording) < 10 * recording.rate_hz:
+        return []
+    predicted = signal.sosfiltfilt(band, recording["ay"] - recording["vx"] * recording["yaw_rate"])
+    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)
+    if predicted.std() == 0.0 or derived.std() < 1e-3:
+        return []
+    correlation = float(np.corrcoef(predicted, derived)[0, 1])
+    where = f"between {KINEMATIC_BAND_HZ[0]:g} and {KINEMATIC_BAND_HZ[1]:g} Hz"
+    if correlation < -SIGN_CORRELATION:
+        return [
+            Finding(
+                "warning",
+                "sign",
+                "vy_ref",
+                f"ay - vx·yaw_rate disagrees in sign with d(vy_ref)/dt (correlation {correlation:.2f} {where}): "
+                f"vy_ref, or ay and yaw_rate together, point the other way; set sign: -1",
+            )
+        ]
+    if correlation < SIGN_CORRELATION:
+        return [
+            Finding(
+                "warning",
+                "kinematics",
+                "vy_ref",
+                f"ay - vx·yaw_rate hardly follows d(vy_ref)/dt (correlation {correlation:.2f} {where}): check units, delays and where the sensors sit",
+            )
+        ]
+    residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording["vx"] * recording["yaw_rate"])
+    return [
+        Finding(
+            "note",
+            "kinematics",
+            "vy_ref",
+            f"d(vy_ref)/dt follows ay - vx·yaw_rate (correlation {correlation:.2f} {where}), mean bias {residual.mean():.3f} m/s²",
+        )
+    ]
+
+
+def _not_measured(recording: Recording) -> list[Finding]:
+    findings = []
+    for name in sorted(recording.gappy):
+        missing = int(np.isnan(recording[name]).sum())
+        if missing:
+            findings.append(Finding("note", "nan", name, f"{100 * missing / len(recording):.1f} % of the samples are 'not measured'"))
+    return findings
+
+
+def _stuck(recording: Recording) -> list[Finding]:
+    findings = []
+    shortest = max(int(STUCK_SECONDS * recording.rate_hz), 3)
+    for name, samples in recording.channels.items():
+        start, length = _longest_run(samples)
+        if length == len(samples) and length > 1:
+            findings.append(Finding("warning", "stuck", name, f"never changes: {samples[0]:.6g} {CHANNELS[name].unit} throughout"))
+        elif length >= shortest:
+            time = recording.start_time + start / recording.rate_hz
+            findings.append(
+                Finding(
+                    "warning",
+                    "stuck",
+                    name,
+                    f"stays at {samples[start]:.6g} {CHANNELS[name].unit} for {length / recording.rate_hz:.3g} s from {time:.6g} s",
+                )
+            )
+    return findings
+
+
+def _saturated(recording: Recording) -> list[Finding]:
+    findings = []
+    for name, samples in recording.channels.items():
+        known = samples[np.isfinite(samples)]
+        if len(known) < 100 or known.min() == known.max():
+            continue
+        for side, extreme in (("highest", known.max()), ("lowest", known.min())):
+            share = float((known == extreme).mean())
+            # a value that the channel rests at (0 at standstill) is not a saturated one
+            if share > SATURATED_FRACTION and abs(extreme) > 0.5 * np.abs(known).max() and _held_share(known) < 0.5:
+                findings.append(
+                    Finding(
+                        "warning",
+                        "saturated",
+                        name,
+                        f"{100 * share:.2g} % of the samples sit at the {side} value, {extreme:.6g} {CHANNELS[name].unit}",
+                    )
+                )
+    return findings
+
+
+def _held_share(samples: FloatArray) -> float:
+    """Share of samples equal to the one before: a slower sensor whose value is held."""
+    return float((np.diff(samples) == 0).mean())
+
+
+def _longest_run(samples: FloatArray) -> tuple[int, int]:
+    """Start and length of the longest run of equal values."""
+    changes = np.flatnonzero(samples[1:] != samples[:-1]) + 1
+    edges = np.concatenate([[0], changes, [len(samples)]])
+    lengths = np.diff(edges)
+    longest = int(np.argmax(lengths))
+    return int(edges[longest]), int(lengths[longest])
+
+
+_CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
+    _impossible_values,
+    _yaw_rate_unit,
+    _kinematic_sign,
+    _not_measured,
+    _stuck,
+    _saturated,
+)

@@ -1,0 +1,37 @@
+"""Errors that a user of vehest can act on; each message is one line that names what is wrong and what to do."""
+
+from __future__ import annotations
+
+
+class VehestError(Exception):
+    """Base of all errors caused by input or environment rather than by a defect of vehest.
+
+    Attributes:
+        exit_code: status that the command line leaves with (documented in docs/cli.md).
+    """
+
+    exit_code = 1
+
+
+class ConfigurationError(VehestError):
+    """An option, override or choice that does not exist, or whose value makes no sense."""
+
+    exit_code = 2
+
+
+class DataError(VehestError):
+    """A file, recording or channel that cannot be used as it is."""
+
+    exit_code = 3
+
+
+class MissingError(VehestError):
+    """Something that should be there is not: a data root, an artefact, an optional package."""
+
+    exit_code = 4
+
+
+class JobsFailedError(VehestError):
+    """Some jobs of a sweep failed; the others were finished and kept."""
+
+    exit_code = 5

@@ -1,0 +1,166 @@
+"""What a recording is: one uninterrupted drive, uniformly sampled, in SI units and ISO 8855 axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.data.channels import CHANNELS, channel
+from vehest.data.errors import DataError
+
+Kind = Literal["real", "simulated"]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """One uninterrupted drive; immutable.
+
+    Sample k was taken at ``start_time + k / rate_hz``.
+
+    Args:
+        id: name, unique within its data set.
+        vehicle: name of the vehicle that was driven.
+        rate_hz: sampling rate [Hz].
+        start_time: time of the first sample [s].
+        channels: canonical name -> samples, float64 of shape (T,), SI units.
+        kind: ``real`` or ``simulated``.
+        gappy: channels in which NaN means "not measured"; everywhere else NaN is an error.
+        provenance: where the samples come from (JSON values only); not part of the data.
+
+    Raises:
+        DataError: no samples, unknown channel, unequal lengths, or values that are not finite.
+    """
+
+    id: str
+    vehicle: str
+    rate_hz: float
+    start_time: float
+    channels: Mapping[str, FloatArray]
+    kind: Kind = "real"
+    gappy: frozenset[str] = frozenset()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise DataError(f"recording '{self.id}': the sampling rate must be positive, not {self.rate_hz}")
+        if not self.channels:
+            raise DataError(f"recording '{self.id}' has no channels")
+        frozen: dict[str, FloatArray] = {}
+        for name, samples in self.channels.items():
+            channel(name)
+            array = np.array(samples, dtype=np.float64, copy=True)
+            if array.ndim != 1:
+                raise DataError(f"recording '{self.id}': channel '{name}' must be one-dimensional, not of shape {array.shape}")
+            array.flags.writeable = False
+            frozen[name] = array
+        lengths = {name: len(samples) for name, samples in frozen.items()}
+        if len(set(lengths.values())) != 1:
+            raise DataError(f"recording '{self.id}': channels differ in length: {lengths}")
+        if next(iter(lengths.values())) == 0:
+            raise DataError(f"recording '{self.id}' holds no samples")
+        object.__setattr__(self, "channels", frozen)
+        object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
+        for name, samples in frozen.items():
+            self._require_finite(name, samples)
+
+    def _require_finite(self, name: str, samples: FloatArray) -> None:
+        bad = np.isinf(samples) if name in self.gappy else ~np.isfinite(samples)
+        if not bad.any():
+            return
+        where = np.flatnonzero(bad)
+        first, last = (self.start_time + where[[0, -1]] / self.rate_hz).tolist()
+        what = "NaN" if np.isnan(samples[bad]).all() else "infinite values"
+        raise DataError(
+            f"recording '{self.id}': channel '{name}' holds {len(where)} {what} between {first:.6g} s and {last:.6g} s; "
+            f"cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
+        )
+
+    def __len__(self) -> int:
+        return len(next(iter(self.channels.values())))
+
+    def __getitem__(self, name: str) -> FloatArray:
+        """Samples of one channel, shape (T,).
+
+        Raises:
+            DataError: the recording does not have it.
+        """
+        try:
+            return self.channels[name]
+        except KeyError:
+            have = ", ".join(self.channels)
+            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {have})") from None
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.channels
+
+    @property
+    def time(self) -> FloatArray:
+        """Sample times [s], shape (T,)."""
+        return self.start_time + np.arange(len(self)) / self.rate_hz
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the end of the last sampling interval [s]."""
+        return len(self) / self.rate_hz
+
+    @property
+    def end_time(self) -> float:
+        """End of the last sampling interval [s]."""
+        return self.start_time + self.duration
+
+    def stack(self, names: Iterable[str]) -> FloatArray:
+        """Channels as columns, shape (T, C).
+
+        Raises:
+            DataError: one of them is missing.
+        """
+        return np.stack([self[name] for name in names], axis=1)
+
+    def select(self, names: Iterable[str]) -> Recording:
+        """The same drive with these channels only."""
+        return replace(self, channels={name: self[name] for name in names})
+
+    def without_references(self) -> Recording:
+        """The same drive as an estimator may see it: no ``_ref`` channels."""
+        kept = [name for name in self.channels if not CHANNELS[name].is_reference]
+        if not kept:
+            raise DataError(f"recording '{self.id}' has reference channels only")
+        return self.select(kept)
+
+    def cut(self, start: float, stop: float) -> Recording:
+        """The samples taken in [start, stop) seconds.
+
+        Raises:
+            DataError: the range holds no samples.
+        """
+        first, last = self.index_range(start, stop)
+        if first >= last:
+            raise DataError(
+                f"recording '{self.id}' spans {self.start_time:.6g} s to {self.end_time:.6g} s; "
+                f"it has no samples between {start:.6g} s and {stop:.6g} s"
+            )
+        return replace(
+            self,
+            start_time=self.start_time + first / self.rate_hz,
+            channels={name: samples[first:last] for name, samples in self.channels.items()},
+        )
+
+    def index_range(self, start: float, stop: float) -> tuple[int, int]:
+        """First index and end index of the samples taken in [start, stop), clipped to the recording."""
+        return (index_at_or_after(self, start), index_at_or_after(self, stop))
+
+
+def index_at_or_after(recording: Recording, time: float) -> int:
+    """Index of the first sample taken at or after ``time`` [s], to a millionth of a sample; clipped to 0 … T."""
+    if time == math.inf:
+        return len(recording)
+    if time == -math.inf:
+        return 0
+    position = (time - recording.start_time) * recording.rate_hz
+    return min(max(math.ceil(position - 1e-6), 0), len(recording))

@@ -1,0 +1,275 @@
+"""What may be done to a recording before an estimator sees it; each transform says whether it is causal or offline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+from scipy import signal
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import FloatArray, Recording
+
+Mode = Literal["causal", "offline"]
+
+
+class Transform(Protocol):
+    """A pure function of a recording."""
+
+    @property
+    def mode(self) -> Mode:
+        """``causal`` if no output sample depends on later input samples."""
+        ...
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Apply it."""
+        ...
+
+
+@dataclass(frozen=True)
+class Resample:
+    """Change the sampling rate by any rational ratio; the first sample keeps its time.
+
+    ``polyphase`` applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so nothing is shifted and
+    what lies above the new Nyquist frequency is removed before it can alias. ``decimate`` keeps every n-th sample as it is
+    (integer ratios only), which is what a slower sensor or a naive logger would deliver.
+
+    Args:
+        rate_hz: the new rate [Hz].
+        method: ``polyphase`` or ``decimate``.
+
+    Source:
+        Crochiere & Rabiner, Multirate Digital Signal Processing, 1983; `scipy.signal.resample_poly`.
+    """
+
+    rate_hz: float
+    method: Literal["polyphase", "decimate"] = "polyphase"
+    zero_crossings: ClassVar[int] = 16
+    kaiser_beta: ClassVar[float] = 7.0
+    cutoff: ClassVar[float] = 0.9
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise ConfigurationError(f"the new sampling rate must be positive, not {self.rate_hz}")
+        if self.method not in ("polyphase", "decimate"):
+            raise ConfigurationError(f"resampling method '{self.method}' is not one of: polyphase, decimate")
+
+    @property
+    def mode(self) -> Mode:
+        """Zero phase needs future samples."""
+        return "causal" if self.method == "decimate" else "offline"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Resample every channel.
+
+        Raises:
+            DataError: the ratio is not one of small whole numbers, or a gappy channel would need filtering.
+            ConfigurationError: decimation by a ratio that is not whole.
+        """
+        up, down = self.ratio(recording)
+        if up == down:
+            return recording
+        n_out = -(-len(recording) * up // down)
+        if self.method == "decimate":
+            if up != 1:
+                raise ConfigurationError(
+                    f"recording '{recording.id}': plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio; "
+                    f"use method=polyphase"
+                )
+            channels = {name: samples[::down] for name, samples in recording.channels.items()}
+        else:
+            if recording.gappy:
+                raise DataError(
+                    f"recording '{recording.id}': channel '{sorted(recording.gappy)[0]}' has gaps and cannot be filtered; "
+                    f"use method=decimate or leave the channel out"
+                )
+            taps = self._taps(up, down)
+            channels = {name: _resampled(samples, up, down, taps)[:n_out] for name, samples in recording.channels.items()}
+        return replace(recording, rate_hz=float(self.rate_hz), channels=channels)
+
+    def ratio(self, recording: Recording) -> tuple[int, int]:
+        """Interpolation and decimation factors (up, down).
+
+        Raises:
+            DataError: the ratio is not one of small whole numbers.
+        """
+        exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
+        ratio = exact.limit_denominator(1000)
+        if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
+            raise DataError(
+                f"recording '{recording.id}': {self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
+            )
+        return ratio.numerator, ratio.denominator
+
+    def _taps(self, up: int, down: int) -> FloatArray:
+        slower = max(up, down)
+        half = self.zero_crossings * slower
+        taps = signal.firwin(2 * half + 1, self.cutoff / slower, window=("kaiser", self.kaiser_beta))
+        for phase in range(up):  # unit gain at 0 Hz in every branch: a constant stays that constant
+            taps[phase::up] /= up * taps[phase::up].sum()
+        return taps
+
+
+@dataclass(frozen=True)
+class LowPass:
+    """Remove what lies above a cut-off frequency.
+
+    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways.
+
+    Args:
+        cutoff_hz: -3 dB frequency of one pass [Hz].
+        channels: which channels; all of them if empty.
+        direction: ``causal`` or ``zero_phase``.
+    """
+
+    cutoff_hz: float
+    channels: tuple[str, ...] = ()
+    direction: Literal["causal", "zero_phase"] = "zero_phase"
+
+    @property
+    def mode(self) -> Mode:
+        """Offline if it runs backwards too."""
+        return "causal" if self.direction == "causal" else "offline"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Filter the channels.
+
+        Raises:
+            ConfigurationError: the cut-off is not below the Nyquist frequency.
+            DataError: a channel is missing or has gaps.
+        """
+        if not 0 < self.cutoff_hz < recording.rate_hz / 2:
+            raise ConfigurationError(
+                f"recording '{recording.id}': low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {recording.rate_hz / 2:g} Hz"
+            )
+        sections = signal.butter(2, self.cutoff_hz, fs=recording.rate_hz, output="sos")
+        settled = signal.sosfilt_zi(sections)
+
+        def apply(samples: FloatArray) -> FloatArray:
+            if self.direction == "causal":
+                return signal.sosfilt(sections, samples, zi=settled * samples[0])[0]
+            return signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
+
+        return _with_changed(recording, self.channels, apply)
+
+
+@dataclass(frozen=True)
+class RemoveOutliers:
+    """Replace isolated spikes by the median of their neighbourhood (Hampel filter).
+
+    Args:
+        half_window: samples on either side that count as neighbours.
+        threshold: how many scaled median absolute deviations make an outlier.
+        channels: which channels; all of them if empty.
+
+    Source:
+        Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
+    """
+
+    half_window: int = 5
+    threshold: float = 6.0
+    channels: tuple[str, ...] = ()
+    mode: ClassVar[Mode] = "offline"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Clean the channels.
+
+        Raises:
+            DataError: a channel is missing or has gaps.
+        """
+
+        def apply(samples: FloatArray) -> FloatArray:
+            padded = np.pad(samples, self.half_window, mode="reflect" if len(samples) > 1 else "edge")
+            neighbours = np.lib.stride_tricks.sliding_window_view(padded, 2 * self.half_window + 1)
+            median = np.median(neighbours, axis=1)
+            deviation = 1.4826 * np.median(np.abs(neighbours - median[:, None]), axis=1)
+            spike = np.abs(samples - median) > self.threshold * deviation + 1e-12
+            return np.where(spike, median, samples)
+
+        return _with_changed(recording, self.channels, apply)
+
+
+@dataclass(frozen=True)
+class MountingCorrection:
+    """Bring the accelerometer's readings to the centre of gravity and the vehicle's axes, in the plane.
+
+    The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw`` about the vertical axis:
+    a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l).
+
+    Args:
+        lever_x: forward offset of the sensor from the centre of gravity [m].
+        lever_y: leftward offset [m].
+        yaw: rotation of the sensor's axes against the vehicle's, counter-clockwise [rad].
+
+    Source:
+        Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section 3.2.
+    """
+
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    yaw: float = 0.0
+
+    @property
+    def mode(self) -> Mode:
+        """With a lever arm the yaw acceleration is needed, taken by central differences."""
+        return "causal" if self.lever_x == self.lever_y == 0.0 else "offline"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Correct ax and ay.
+
+        Raises:
+            DataError: ax, ay or yaw_rate is missing.
+        """
+        ax, ay, yaw_rate = recording["ax"], recording["ay"], recording["yaw_rate"]
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
+        if self.mode == "offline":
+            yaw_acceleration = np.gradient(yaw_rate) * recording.rate_hz
+            rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
+            rotated_y = rotated_y - yaw_acceleration * self.lever_x + yaw_rate**2 * self.lever_y
+        return replace(recording, channels={**recording.channels, "ax": rotated_x, "ay": rotated_y})
+
+
+TRANSFORMS: dict[str, type] = {
+    "resample": Resample,
+    "low_pass": LowPass,
+    "remove_outliers": RemoveOutliers,
+    "mounting_correction": MountingCorrection,
+}
+
+
+def transform_from_config(config: Mapping[str, Any]) -> Transform:
+    """Build a transform from plain values: its ``name`` and its arguments.
+
+    Raises:
+        ConfigurationError: an unknown name or argument.
+    """
+    arguments = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items() if key != "name"}
+    name = config.get("name")
+    if name not in TRANSFORMS:
+        raise ConfigurationError(f"transform '{name}' is not one of: {', '.join(TRANSFORMS)}")
+    try:
+        transform: Transform = TRANSFORMS[name](**arguments)
+    except TypeError as error:
+        raise ConfigurationError(f"transform '{name}': {error}") from None
+    return transform
+
+
+def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray) -> FloatArray:
+    """Polyphase filtering of samples extended at both ends by odd reflection, so that the ends do not ring."""
+    reach = len(taps) // 2 // up + 1
+    margin = -(-reach // down) * down  # whole steps of the output grid
+    extended = np.pad(samples, margin, mode="reflect", reflect_type="odd") if len(samples) > 1 else np.pad(samples, margin, mode="edge")
+    return signal.resample_poly(extended, up, down, window=taps)[margin * up // down :]
+
+
+def _with_changed(recording: Recording, names: tuple[str, ...], change: Callable[[FloatArray], FloatArray]) -> Recording:
+    for name in names or recording.channels:
+        if name in recording.gappy:
+            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out")
+    changed = {name: change(recording[name]) for name in names or tuple(recording.channels)}
+    return replace(recording, channels={**recording.channels, **changed})

@@ -1,0 +1,58 @@
+"""Windows of past samples, addressed by index so that overlapping ones share memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.data.errors import DataError
+from vehest.data.recording import FloatArray, Recording
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSet:
+    """All windows of N samples of some recordings, each with the target one step after it.
+
+    Window i is ``series[starts[i] : starts[i] + n_window]``; it never crosses from one recording into the next.
+
+    Args:
+        series: channels as columns, recordings one after another, shape (T, C).
+        targets: target of each window, shape (W,).
+        starts: first row of each window, shape (W,).
+        n_window: samples N in a window.
+    """
+
+    series: FloatArray
+    targets: FloatArray
+    starts: NDArray[np.int64]
+    n_window: int
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+
+def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int) -> WindowSet:
+    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1).
+
+    Raises:
+        DataError: no recording is long enough.
+    """
+    series, targets, starts, offset = [], [], [], 0
+    for recording in recordings:
+        first = window_starts(len(recording), n_window)
+        series.append(recording.stack(channels))
+        targets.append(recording[target][first + n_window])
+        starts.append(first + offset)
+        offset += len(recording)
+    if not sum(len(first) for first in starts):
+        lengths = ", ".join(f"'{r.id}' {len(r)}" for r in recordings)
+        raise DataError(f"windows of {n_window} samples and a target need longer recordings than: {lengths}")
+    return WindowSet(np.concatenate(series), np.concatenate(targets), np.concatenate(starts), n_window)
+
+
+def window_starts(n_samples: int, n_window: int) -> NDArray[np.int64]:
+    """First indices of all windows that have a sample after them, shape (max(T - N, 0),)."""
+    return np.arange(max(n_samples - n_window, 0), dtype=np.int64)
