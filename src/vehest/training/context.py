@@ -1,0 +1,51 @@
+"""What a fit needs to know about the world around it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+def _never() -> bool:
+    return False
+
+
+def _silent(progress: Progress) -> None:
+    return None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a fit stands after an epoch.
+
+    Args:
+        epoch: epochs finished.
+        max_epochs: epochs allowed.
+        active: members still training.
+        members: members in all.
+        best_validation_loss: lowest so far over the members.
+    """
+
+    epoch: int
+    max_epochs: int
+    active: int
+    members: int
+    best_validation_loss: float
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """Surroundings of a fit.
+
+    Args:
+        checkpoint_folder: where to keep the state of an unfinished fit; none if nothing is to be kept.
+        device: torch device name.
+        should_stop: asked after every batch; True ends the fit cleanly with the best so far.
+        on_progress: called after every epoch.
+    """
+
+    checkpoint_folder: Path | None = None
+    device: str = "cpu"
+    should_stop: Callable[[], bool] = field(default=_never)
+    on_progress: Callable[[Progress], None] = field(default=_silent)

@@ -1,0 +1,77 @@
+"""Direct search: Nelder-Mead from a grid of starts inside a box."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from vehest.data.recording import FloatArray
+from vehest.training.context import FitContext, Progress
+from vehest.training.settings import DirectSearchSettings
+
+
+@dataclass(frozen=True)
+class SearchRecord:
+    """Outcome of a direct search.
+
+    Args:
+        best: parameters with the smallest cost, shape (K,).
+        cost: that cost.
+        starts: each start with the parameters and the cost it led to, shape (S, 2K + 1).
+        evaluations: cost evaluations in all.
+        interrupted: whether it was stopped before the last start.
+    """
+
+    best: FloatArray
+    cost: float
+    starts: FloatArray
+    evaluations: int
+    interrupted: bool
+
+
+def nelder_mead_over_grid(
+    cost: Callable[[FloatArray], float],
+    box: Sequence[tuple[float, float]],
+    start_range: Sequence[tuple[float, float]],
+    settings: DirectSearchSettings,
+    context: FitContext,
+) -> SearchRecord:
+    """Minimise a cost that need not be smooth, keeping the best of several local searches.
+
+    Args:
+        cost: function of the parameters, shape (K,).
+        box: admissible range of each parameter.
+        start_range: range of each parameter over which ``settings.grid`` starts are spread evenly, ends included.
+        settings: grid and limits.
+        context: progress and the wish to stop.
+
+    Source:
+        Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
+    """
+    axes = [np.linspace(low, high, settings.grid) for low, high in start_range]
+    scale = np.array([high - low for low, high in box])
+    rows: list[FloatArray] = []
+    evaluations, interrupted = 0, False
+    starts = list(itertools.product(*axes))
+    for start in starts:
+        if context.should_stop() and rows:
+            interrupted = True
+            break
+        result = optimize.minimize(
+            lambda unit: cost(unit * scale),
+            np.array(start) / scale,
+            method="Nelder-Mead",
+            bounds=[(low / s, high / s) for (low, high), s in zip(box, scale, strict=True)],
+            options={"maxfev": settings.max_evaluations, "xatol": settings.tolerance, "fatol": 1e-12},
+        )
+        evaluations += result.nfev
+        rows.append(np.concatenate([start, result.x * scale, [result.fun]]))
+        context.on_progress(Progress(len(rows), len(starts), 1, 1, float(min(row[-1] for row in rows))))
+    table = np.array(rows)
+    best = table[np.argmin(table[:, -1])]
+    n = len(box)
+    return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)

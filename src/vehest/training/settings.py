@@ -1,0 +1,101 @@
+"""How networks are trained, as conf/training/*.yaml states it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Literal, TypeVar
+
+from vehest.data.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class SupervisedSettings:
+    """Supervised training of windowed networks (Da Lio et al. 2023, Section VI-B).
+
+    Args:
+        learning_rate: Adam's step size.
+        batch_size: windows in a batch.
+        max_epochs: epochs after which training ends in any case.
+        patience: epochs without a better validation loss after which a member stops.
+        dtype: ``float32`` or ``float64``.
+        compiled: use the compiled recursion where the network has one; the plain PyTorch one otherwise.
+        checkpoint_seconds: time between two checkpoints [s].
+    """
+
+    learning_rate: float = 1e-3
+    batch_size: int = 64
+    max_epochs: int = 1000
+    patience: int = 25
+    dtype: Literal["float32", "float64"] = "float32"
+    compiled: bool = True
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not self.learning_rate > 0:
+            raise ConfigurationError(f"training.learning_rate must be positive, not {self.learning_rate}")
+        for name in ("batch_size", "max_epochs", "patience"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+
+
+@dataclass(frozen=True)
+class DirectSearchSettings:
+    """Nelder-Mead from a grid of starts inside a box (Da Lio et al. 2023, Appendix A).
+
+    Args:
+        grid: starts along each parameter.
+        max_evaluations: evaluations allowed from each start.
+        tolerance: relative change of the parameters at which a search ends.
+    """
+
+    grid: int = 4
+    max_evaluations: int = 400
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.grid < 1 or self.max_evaluations < 1:
+            raise ConfigurationError("training.grid and training.max_evaluations must be at least 1")
+        if not self.tolerance > 0:
+            raise ConfigurationError(f"training.tolerance must be positive, not {self.tolerance}")
+
+
+Settings = TypeVar("Settings")
+
+
+def settings_from_config(kind: type[Settings], config: Mapping[str, Any], group: str) -> Settings:
+    """Build a settings dataclass from plain values.
+
+    Raises:
+        ConfigurationError: an unknown key, or a value of the wrong type.
+    """
+    types = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for key, value in config.items():
+        if key == "name":
+            continue
+        if key not in types:
+            raise ConfigurationError(f"{group}.{key} is not an option of {group}; options: {', '.join(types)}")
+        values[key] = _converted(f"{group}.{key}", value, types[key])
+    try:
+        return kind(**values)
+    except TypeError as error:
+        raise ConfigurationError(f"{group}: {error}") from None
+
+
+def _converted(name: str, value: Any, type_name: str) -> Any:
+    if type_name == "bool":
+        if not isinstance(value, bool):
+            raise ConfigurationError(f"{name} must be true or false, not {value!r}")
+        return value
+    if type_name == "int":
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+            raise ConfigurationError(f"{name} must be a whole number, not {value!r}")
+        return int(value)
+    if type_name == "float":
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigurationError(f"{name} must be a number, not {value!r}")
+        return float(value)
+    return value

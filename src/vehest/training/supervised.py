@@ -1,0 +1,248 @@
+"""Supervised training of windowed networks: Adam on the mean squared error, early stopping, members side by side."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vehest.data.errors import DataError
+from vehest.data.windows import WindowSet
+from vehest.training.checkpoints import Checkpoint, drop_checkpoint, load_checkpoint, save_checkpoint
+from vehest.training.context import FitContext, Progress
+from vehest.training.members import FlatParameters, predict_members
+from vehest.training.settings import SupervisedSettings
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """How the training of one member went.
+
+    Args:
+        train_loss: mean squared error over the batches of each epoch [m²/s²].
+        validation_loss: mean squared error on the validation windows after each epoch [m²/s²].
+        best_epoch: epoch (from 1) whose weights were kept; 0 if none was finished.
+        interrupted: whether training was stopped before it was over.
+        seconds: wall time of the whole batch of members, not counting earlier runs that a checkpoint continues [s].
+    """
+
+    train_loss: tuple[float, ...]
+    validation_loss: tuple[float, ...]
+    best_epoch: int
+    interrupted: bool
+    seconds: float
+
+    @property
+    def epochs(self) -> int:
+        """Epochs trained."""
+        return len(self.validation_loss)
+
+    @property
+    def best_validation_loss(self) -> float:
+        """Validation loss of the weights that were kept [m²/s²]."""
+        return min(self.validation_loss, default=math.nan)
+
+
+def train_members(
+    networks: Sequence[nn.Module],
+    seeds: Sequence[int],
+    train: WindowSet,
+    validation: WindowSet,
+    settings: SupervisedSettings,
+    context: FitContext,
+) -> list[TrainingRecord]:
+    """Train networks of one shape together; each ends with its own best weights, as if it had been trained alone.
+
+    Every member draws its own order of the windows from its own seed, stops on its own, and leaves the batch then.
+
+    Args:
+        networks: M networks (`WindowNetwork`) that differ in their initial weights only; changed in place.
+        seeds: their seeds.
+        train: windows to learn from.
+        validation: windows that decide when to stop and which weights to keep.
+        settings: see `SupervisedSettings`.
+        context: checkpoints, progress and the wish to stop.
+
+    Returns:
+        M records.
+
+    Raises:
+        DataError: the loss is no longer finite.
+
+    Source:
+        Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015.
+    """
+    run = _Run(networks, seeds, train, validation, settings, context)
+    run.resume()
+    while run.active.numel() and run.epoch < settings.max_epochs and not run.interrupted:
+        run.train_epoch()
+    return run.finish()
+
+
+class _Run:
+    """State of one training; rows of ``flat`` and of Adam's moments belong to the members in ``active``."""
+
+    def __init__(
+        self,
+        networks: Sequence[nn.Module],
+        seeds: Sequence[int],
+        train: WindowSet,
+        validation: WindowSet,
+        settings: SupervisedSettings,
+        context: FitContext,
+    ) -> None:
+        self.networks, self.settings, self.context = networks, settings, context
+        self.network = networks[0]
+        self.layout = FlatParameters(self.network)
+        self.train, self.validation = _Prepared(self.network, train, settings), _Prepared(self.network, validation, settings)
+        flat = self.layout.pack(networks)
+        self.best = flat.clone()
+        self.best_loss = torch.full((len(networks),), math.inf, dtype=torch.float64)
+        self.best_epoch = torch.zeros(len(networks), dtype=torch.int64)
+        self.active = torch.arange(len(networks))
+        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in seeds]
+        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in networks]
+        self.epoch = 0
+        self.interrupted = False
+        self.started = self.saved = time.monotonic()
+        self._set_parameters(flat, None)
+
+    def _set_parameters(self, flat: Tensor, moments: tuple[Tensor, Tensor, Tensor] | None) -> None:
+        self.flat = nn.Parameter(flat.clone())
+        self.adam = torch.optim.Adam([self.flat], lr=self.settings.learning_rate)
+        if moments is not None:
+            step, mean, square = moments
+            self.adam.state[self.flat] = {"step": step, "exp_avg": mean.clone(), "exp_avg_sq": square.clone()}
+
+    def _moments(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        state = self.adam.state.get(self.flat)
+        return (state["step"], state["exp_avg"], state["exp_avg_sq"]) if state else None
+
+    def train_epoch(self) -> None:
+        """One pass over the training windows, then the validation loss and the decisions that hang on it."""
+        before = self._checkpoint()
+        order = torch.stack([torch.randperm(len(self.train), generator=self.generators[m]) for m in self.active.tolist()])
+        total = torch.zeros(len(self.active), dtype=torch.float64)
+        for batch in order.split(self.settings.batch_size, dim=1):
+            if self.context.should_stop():
+                self._interrupt(before)
+                return
+            self.adam.zero_grad(set_to_none=True)
+            views = self.layout.views(self.flat)
+            error = self._predict(views, self.train, self.train.starts[batch]) - self.train.targets[batch]
+            losses = error.square().mean(dim=1)
+            losses.sum().backward()
+            self.adam.step()
+            with torch.no_grad():
+                self.network.constrain(self.layout.views(self.flat.detach()))  # type: ignore[operator]
+            total += losses.detach().double() * batch.shape[1]
+        self.epoch += 1
+        self._judge(total / len(self.train))
+
+    def _predict(self, parameters: dict[str, Tensor], data: _Prepared, starts: Tensor) -> Tensor:
+        return predict_members(self.network, parameters, data.series, starts, data.n_window, compiled=self.settings.compiled)
+
+    def _judge(self, train_loss: Tensor) -> None:
+        with torch.no_grad():
+            starts = self.validation.starts.expand(len(self.active), -1)
+            prediction = self._predict(self.layout.views(self.flat.detach()), self.validation, starts)
+            loss = (prediction.double() - self.validation.targets.double()).square().mean(dim=1)
+        for row, member in enumerate(self.active.tolist()):
+            self.history[member][0].append(float(train_loss[row]))
+            self.history[member][1].append(float(loss[row]))
+            if not math.isfinite(float(loss[row])):
+                raise DataError(
+                    f"training: the validation loss of member {member} is {float(loss[row])} after epoch {self.epoch}; "
+                    f"lower training.learning_rate or check the data with 'vehest data check'"
+                )
+        better = loss < self.best_loss[self.active]
+        improved = self.active[better]
+        self.best[improved] = self.flat.detach()[better]
+        self.best_loss[improved] = loss[better]
+        self.best_epoch[improved] = self.epoch
+        going_on = self.epoch - self.best_epoch[self.active] < self.settings.patience
+        if not bool(going_on.all()):
+            self._keep(going_on)
+        self.context.on_progress(
+            Progress(self.epoch, self.settings.max_epochs, len(self.active), len(self.networks), float(self.best_loss.min()))
+        )
+        if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
+            self._save(self._checkpoint())
+
+    def _keep(self, rows: Tensor) -> None:
+        """Let the other rows leave the batch."""
+        moments = self._moments()
+        assert moments is not None
+        self.active = self.active[rows]
+        self._set_parameters(self.flat.detach()[rows], (moments[0], moments[1][rows], moments[2][rows]))
+
+    def _interrupt(self, before: Checkpoint) -> None:
+        self.interrupted = True
+        self._save(before)
+
+    def _checkpoint(self) -> Checkpoint:
+        tensors = {"flat": self.flat.detach().clone(), "best": self.best.clone(), "best_loss": self.best_loss.clone()}
+        tensors |= {"best_epoch": self.best_epoch.clone(), "active": self.active.clone()}
+        tensors |= {f"generator_{member}": generator.get_state() for member, generator in enumerate(self.generators)}
+        moments = self._moments()
+        if moments is not None:
+            tensors |= {"step": moments[0].clone(), "exp_avg": moments[1].clone(), "exp_avg_sq": moments[2].clone()}
+        return Checkpoint(tensors, {"epoch": self.epoch, "history": [[list(t), list(v)] for t, v in self.history]})
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        self.saved = time.monotonic()
+        if self.context.checkpoint_folder is not None:
+            save_checkpoint(self.context.checkpoint_folder, checkpoint)
+
+    def resume(self) -> None:
+        """Go on from the checkpoint, if there is one for these members."""
+        checkpoint = load_checkpoint(self.context.checkpoint_folder) if self.context.checkpoint_folder else None
+        if checkpoint is None or checkpoint.tensors["best"].shape != self.best.shape:
+            return
+        tensors = dict(checkpoint.tensors)
+        self.best, self.best_loss, self.best_epoch = tensors["best"], tensors["best_loss"], tensors["best_epoch"]
+        self.active = tensors["active"]
+        for member, generator in enumerate(self.generators):
+            generator.set_state(tensors[f"generator_{member}"])
+        moments = (tensors["step"], tensors["exp_avg"], tensors["exp_avg_sq"]) if "step" in tensors else None
+        self._set_parameters(tensors["flat"], moments)
+        self.epoch = checkpoint.values["epoch"]
+        self.history = [(list(t), list(v)) for t, v in checkpoint.values["history"]]
+
+    def finish(self) -> list[TrainingRecord]:
+        """Put the best weights into the networks."""
+        if not self.interrupted and self.context.checkpoint_folder is not None:
+            drop_checkpoint(self.context.checkpoint_folder)
+        seconds = time.monotonic() - self.started
+        records = []
+        for member, network in enumerate(self.networks):
+            self.layout.unpack(self.best[member], network)
+            train_loss, validation_loss = self.history[member]
+            unfinished = self.interrupted and bool((self.active == member).any())
+            records.append(TrainingRecord(tuple(train_loss), tuple(validation_loss), int(self.best_epoch[member]), unfinished, seconds))
+        return records
+
+
+class _Prepared:
+    """A window set as tensors, scaled once."""
+
+    def __init__(self, network: nn.Module, windows: WindowSet, settings: SupervisedSettings) -> None:
+        dtype = getattr(torch, settings.dtype)
+        with torch.no_grad():
+            self.series: Tensor = network.prepared(torch.as_tensor(windows.series, dtype=dtype)).contiguous()  # type: ignore[operator]
+        self.targets = torch.as_tensor(windows.targets, dtype=dtype)
+        self.starts = torch.as_tensor(windows.starts)
+        self.n_window = windows.n_window
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+
+def _shuffle_seed(seed: int) -> int:
+    """A stream for shuffling that has nothing to do with the one the initial weights were drawn from."""
+    return int(np.random.SeedSequence([seed, 1]).generate_state(1, np.uint64)[0] >> np.uint64(1))
