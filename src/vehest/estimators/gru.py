@@ -1,0 +1,49 @@
+"""Gated recurrent unit, the benchmark of Gräber et al. 2019 (estimator E1) with the inputs of the KS-NN."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vehest.estimators.recurrent import RecurrentEstimator, RecurrentNetwork, RecurrentSettings
+
+
+class GruNetwork(RecurrentNetwork):
+    """Gated recurrent unit with one bias a gate.
+
+    r = σ(W_r x + U_r h + b_r),  z = σ(W_z x + U_z h + b_z)
+    n = tanh(W_n x + r ∘ (U_n h) + b_n),  h⁺ = (1 - z) ∘ n + z ∘ h
+
+    Source: Cho et al. 2014; Gräber et al., IEEE T-IV 4 (1), 2019.
+    """
+
+    def __init__(self, settings: RecurrentSettings) -> None:
+        super().__init__(settings, n_gates=3, n_channels=4)
+
+    def last_state(self, prepared_windows: Tensor) -> Tensor:
+        """Hidden state after the window, from zero."""
+        driven = torch.einsum("...c,ghc->...gh", prepared_windows, self.input_weight) + self.gate_bias
+        state = torch.zeros_like(driven[..., 0, 0, :])
+        for k in range(prepared_windows.shape[-2]):
+            recurrent = torch.einsum("...i,ghi->...gh", state, self.state_weight)
+            step = driven[..., k, :, :]
+            reset = torch.sigmoid(step[..., 0, :] + recurrent[..., 0, :])
+            update = torch.sigmoid(step[..., 1, :] + recurrent[..., 1, :])
+            candidate = torch.tanh(step[..., 2, :] + reset * recurrent[..., 2, :])
+            state = candidate + update * (state - candidate)
+        return state
+
+    def _kernel(self) -> Any:
+        from vehest.estimators.kernels import gru
+
+        return gru.last_state
+
+
+class Gru(RecurrentEstimator):
+    """GRU benchmark."""
+
+    name = "gru"
+    title = "GRU"
+    network_type = GruNetwork

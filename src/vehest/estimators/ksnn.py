@@ -1,0 +1,189 @@
+"""KS-NN: the kinematics-structured neural network of Da Lio, Piccinini & Biral, IEEE T-ITS 2023.
+
+The method is patented by its authors (PCT/IT2023/050058).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vehest.data.errors import ConfigurationError
+from vehest.data.recording import Recording
+from vehest.estimators.windowed import WindowedEstimator, WindowedSettings
+
+GAMMA_START = 0.98
+GAMMA_SPREAD = 0.01
+SMALL = 0.1
+
+
+@dataclass(frozen=True)
+class KsnnSettings(WindowedSettings):
+    """Structure of a KS-NN.
+
+    Args:
+        n_local: number P of local models along |yaw rate|.
+        n_hidden: neurons Q of each feedback function; 0 makes it linear.
+        bias: whether the feedback functions may learn sensor offsets.
+    """
+
+    n_local: int = 2
+    n_hidden: int = 2
+    bias: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n_local < 1:
+            raise ConfigurationError(f"estimator.n_local must be at least 1, not {self.n_local}")
+        if self.n_hidden < 0:
+            raise ConfigurationError(f"estimator.n_hidden must not be negative, not {self.n_hidden}")
+
+
+class KinematicsStructuredNetwork(nn.Module):
+    """Bank of Luenberger-like observers blended by yaw rate (KS-NN).
+
+    v⁺ = γ₁v + β₁τ(a_y - u_m ω) - ω f₁(û - u_m)        (Da Lio et al. 2023, Eq. 7a)
+    û⁺ = γ₂û + β₂τ(a_x + vω) - f₂(û - u_m)             (Eq. 7b)
+    f(e) = w₁e + b₁ + Σⱼ w₃ⱼ tanh(w₂ⱼe + b₂ⱼ) + b₃      (Eq. 8, and the second layer's own bias)
+
+    Args:
+        settings: structure.
+        yaw_rate_max: centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
+
+    Shapes:
+        measurements: (..., N, 4), channels yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
+        returns: (...) lateral velocity [m/s] one step after the window.
+    """
+
+    yaw_rate_max: Tensor
+
+    def __init__(self, settings: KsnnSettings, yaw_rate_max: float = 1.0) -> None:
+        super().__init__()
+        local, hidden = settings.n_local, settings.n_hidden
+        self.settings = settings
+        self.step = 1.0 / settings.rate_hz
+        self.register_buffer("yaw_rate_max", torch.tensor(float(yaw_rate_max)))
+        self.gamma = nn.Parameter(torch.empty(local, 2))
+        self.beta = nn.Parameter(torch.empty(local, 2))
+        self.linear_weight = nn.Parameter(torch.empty(local, 2))
+        if settings.bias:
+            self.linear_bias = nn.Parameter(torch.zeros(local, 2))
+        if hidden:
+            self.hidden_weight = nn.Parameter(torch.empty(local, 2, hidden))
+            self.output_weight = nn.Parameter(torch.empty(local, 2, hidden))
+            if settings.bias:
+                self.hidden_bias = nn.Parameter(torch.zeros(local, 2, hidden))
+                self.output_bias = nn.Parameter(torch.zeros(local, 2))
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw initial weights near the kinematic observer: γ ≈ 0.98, β ≈ 1, small feedback."""
+        with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64).to(parameter.dtype)
+                if name == "gamma":
+                    parameter.copy_((GAMMA_START + GAMMA_SPREAD * noise).clamp(max=1.0))
+                elif name == "beta":
+                    parameter.copy_(1.0 + SMALL * noise)
+                elif name == "hidden_weight":
+                    parameter.copy_(noise)
+                elif name in ("linear_weight", "output_weight"):
+                    parameter.copy_(SMALL * noise.abs() if name == "linear_weight" else SMALL * noise)
+                else:
+                    parameter.copy_(0.01 * noise)
+
+    def prepared(self, series: Tensor) -> Tensor:
+        """Measurements as they are."""
+        return series
+
+    def constrain(self, parameters: Mapping[str, Tensor]) -> None:
+        """Keep γ₁ in (0, 1] (Section IV-A2)."""
+        parameters["gamma"][..., 0].clamp_(min=1e-3, max=1.0)
+
+    def activations(self, yaw_rate: Tensor) -> Tensor:
+        """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the last one alone."""
+        position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(max=self.settings.n_local - 1)
+        centres = torch.arange(self.settings.n_local, dtype=yaw_rate.dtype)
+        return (1.0 - (position.unsqueeze(-1) - centres).abs()).clamp(min=0.0)
+
+    def feedback(self, error: Tensor) -> Tensor:
+        """f₁ and f₂ of every local model (Eq. 8), (...) -> (..., P, 2)."""
+        error = error[..., None, None]
+        value = self.linear_weight * error
+        if self.settings.bias:
+            value = value + self.linear_bias
+        if self.settings.n_hidden:
+            inner = self.hidden_weight * error.unsqueeze(-1)
+            if self.settings.bias:
+                inner = inner + self.hidden_bias
+            value = value + (self.output_weight * torch.tanh(inner)).sum(-1)
+            if self.settings.bias:
+                value = value + self.output_bias
+        return value
+
+    def forward(self, measurements: Tensor) -> Tensor:
+        """Run the recursion from v = 0, û = u_m over the window (Fig. 1)."""
+        yaw_rate, speed, ay, ax = measurements.unbind(-1)
+        weights = self.activations(yaw_rate)
+        v, u = torch.zeros_like(speed[..., 0]), speed[..., 0]
+        for k in range(measurements.shape[-2]):
+            omega, phi = yaw_rate[..., k], weights[..., k, :]
+            f = self.feedback(u - speed[..., k])
+            slip = self.step * (ay[..., k] - speed[..., k] * omega)
+            thrust = self.step * (ax[..., k] + v * omega)
+            v_local = self.gamma[:, 0] * v[..., None] + self.beta[:, 0] * slip[..., None] - omega[..., None] * f[..., 0]
+            u_local = self.gamma[:, 1] * u[..., None] + self.beta[:, 1] * thrust[..., None] - f[..., 1]
+            v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
+        return v
+
+    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+        """The same for M members by the compiled recursion, (M, B)."""
+        from vehest.estimators.kernels import ksnn as kernel
+
+        theta = self._packed(parameters)
+        yaw_rate_max = float(self.yaw_rate_max)
+        return kernel.predict(theta, prepared, starts, yaw_rate_max, self.step, self.settings.n_hidden, self.settings.window)
+
+    def _packed(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        gamma = parameters["gamma"]
+        bias = parameters.get("linear_bias", torch.zeros_like(gamma))
+        pieces = [parameters["linear_weight"].unsqueeze(-1)]
+        if self.settings.n_hidden:
+            hidden_weight = parameters["hidden_weight"]
+            hidden_bias = parameters.get("hidden_bias", torch.zeros_like(hidden_weight))
+            bias = bias + parameters["output_bias"] if self.settings.bias else bias
+            pieces += [bias.unsqueeze(-1), hidden_weight, hidden_bias, parameters["output_weight"]]
+        else:
+            pieces.append(bias.unsqueeze(-1))
+        return torch.cat([gamma, parameters["beta"], torch.cat(pieces, dim=-1).flatten(-2)], dim=-1)
+
+
+class Ksnn(WindowedEstimator):
+    """KS-NN as an estimator: windows of N measurements, lateral velocity one step after.
+
+    Source: Da Lio et al. 2023; patented (PCT/IT2023/050058).
+    """
+
+    name = "ksnn"
+    title = "KS-NN"
+    settings_type = KsnnSettings
+    settings: KsnnSettings
+
+    @property
+    def variant(self) -> str:
+        """Name of the structure as in Table III."""
+        kind = "nonlinear" if self.settings.n_hidden else "linear"
+        bias = "bias" if self.settings.bias else "no_bias"
+        neurons = f"_q{self.settings.n_hidden}" if self.settings.n_hidden else ""
+        return f"{kind}_{bias}_p{self.settings.n_local}{neurons}"
+
+    def new_network(self, train: list[Recording]) -> KinematicsStructuredNetwork:
+        """A network whose local models span the yaw rates of the training recordings."""
+        return KinematicsStructuredNetwork(self.settings, max(float(np.abs(r["yaw_rate"]).max()) for r in train))
+
+    def empty_network(self) -> KinematicsStructuredNetwork:
+        """A network to load weights into."""
+        return KinematicsStructuredNetwork(self.settings)
