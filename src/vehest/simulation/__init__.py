@@ -1,0 +1,1 @@
+"""A proving ground: plant, driver, courses and sensors that together make simulated recordings."""
