@@ -23,13 +23,13 @@ def written_aside(path: Path) -> Iterator[Path]:
     Raises:
         MissingError: the disk is full or the folder cannot be written to.
     """
-    aside = path.with_name(f"{ASIDE_PREFIX}{uuid.uuid4().hex[:8]}-{path.name}")
+    aside = path.with_name(_aside_name(path.name))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield aside
         _flush(aside)
         if path.is_dir() and not path.is_symlink():
-            replaced = path.with_name(f"{ASIDE_PREFIX}{uuid.uuid4().hex[:8]}-replaced")
+            replaced = path.with_name(_aside_name("replaced"))
             os.rename(path, replaced)
             os.rename(aside, path)
             shutil.rmtree(replaced, ignore_errors=True)
@@ -57,8 +57,8 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Remove what interrupted writers left in ``folder``; returns how many."""
-    leftovers = list(folder.glob(f"{ASIDE_PREFIX}*")) if folder.is_dir() else []
+    """Remove what killed writers left in ``folder``; what a living process is writing stays. Returns how many."""
+    leftovers = [path for path in folder.glob(f"{ASIDE_PREFIX}*") if not _is_alive(_writer(path))] if folder.is_dir() else []
     for leftover in leftovers:
         remove(leftover)
     return len(leftovers)
@@ -75,6 +75,25 @@ def sha256_of(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
+
+
+def _aside_name(name: str) -> str:
+    return f"{ASIDE_PREFIX}{os.getpid()}-{uuid.uuid4().hex[:8]}-{name}"
+
+
+def _writer(path: Path) -> int:
+    number = path.name.removeprefix(ASIDE_PREFIX).split("-")[0]
+    return int(number) if number.isdigit() else 0
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return process > 0
 
 
 def _flush(path: Path) -> None:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.estimate import Estimate
-from vehest.data.files import written_aside, writing_error
+from vehest.data.files import writing_error, written_aside
 from vehest.data.recording import Recording
 
 _METADATA_KEY = b"vehest"

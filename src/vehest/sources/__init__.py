@@ -1,0 +1,1 @@
+"""One module an origin of recordings: files, or a simulation, to recordings."""

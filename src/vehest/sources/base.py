@@ -1,0 +1,120 @@
+"""What every source does, and the registry of sources."""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.recording import Recording
+
+SOURCES: dict[str, tuple[str, str]] = {
+    "revs": ("vehest.sources.revs", "RevsSource"),
+    "tabular": ("vehest.sources.tabular", "TabularSource"),
+    "simulated": ("vehest.sources.simulated", "SimulatedSource"),
+}
+
+COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept"})
+
+
+class Source(ABC):
+    """Reads one data set.
+
+    Args:
+        dataset: its configuration, as conf/dataset/*.yaml holds it.
+
+    Raises:
+        ConfigurationError: a key that this source does not know, or one that is missing.
+    """
+
+    keys: frozenset[str] = frozenset()
+
+    def __init__(self, dataset: Mapping[str, Any]) -> None:
+        self.dataset = dict(dataset)
+        self.name = str(dataset.get("name", "unnamed"))
+        unknown = sorted(set(dataset) - COMMON_KEYS - self.keys)
+        if unknown:
+            known = ", ".join(sorted(self.keys))
+            raise ConfigurationError(
+                f"data set '{self.name}': source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {known}"
+            )
+
+    @abstractmethod
+    def inputs(self) -> dict[str, str | Path]:
+        """What the recordings are made from: name -> file, or a version where there is no file.
+
+        Raises:
+            MissingError: a file or folder is not there.
+        """
+
+    @abstractmethod
+    def ids(self) -> list[str]:
+        """Names of the recordings, in order."""
+
+    @abstractmethod
+    def read(self, recording_id: str) -> Recording:
+        """Make one recording.
+
+        Raises:
+            DataError: its files cannot be used as they are.
+        """
+
+    def recordings(self) -> Iterator[Recording]:
+        """All recordings, one after another."""
+        for recording_id in self.ids():
+            yield self.read(recording_id)
+
+
+def open_source(dataset: Mapping[str, Any]) -> Source:
+    """The source that a data set's configuration names.
+
+    Raises:
+        ConfigurationError: an unknown source or option.
+    """
+    module, name = SOURCES[source_name(dataset)]
+    found: Source = getattr(importlib.import_module(module), name)(dataset)
+    return found
+
+
+def source_name(dataset: Mapping[str, Any]) -> str:
+    """The name of the source of a data set.
+
+    Raises:
+        ConfigurationError: there is none of that name.
+    """
+    name = str(dataset.get("source"))
+    if name not in SOURCES:
+        raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(SOURCES)}")
+    return name
+
+
+def existing_folder(path: Any, dataset: str) -> Path:
+    """A folder of raw data.
+
+    Raises:
+        MissingError: no root was given, or the folder is not there.
+    """
+    if path is None or str(path) in {"", "None", "null"} or str(path).startswith(("None/", "null/")):
+        raise MissingError(
+            f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA to the folder with the recordings"
+        )
+    folder = Path(str(path)).expanduser()
+    if not folder.is_dir():
+        raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
+    return folder
+
+
+def require_files(files: Sequence[Path], dataset: str) -> None:
+    """See that files are there and hold something.
+
+    Raises:
+        MissingError: one is not there or is empty.
+    """
+    for file in files:
+        if not file.is_file():
+            raise MissingError(f"data set '{dataset}': there is no file '{file}'")
+        if file.stat().st_size == 0:
+            raise MissingError(f"data set '{dataset}': file '{file}' is empty")

@@ -1,0 +1,192 @@
+"""Any CSV or Parquet table with a column a channel; names, units and signs are declared in conf/dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+import pyarrow.parquet as pq
+
+from vehest.data.channels import channel
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import FloatArray, Recording
+from vehest.data.store import is_stored_recording, read_recording
+from vehest.sources.base import Source, existing_folder, require_files
+from vehest.sources.columns import Clock, Column, column_from_config, columns_from_config, identity_columns, uniform_clock
+
+
+class TabularSource(Source):
+    """Tables, a recording each.
+
+    Options: ``path`` and ``files`` (glob), ``time`` or ``rate_hz``, ``clock``, ``channels``, ``gappy``, and for CSV
+    ``delimiter``, ``decimal``, ``encoding``, ``skip_rows``.
+    """
+
+    keys = frozenset({"path", "files", "time", "rate_hz", "clock", "channels", "gappy", "delimiter", "decimal", "encoding", "skip_rows"})
+
+    def __init__(self, dataset: Mapping[str, Any]) -> None:
+        super().__init__(dataset)
+        declared = dataset.get("channels")
+        self.columns = None if declared is None else columns_from_config(declared, self.name)
+        time = dataset.get("time")
+        self.time = None if time is None else column_from_config(time, f"data set '{self.name}': time")
+        if dataset.get("clock", "strict") not in ("strict", "interpolate"):
+            raise ConfigurationError(f"data set '{self.name}': clock '{dataset['clock']}' is not one of: strict, interpolate")
+        if self.time is None and not dataset.get("rate_hz"):
+            raise ConfigurationError(f"data set '{self.name}': without a time column, rate_hz must be given")
+
+    def ids(self) -> list[str]:
+        """Stems of the files, in alphabetical order."""
+        return [file.stem for file in self._files()]
+
+    def inputs(self) -> dict[str, str | Path]:
+        """The tables."""
+        return {file.name: file for file in self._files()}
+
+    def read(self, recording_id: str) -> Recording:
+        """Read one table by its stem."""
+        for file in self._files():
+            if file.stem == recording_id:
+                return self.read_file(file)
+        raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(self.ids())})")
+
+    def read_file(self, file: Path) -> Recording:
+        """Read a table wherever it is.
+
+        Raises:
+            MissingError: it is not there or empty.
+            DataError: it cannot be read, lacks a column, or holds text where numbers belong.
+        """
+        require_files([file], self.name)
+        if is_stored_recording(file):
+            return read_recording(file)
+        names = _column_names(file, self.dataset)
+        columns = identity_columns(names) if self.columns is None else self.columns
+        if not columns:
+            raise DataError(
+                f"'{file}' has no column that is named like a channel (it has {_listed(names)}); declare the columns in conf/dataset"
+            )
+        wanted = [column.column for column in columns.values()] + ([self.time.column] if self.time else [])
+        for name in wanted:
+            if name not in names:
+                raise DataError(
+                    f"'{file}' has no column '{name}' (it has {_listed(names)}); correct the map in conf/dataset/{self.name}.yaml"
+                )
+        table = _read_columns(file, list(dict.fromkeys(wanted)), self.dataset)
+        return self._recording(file, columns, {name: _numbers(table, name, file) for name in table.column_names})
+
+    def _recording(self, file: Path, columns: Mapping[str, Column], values: Mapping[str, FloatArray]) -> Recording:
+        n_rows = len(next(iter(values.values())))
+        if n_rows == 0:
+            raise DataError(f"'{file}' has a header and no rows")
+        if self.time is not None:
+            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), f"'{file}'", self.dataset.get("clock", "strict"))
+        else:
+            clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
+        gappy = frozenset(str(name) for name in self.dataset.get("gappy") or [])
+        channels = {name: clock.align(column.to_si(values[column.column], channel(name).unit)) for name, column in columns.items()}
+        try:
+            return Recording(
+                id=file.stem,
+                vehicle=str(self.dataset.get("vehicle", "unknown")),
+                rate_hz=clock.rate_hz,
+                start_time=clock.start_time,
+                channels=channels,
+                kind=self.dataset.get("kind", "real"),
+                gappy=gappy,
+                provenance={"dataset": self.name, "source": "tabular", "file": file.name, "citation": self.dataset.get("citation", "")},
+            )
+        except DataError as error:
+            raise DataError(f"'{file}': {error}") from None
+
+    def _files(self) -> list[Path]:
+        folder = existing_folder(self.dataset.get("path"), self.name)
+        pattern = str(self.dataset.get("files", "*.csv"))
+        files = sorted(file for file in folder.glob(pattern) if file.is_file())
+        if not files:
+            raise MissingError(f"data set '{self.name}': no file in '{folder}' matches '{pattern}'")
+        stems = [file.stem for file in files]
+        doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
+        if doubled:
+            raise DataError(f"data set '{self.name}': two files are called '{doubled[0]}', a recording's name must be unique")
+        return files
+
+
+def _is_parquet(file: Path) -> bool:
+    return file.suffix.lower() in {".parquet", ".pq"}
+
+
+def _column_names(file: Path, dataset: Mapping[str, Any]) -> list[str]:
+    try:
+        if _is_parquet(file):
+            return list(pq.read_schema(file).names)
+        with pc.open_csv(file, read_options=_read_options(dataset), parse_options=_parse_options(dataset)) as reader:
+            return list(reader.schema.names)
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise _unreadable(file, error) from None
+
+
+def _read_columns(file: Path, names: list[str], dataset: Mapping[str, Any]) -> pa.Table:
+    try:
+        return pq.read_table(file, columns=names) if _is_parquet(file) else _read_csv(file, names, dataset, pa.float64())
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        if not _is_parquet(file):
+            _point_at_text(file, names, dataset)
+        raise _unreadable(file, error) from None
+
+
+def _read_csv(file: Path, names: list[str], dataset: Mapping[str, Any], kind: pa.DataType) -> pa.Table:
+    convert = pc.ConvertOptions(
+        include_columns=names,
+        column_types=dict.fromkeys(names, kind),
+        decimal_point=str(dataset.get("decimal", ".")),
+        strings_can_be_null=True,
+    )
+    return pc.read_csv(file, _read_options(dataset), _parse_options(dataset), convert)
+
+
+def _read_options(dataset: Mapping[str, Any]) -> pc.ReadOptions:
+    return pc.ReadOptions(encoding=str(dataset.get("encoding", "utf8")), skip_rows=int(dataset.get("skip_rows", 0)))
+
+
+def _parse_options(dataset: Mapping[str, Any]) -> pc.ParseOptions:
+    return pc.ParseOptions(delimiter=str(dataset.get("delimiter", ",")))
+
+
+def _point_at_text(file: Path, names: list[str], dataset: Mapping[str, Any]) -> None:
+    """Say where text stands in a column of numbers.
+
+    Raises:
+        DataError: where it is, if that is what is wrong with the file.
+    """
+    try:
+        table = _read_csv(file, names, dataset, pa.string())
+    except (OSError, pa.ArrowException, UnicodeDecodeError):
+        return
+    for name in names:
+        for row, text in enumerate(table.column(name).to_pylist(), start=1):
+            try:
+                float((text or "nan").replace(str(dataset.get("decimal", ".")), "."))
+            except ValueError:
+                raise DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {row}; numbers are needed") from None
+
+
+def _numbers(table: pa.Table, name: str, file: Path) -> FloatArray:
+    column = table.column(name)
+    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+        raise DataError(f"'{file}': column '{name}' is of type {column.type}; numbers are needed")
+    return column.cast(pa.float64()).to_numpy().astype(np.float64)
+
+
+def _unreadable(file: Path, error: Exception) -> DataError:
+    return DataError(
+        f"'{file}' cannot be read as a table ({str(error).splitlines()[0][:160]}); is it truncated, or of another format or encoding?"
+    )
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
