@@ -1,0 +1,1 @@
+"""How good an estimate is: metrics on a common grid of times."""

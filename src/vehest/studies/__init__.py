@@ -1,0 +1,1 @@
+"""One module a study: its tables and figures as pure functions of artefacts."""

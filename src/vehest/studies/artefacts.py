@@ -1,0 +1,103 @@
+"""What a study is made from: metrics, estimates, references and training histories that earlier stages wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from vehest.data.estimate import Estimate
+from vehest.data.splits import Split
+from vehest.data.store import read_estimate, read_recording
+from vehest.evaluation.metrics import Protocol, Scored, score
+
+METRIC_COLUMNS = (
+    "study",
+    "estimator",
+    "variant",
+    "trained_on",
+    "dataset",
+    "kind",
+    "test_set",
+    "subset",
+    "condition",
+    "rate_hz",
+    "mode",
+    "seed",
+    "metric",
+    "value",
+    "unit",
+)
+
+
+@dataclass(frozen=True)
+class EvaluatedModel:
+    """One fitted and evaluated estimator.
+
+    Args:
+        estimator: name in conf/estimator.
+        variant: what the paper calls it.
+        title: for people, for example ``KS-NN linear + bias, P = 2``.
+        seed: its seed.
+        model_folder: what the train stage wrote (``history.csv`` in it, where there is one).
+        evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set.
+    """
+
+    estimator: str
+    variant: str
+    title: str
+    seed: int
+    model_folder: Path
+    evaluation_folder: Path
+
+    def history(self) -> pd.DataFrame | None:
+        """Training history, one row an epoch (or a search); none if the method has none."""
+        path = self.model_folder / "history.csv"
+        return pd.read_csv(path) if path.is_file() else None
+
+    def estimate(self, test_set: str, position: int) -> Estimate:
+        """The stored estimate of the n-th range of a test set."""
+        return read_estimate(self.evaluation_folder / test_set / f"{position}.parquet")
+
+
+@dataclass(frozen=True)
+class StudyArtefacts:
+    """Everything a study module may look at.
+
+    Args:
+        study: name of the study.
+        title: its title.
+        about: a paragraph on what is compared, from the pipeline file.
+        command: the command that makes this report.
+        split: training, validation and test ranges.
+        protocol: how estimates are scored.
+        kinds: data set -> ``real`` or ``simulated``.
+        data_titles: data set -> title, for people.
+        metrics: long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range.
+        models: evaluated models, in the order of the pipeline file.
+        references: (data set, recording) -> Parquet file at the evaluation rate, references included.
+        facts: further lines on how it was made: training budget, versions, machine.
+    """
+
+    study: str
+    title: str
+    about: str
+    command: str
+    split: Split
+    protocol: Protocol
+    kinds: Mapping[str, str]
+    data_titles: Mapping[str, str]
+    metrics: pd.DataFrame
+    models: Sequence[EvaluatedModel]
+    references: Mapping[tuple[str, str], Path]
+    facts: Sequence[str]
+
+    def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
+        """Estimate and reference of a model on each range of a test set."""
+        spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
+        return [
+            score(model.estimate(test_set, position), read_recording(self.references[span.dataset, span.recording]), span, self.protocol)
+            for position, span in enumerate(spans)
+        ]
