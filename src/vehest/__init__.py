@@ -1,3 +1,20 @@
 """vehest: published estimators of a car's lateral velocity and sideslip angle, trained and compared on the same recordings."""
 
+from __future__ import annotations
+
+from typing import Any
+
 __version__ = "0.1.0"
+
+_API = ("Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate")
+
+__all__ = ["__version__", *_API]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the Python interface when it is first used, so that the command line starts quickly."""
+    if name in _API:
+        from vehest import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module 'vehest' has no attribute '{name}'")

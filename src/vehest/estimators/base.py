@@ -109,6 +109,11 @@ class Estimator(ABC):
         return self.name
 
     @property
+    def full_title(self) -> str:
+        """Title with what distinguishes this configuration, for people."""
+        return self.title
+
+    @property
     def batch_key(self) -> tuple[Any, ...]:
         """Estimators with equal keys may be fitted together as members."""
         return (self.name, *asdict(self.settings).items())

@@ -180,6 +180,13 @@ class Ksnn(WindowedEstimator):
         neurons = f"_q{self.settings.n_hidden}" if self.settings.n_hidden else ""
         return f"{kind}_{bias}_p{self.settings.n_local}{neurons}"
 
+    @property
+    def full_title(self) -> str:
+        """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
+        kind = "nonlinear" if self.settings.n_hidden else "linear"
+        neurons = f", Q = {self.settings.n_hidden}" if self.settings.n_hidden else ""
+        return f"{self.title} {kind} {'+ bias' if self.settings.bias else 'no bias'}, P = {self.settings.n_local}{neurons}"
+
     def new_network(self, train: list[Recording]) -> KinematicsStructuredNetwork:
         """A network whose local models span the yaw rates of the training recordings."""
         return KinematicsStructuredNetwork(self.settings, max(float(np.abs(r["yaw_rate"]).max()) for r in train))

@@ -106,6 +106,11 @@ class RecurrentEstimator(WindowedEstimator):
         """Name of the structure."""
         return f"states_{self.settings.n_states}"
 
+    @property
+    def full_title(self) -> str:
+        """With the number of states."""
+        return f"{self.title}, {self.settings.n_states} states"
+
     def new_network(self, train: list[Recording]) -> RecurrentNetwork:
         """A network that standardises by the training recordings."""
         network = self.empty_network()

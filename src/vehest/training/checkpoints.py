@@ -1,4 +1,4 @@
-"""State of an unfinished training, kept so that a killed one goes on to the same result."""
+"""State of one member's unfinished training, kept so that a killed one goes on to the same result."""
 
 from __future__ import annotations
 
@@ -52,9 +52,20 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
         return None
 
 
+def resume_epoch(folder: Path) -> int:
+    """Epochs that the checkpoint in ``folder`` saves, 0 if there is none, -1 if training was over and only the model is missing.
+
+    Members can go on together if they agree in this.
+    """
+    checkpoint = load_checkpoint(folder)
+    if checkpoint is None:
+        return 0
+    return -1 if checkpoint.values.get("finished") else int(checkpoint.values["epoch"])
+
+
 def drop_checkpoint(folder: Path) -> None:
-    """Forget the checkpoint in ``folder``."""
-    remove(folder / _FILE)
+    """Forget the checkpoint in ``folder``, and the folder with it."""
+    remove(folder)
 
 
 def as_os_error(error: SafetensorError) -> OSError:

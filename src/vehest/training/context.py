@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,13 +39,13 @@ class FitContext:
     """Surroundings of a fit.
 
     Args:
-        checkpoint_folder: where to keep the state of an unfinished fit; none if nothing is to be kept.
+        checkpoint_folders: where each member keeps the state of its unfinished fit; empty if nothing is to be kept.
         device: torch device name.
         should_stop: asked after every batch; True ends the fit cleanly with the best so far.
         on_progress: called after every epoch.
     """
 
-    checkpoint_folder: Path | None = None
+    checkpoint_folders: Sequence[Path] = ()
     device: str = "cpu"
     should_stop: Callable[[], bool] = field(default=_never)
     on_progress: Callable[[Progress], None] = field(default=_silent)

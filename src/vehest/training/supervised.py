@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
-from vehest.training.checkpoints import Checkpoint, drop_checkpoint, load_checkpoint, save_checkpoint
+from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, Progress
 from vehest.training.members import FlatParameters, predict_members
 from vehest.training.settings import SupervisedSettings
@@ -107,7 +107,7 @@ class _Run:
         self.active = torch.arange(len(networks))
         self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in seeds]
         self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in networks]
-        self.epoch = 0
+        self.epoch = 0  # of the members still active
         self.interrupted = False
         self.started = self.saved = time.monotonic()
         self._set_parameters(flat, None)
@@ -125,12 +125,13 @@ class _Run:
 
     def train_epoch(self) -> None:
         """One pass over the training windows, then the validation loss and the decisions that hang on it."""
-        before = self._checkpoint()
+        before = self._checkpoints()
         order = torch.stack([torch.randperm(len(self.train), generator=self.generators[m]) for m in self.active.tolist()])
         total = torch.zeros(len(self.active), dtype=torch.float64)
         for batch in order.split(self.settings.batch_size, dim=1):
             if self.context.should_stop():
-                self._interrupt(before)
+                self.interrupted = True
+                self._save(before)
                 return
             self.adam.zero_grad(set_to_none=True)
             views = self.layout.views(self.flat)
@@ -172,7 +173,7 @@ class _Run:
             Progress(self.epoch, self.settings.max_epochs, len(self.active), len(self.networks), float(self.best_loss.min()))
         )
         if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
-            self._save(self._checkpoint())
+            self._save(self._checkpoints())
 
     def _keep(self, rows: Tensor) -> None:
         """Let the other rows leave the batch."""
@@ -181,43 +182,63 @@ class _Run:
         self.active = self.active[rows]
         self._set_parameters(self.flat.detach()[rows], (moments[0], moments[1][rows], moments[2][rows]))
 
-    def _interrupt(self, before: Checkpoint) -> None:
-        self.interrupted = True
-        self._save(before)
-
-    def _checkpoint(self) -> Checkpoint:
-        tensors = {"flat": self.flat.detach().clone(), "best": self.best.clone(), "best_loss": self.best_loss.clone()}
-        tensors |= {"best_epoch": self.best_epoch.clone(), "active": self.active.clone()}
-        tensors |= {f"generator_{member}": generator.get_state() for member, generator in enumerate(self.generators)}
+    def _checkpoints(self) -> list[Checkpoint]:
+        """The state of every member, each by itself, so that any of them can go on without the others."""
         moments = self._moments()
-        if moments is not None:
-            tensors |= {"step": moments[0].clone(), "exp_avg": moments[1].clone(), "exp_avg_sq": moments[2].clone()}
-        return Checkpoint(tensors, {"epoch": self.epoch, "history": [[list(t), list(v)] for t, v in self.history]})
+        row_of = {member: row for row, member in enumerate(self.active.tolist())}
+        checkpoints = []
+        for member, generator in enumerate(self.generators):
+            tensors = {"best": self.best[member].clone()}
+            row = row_of.get(member)
+            if row is not None:
+                tensors |= {"generator": generator.get_state(), "parameters": self.flat.detach()[row].clone()}
+                if moments is not None:
+                    tensors |= {"step": moments[0].clone(), "mean": moments[1][row].clone(), "square": moments[2][row].clone()}
+            train_loss, validation_loss = self.history[member]
+            values = {
+                "finished": row is None,
+                "epoch": len(validation_loss),
+                "best_epoch": int(self.best_epoch[member]),
+                "best_loss": float(self.best_loss[member]),
+                "train_loss": list(train_loss),
+                "validation_loss": list(validation_loss),
+            }
+            checkpoints.append(Checkpoint(tensors, values))
+        return checkpoints
 
-    def _save(self, checkpoint: Checkpoint) -> None:
+    def _save(self, checkpoints: Sequence[Checkpoint]) -> None:
         self.saved = time.monotonic()
-        if self.context.checkpoint_folder is not None:
-            save_checkpoint(self.context.checkpoint_folder, checkpoint)
+        for folder, checkpoint in zip(self.context.checkpoint_folders, checkpoints, strict=False):
+            save_checkpoint(folder, checkpoint)
 
     def resume(self) -> None:
-        """Go on from the checkpoint, if there is one for these members."""
-        checkpoint = load_checkpoint(self.context.checkpoint_folder) if self.context.checkpoint_folder else None
-        if checkpoint is None or checkpoint.tensors["best"].shape != self.best.shape:
+        """Go on from the members' checkpoints, if all have one and those that are not finished agree in the epoch."""
+        loaded = [load_checkpoint(folder) for folder in self.context.checkpoint_folders]
+        checkpoints = [checkpoint for checkpoint in loaded if checkpoint is not None]
+        if len(checkpoints) < len(self.networks) or any(c.tensors["best"].shape != self.best[0].shape for c in checkpoints):
             return
-        tensors = dict(checkpoint.tensors)
-        self.best, self.best_loss, self.best_epoch = tensors["best"], tensors["best_loss"], tensors["best_epoch"]
-        self.active = tensors["active"]
-        for member, generator in enumerate(self.generators):
-            generator.set_state(tensors[f"generator_{member}"])
-        moments = (tensors["step"], tensors["exp_avg"], tensors["exp_avg_sq"]) if "step" in tensors else None
-        self._set_parameters(tensors["flat"], moments)
-        self.epoch = checkpoint.values["epoch"]
-        self.history = [(list(t), list(v)) for t, v in checkpoint.values["history"]]
+        unfinished = [member for member, checkpoint in enumerate(checkpoints) if not checkpoint.values["finished"]]
+        epochs = {checkpoints[member].values["epoch"] for member in unfinished}
+        if len(epochs) > 1:
+            return
+        for member, checkpoint in enumerate(checkpoints):
+            self.best[member] = checkpoint.tensors["best"]
+            self.best_loss[member] = checkpoint.values["best_loss"]
+            self.best_epoch[member] = checkpoint.values["best_epoch"]
+            self.history[member] = (list(checkpoint.values["train_loss"]), list(checkpoint.values["validation_loss"]))
+        self.active = torch.tensor(unfinished, dtype=torch.int64)
+        self.epoch = epochs.pop() if epochs else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
+        if unfinished:
+            states = [checkpoints[member].tensors for member in unfinished]
+            for member in unfinished:
+                self.generators[member].set_state(checkpoints[member].tensors["generator"])
+            moments = None
+            if "step" in states[0]:
+                moments = (states[0]["step"], torch.stack([s["mean"] for s in states]), torch.stack([s["square"] for s in states]))
+            self._set_parameters(torch.stack([s["parameters"] for s in states]), moments)
 
     def finish(self) -> list[TrainingRecord]:
         """Put the best weights into the networks."""
-        if not self.interrupted and self.context.checkpoint_folder is not None:
-            drop_checkpoint(self.context.checkpoint_folder)
         seconds = time.monotonic() - self.started
         records = []
         for member, network in enumerate(self.networks):

@@ -1,0 +1,5 @@
+"""``python -m vehest``."""
+
+from vehest.cli import main
+
+main()

@@ -1,0 +1,1 @@
+"""Ingest, downsample, train, evaluate, report: configuration in, artefacts out."""

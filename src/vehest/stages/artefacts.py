@@ -1,0 +1,224 @@
+"""What a stage leaves behind: one folder with a manifest, complete or not there at all.
+
+The folder's name ends in the stage's key. The key is a hash of everything that determines the content: the stage's
+configuration, the digests of its inputs and the version of its code. Commit, library versions, time and machine are
+written down as provenance and are not part of the key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import vehest
+from vehest.data.errors import DataError, MissingError
+from vehest.data.files import remove_leftovers, sha256_of, written_aside
+
+MANIFEST = "manifest.json"
+Status = Literal["complete", "interrupted"]
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """What a stage is going to make.
+
+    Args:
+        stage: name of the stage.
+        label: what it is made from, for people; start of the folder's name.
+        config: the part of the configuration that matters here, plain values.
+        inputs: input name -> digest.
+        code: version of the stage's code.
+        output: the output root.
+    """
+
+    stage: str
+    label: str
+    config: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    code: str
+    output: Path
+
+    @property
+    def key(self) -> str:
+        """Hash of what determines the content."""
+        content = {"stage": self.stage, "config": self.config, "inputs": dict(self.inputs), "code": self.code}
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+    @property
+    def folder(self) -> Path:
+        """Where the artefact belongs."""
+        return self.output / self.stage / f"{self.label}-{self.key[:12]}"
+
+    @property
+    def checkpoint_folder(self) -> Path:
+        """Where an unfinished run of this stage keeps its state."""
+        return self.output / "checkpoints" / f"{self.label}-{self.key[:12]}"
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """What a stage made.
+
+    Args:
+        folder: where it is.
+        stage: which stage made it.
+        label: what it was made from.
+        key: see the module.
+        status: ``complete``, or ``interrupted`` where a fit was stopped with its best so far.
+        outputs: file -> sha256.
+        config: configuration of the stage.
+        inputs: input name -> digest.
+        provenance: time, seconds, versions, machine.
+        skipped: whether it was there already.
+    """
+
+    folder: Path
+    stage: str
+    label: str
+    key: str
+    status: Status
+    outputs: Mapping[str, str]
+    config: Mapping[str, Any]
+    inputs: Mapping[str, str]
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    skipped: bool = False
+
+    @property
+    def digest(self) -> str:
+        """Hash of the content, for the stages that build on it."""
+        return hashlib.sha256(json.dumps(dict(self.outputs), sort_keys=True).encode()).hexdigest()
+
+
+def find(plan: StagePlan) -> Artefact | None:
+    """The finished artefact of a plan, if it is there whole."""
+    try:
+        artefact = read_artefact(plan.folder)
+    except (DataError, MissingError):
+        return None
+    if artefact.key != plan.key or artefact.status != "complete":
+        return None
+    return artefact
+
+
+def read_artefact(folder: Path) -> Artefact:
+    """Read a stage's folder.
+
+    Raises:
+        MissingError: there is no manifest.
+        DataError: the manifest is damaged, or a file it names is gone or has another size.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise MissingError(f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it")
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        files = manifest["outputs"]
+        for name, entry in files.items():
+            if not (folder / name).is_file() or (folder / name).stat().st_size != entry["bytes"]:
+                raise DataError(f"'{folder / name}' is gone or truncated; run the stage '{manifest['stage']}' again")
+        return Artefact(
+            folder=folder,
+            stage=manifest["stage"],
+            label=manifest["label"],
+            key=manifest["key"],
+            status=manifest["status"],
+            outputs={name: entry["sha256"] for name, entry in files.items()},
+            config=manifest["config"],
+            inputs=manifest["inputs"],
+            provenance=manifest["provenance"],
+            skipped=True,
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"'{path}' is damaged ({type(error).__name__}); remove the folder and run the stage again") from error
+
+
+def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
+    """Run a stage: let ``write`` fill a folder aside, add the manifest, put the folder in its place.
+
+    Args:
+        plan: what is made.
+        write: fills an empty folder; returns ``interrupted`` if it was stopped.
+
+    Raises:
+        MissingError: the disk is full or not writable.
+        VehestError: whatever ``write`` raises; nothing is left behind then.
+    """
+    started = time.monotonic()
+    remove_leftovers(plan.folder.parent)
+    with written_aside(plan.folder) as aside:
+        aside.mkdir()
+        status = write(aside) or "complete"
+        files = sorted(file for file in aside.rglob("*") if file.is_file())
+        outputs = {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files}
+        manifest = {
+            "stage": plan.stage,
+            "label": plan.label,
+            "key": plan.key,
+            "status": status,
+            "config": plan.config,
+            "inputs": dict(plan.inputs),
+            "code": plan.code,
+            "outputs": outputs,
+            "provenance": provenance(time.monotonic() - started),
+        }
+        (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
+    made = read_artefact(plan.folder)
+    return Artefact(**{**made.__dict__, "skipped": False})
+
+
+def provenance(seconds: float) -> dict[str, Any]:
+    """Circumstances that are worth knowing and do not determine the content."""
+    return {
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "seconds": round(seconds, 3),
+        "vehest": vehest.__version__,
+        "commit": commit(),
+        "python": platform.python_version(),
+        "libraries": library_versions(),
+        "platform": platform.platform(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+@cache
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries that numbers depend on."""
+    names = ("torch", "numpy", "scipy", "numba", "pandas", "pyarrow", "hydra-core", "mlflow", "commonroad-vehicle-models")
+    versions = {}
+    for name in names:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+@cache
+def commit() -> str:
+    """Commit of the checkout that vehest runs from, with a mark if it has changes; empty if it is no checkout."""
+    folder = Path(vehest.__file__).resolve().parents[2]
+    if not (folder / ".git").exists() or "site-packages" in folder.parts:
+        return ""
+    try:
+        result = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return result.stdout.strip()

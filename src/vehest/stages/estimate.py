@@ -1,0 +1,124 @@
+"""Running a trained model on a new recording that has no reference channels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vehest.data.checks import checks_of_recording
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.estimate import QUANTITIES, Estimate
+from vehest.data.files import written_aside
+from vehest.data.recording import Recording
+from vehest.data.store import write_estimate
+from vehest.data.transforms import Resample
+from vehest.estimators.base import Estimator
+from vehest.sources.tabular import TabularSource
+from vehest.stages.config import compose_config
+from vehest.stages.downsample import transforms_of
+
+SUFFIXES = (".parquet", ".csv")
+
+
+def find_model(name: str, output: Path) -> Path:
+    """A model's folder, by path or by the start of its name in the output root.
+
+    Raises:
+        MissingError: there is none.
+        ConfigurationError: several have that name.
+    """
+    given = Path(name)
+    if given.is_dir():
+        return given
+    found = sorted(folder for folder in (output / "train").glob(f"{given.name}*") if folder.is_dir() and not folder.name.startswith("."))
+    if not found:
+        known = sorted(folder.name for folder in (output / "train").glob("[!.]*"))
+        listed = f" (there are: {', '.join(known[:8])}{', …' if len(known) > 8 else ''})" if known else "; train one first"
+        raise MissingError(f"there is no model '{name}', neither a folder nor in '{output / 'train'}'{listed}")
+    if len(found) > 1:
+        raise ConfigurationError(f"'{name}' could be any of: {', '.join(folder.name for folder in found[:8])}; say more of the name")
+    return found[0]
+
+
+def read_table(path: Path, overrides: Sequence[str] = ()) -> Recording:
+    """Read a CSV or Parquet recording, as conf/estimate.yaml and overrides describe its columns.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be used as it is.
+        ConfigurationError: the data set named by the overrides is not a table.
+    """
+    config = compose_config("estimate", overrides)
+    dataset = config["dataset"]
+    if dataset.get("source") != "tabular":
+        raise ConfigurationError(f"data set '{dataset.get('name')}' does not describe tables; use one with source: tabular")
+    recording = TabularSource(dataset).read_file(path)
+    accepted = set(dataset.get("accept") or [])
+    for finding in checks_of_recording(recording):
+        if finding.level == "error" and finding.check not in accepted:
+            raise DataError(f"'{path}': channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
+    return recording
+
+
+def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any] | None = None) -> Estimate:
+    """Bring a recording to the model's rate and run the model on it.
+
+    Args:
+        model: fitted.
+        recording: with the channels that the model reads, at any rate from the model's upwards.
+        downsample: ``downsample`` of the configuration; anti-aliased resampling by default.
+
+    Raises:
+        DataError: a channel is missing, or the recording is sampled too slowly.
+    """
+    rate = model.settings.rate_hz
+    needed = recording.select(model.channels) if all(name in recording for name in model.channels) else recording
+    for name in model.channels:
+        if name not in needed:
+            raise DataError(
+                f"recording '{recording.id}' has no channel '{name}', which '{model.name}' needs (it reads {', '.join(model.channels)})"
+            )
+    if recording.rate_hz < rate * (1 - 1e-9):
+        raise DataError(
+            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate:g} Hz that '{model.name}' works at"
+        )
+    transforms = [Resample(rate)] if downsample is None else transforms_of({"rate_hz": rate, **downsample})
+    for transform in transforms:
+        needed = transform(needed)
+    return model.estimate([needed])[0]
+
+
+def write_estimate_table(estimate: Estimate, path: Path) -> None:
+    """Write an estimate as Parquet or CSV, by the file's ending.
+
+    Raises:
+        ConfigurationError: another ending.
+        MissingError: it cannot be written.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigurationError(f"'{path}' must end in {' or '.join(SUFFIXES)}")
+    if path.suffix.lower() == ".parquet":
+        write_estimate(estimate, path)
+        return
+    frame = pd.DataFrame({"time": estimate.time, **estimate.channels})
+    with written_aside(path) as aside:
+        frame.to_csv(aside, index=False, lineterminator="\n")
+
+
+def summary_of(estimate: Estimate) -> dict[str, Any]:
+    """What an estimate holds, for people and scripts."""
+    known = estimate["vy"][~pd.isna(estimate["vy"])]
+    degrees = [math.degrees(value) for value in (estimate["sideslip"][~pd.isna(estimate["sideslip"])])] or [math.nan]
+    return {
+        "recording": estimate.recording_id,
+        "estimator": estimate.estimator,
+        "rate_hz": estimate.rate_hz,
+        "samples": len(estimate),
+        "estimated": len(known),
+        "quantities": {name: QUANTITIES[name] for name in estimate.channels},
+        "sideslip_deg": {"min": round(min(degrees), 3), "max": round(max(degrees), 3)},
+    }

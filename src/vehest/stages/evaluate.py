@@ -1,0 +1,174 @@
+"""Fourth stage: fitted estimators to estimates and metrics, all read on one grid of times."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.data.recording import Recording
+from vehest.data.splits import Span, Split
+from vehest.data.store import read_recording, write_estimate
+from vehest.estimators.base import Estimator
+from vehest.estimators.model_files import load_model, read_description
+from vehest.estimators.registry import estimator_module
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+from vehest.stages.artefacts import Artefact, StagePlan
+from vehest.stages.code_version import code_version
+from vehest.stages.train import file_digest, read_fit_metrics, recording_file
+
+STAGE = "evaluate"
+METRICS = "metrics.csv"
+VALIDATION = "validation"
+TIMED_STEPS = 200
+
+COLUMNS = (
+    "estimator",
+    "variant",
+    "trained_on",
+    "dataset",
+    "kind",
+    "test_set",
+    "subset",
+    "condition",
+    "rate_hz",
+    "mode",
+    "seed",
+    "metric",
+    "value",
+    "unit",
+)
+
+
+@dataclass(frozen=True)
+class EvaluateJob:
+    """One model to evaluate.
+
+    Args:
+        plan: the artefact it becomes.
+        model: what the train stage made.
+        split: its validation range and tests are scored.
+        data: data set -> recordings at the estimator's rate.
+        references: data set -> recordings at the evaluation rate.
+        kinds: data set -> ``real`` or ``simulated``.
+        protocol: how estimates are scored.
+    """
+
+    plan: StagePlan
+    model: Artefact
+    split: Split
+    data: Mapping[str, Artefact]
+    references: Mapping[str, Artefact]
+    kinds: Mapping[str, str]
+    protocol: Protocol
+
+
+def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
+    """How estimates are scored.
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+    protocol = Protocol(**{key: float(value) for key, value in config.items()})
+    if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
+        raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
+    return protocol
+
+
+def plan_evaluate(
+    model: Artefact,
+    split: Split,
+    data: Mapping[str, Artefact],
+    references: Mapping[str, Artefact],
+    kinds: Mapping[str, str],
+    protocol: Protocol,
+    output: Path,
+) -> EvaluateJob:
+    """What an evaluation would make.
+
+    Raises:
+        DataError: the split names a recording that the data set does not have.
+    """
+    estimator = str(read_description(model.folder)["estimator"])
+    inputs = {"model": model.digest}
+    for span in scored_spans(split):
+        inputs[f"{span.dataset}/{span.recording}"] = file_digest(data[span.dataset], span)
+        inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
+    sets = {name: [str(span) for span in spans] for name, spans in test_sets(split).items()}
+    plan = StagePlan(
+        stage=STAGE,
+        label=f"{model.label}-on-{split.name}",
+        config={"sets": sets, "protocol": asdict(protocol), "kinds": dict(kinds), "split": split.name},
+        inputs=inputs,
+        code=code_version([estimator_module(estimator), "vehest.evaluation.metrics", "vehest.estimators.model_files"], own=[__name__]),
+        output=output,
+    )
+    return EvaluateJob(plan, model, split, data, references, kinds, protocol)
+
+
+def write_evaluation(job: EvaluateJob, folder: Path) -> None:
+    """Estimate and score every range; write estimates and metrics into ``folder``."""
+    estimator = load_model(job.model.folder)
+    seed = int(read_description(job.model.folder)["about"]["seed"])
+    fit = read_fit_metrics(job.model.folder)
+    rows: list[tuple[Any, ...]] = []
+    for name, spans in test_sets(job.split).items():
+        parts = []
+        for position, span in enumerate(spans):
+            parts.append(_estimate_and_score(estimator, job, span, folder / name / f"{position}.parquet"))
+        figures = accuracy(parts)
+        if name != VALIDATION:
+            figures |= {key: fit[key] for key in ("n_parameters", "epochs", "train_seconds")}
+            figures["step_seconds"] = _step_seconds(estimator, _measured(job, spans[0]))
+        trained_on = "+".join(dict.fromkeys(span.dataset for span in job.split.train))
+        datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
+        kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
+        mode = "causal" if estimator.causal else "offline"
+        head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, "all", "nominal", job.protocol.rate_hz, mode, seed)
+        rows += [(*head, metric, repr(float(value)), UNITS[metric]) for metric, value in figures.items()]
+    with open(folder / METRICS, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(rows)
+
+
+def test_sets(split: Split) -> dict[str, Sequence[Span]]:
+    """Everything that is scored; the validation range too, since seeds are chosen on it."""
+    return {VALIDATION: split.validation, **split.tests}
+
+
+def scored_spans(split: Split) -> list[Span]:
+    """The ranges of all test sets."""
+    return [span for spans in test_sets(split).values() for span in spans]
+
+
+def _measured(job: EvaluateJob, span: Span) -> Recording:
+    """What the estimator may see of a range: no references, and a warm-up before it."""
+    recording = read_recording(recording_file(job.data[span.dataset], span))
+    return recording.cut(span.start - job.protocol.warm_up_seconds, span.stop).without_references()
+
+
+def _estimate_and_score(estimator: Estimator, job: EvaluateJob, span: Span, file: Path) -> Scored:
+    estimate = estimator.estimate([_measured(job, span)])[0]
+    write_estimate(estimate, file)
+    reference = read_recording(recording_file(job.references[span.dataset], span))
+    return score(estimate, reference, span, job.protocol)
+
+
+def _step_seconds(estimator: Estimator, recording: Recording) -> float:
+    """Median time of one online step on this machine [s]."""
+    stepper = estimator.online()
+    columns = {name: recording[name] for name in estimator.channels}
+    times = np.empty(min(TIMED_STEPS, len(recording)))
+    for k in range(len(times)):
+        sample = {name: float(samples[k]) for name, samples in columns.items()}
+        started = time.perf_counter()
+        stepper.step(sample)
+        times[k] = time.perf_counter() - started
+    return float(np.median(times))

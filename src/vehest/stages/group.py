@@ -1,0 +1,137 @@
+"""What one worker does: train the members of a group together, then evaluate each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vehest.data.splits import Split
+from vehest.evaluation.metrics import Protocol
+from vehest.stages.artefacts import Artefact, Status, find, make
+from vehest.stages.evaluate import plan_evaluate, write_evaluation
+from vehest.stages.train import TrainJob, fit_jobs, write_model
+from vehest.training.checkpoints import drop_checkpoint, resume_epoch
+from vehest.training.context import FitContext, Progress
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How the members of a group are to be evaluated.
+
+    Args:
+        split: its validation range and tests are scored.
+        data: data set -> recordings at the estimator's rate.
+        references: data set -> recordings at the evaluation rate.
+        kinds: data set -> ``real`` or ``simulated``.
+        protocol: how estimates are scored.
+        output: the output root.
+    """
+
+    split: Split
+    data: Mapping[str, Artefact]
+    references: Mapping[str, Artefact]
+    kinds: Mapping[str, str]
+    protocol: Protocol
+    output: Path
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members that fit one batch, and what is to be done with them.
+
+    Args:
+        jobs: in the order of the pipeline.
+        evaluation: none if they are trained only.
+        force: stages to run although their artefacts are there.
+    """
+
+    jobs: Sequence[TrainJob]
+    evaluation: Evaluation | None = None
+    force: frozenset[str] = frozenset()
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        seeds = [str(job.seed) for job in self.jobs]
+        label = self.jobs[0].plan.label.rsplit("-seed", 1)[0]
+        return f"{label} seed {seeds[0]}" if len(seeds) == 1 else f"{label} seeds {', '.join(seeds)}"
+
+
+@dataclass(frozen=True)
+class Member:
+    """What became of one member: its model and its evaluation, where they are there."""
+
+    job: TrainJob
+    model: Artefact | None = None
+    evaluation: Artefact | None = None
+
+
+def existing(group: Group) -> list[Member]:
+    """What of a group is there already."""
+    members = []
+    for job in group.jobs:
+        model = None if "train" in group.force else find(job.plan)
+        members.append(Member(job, model, _found_evaluation(group, model)))
+    return members
+
+
+def is_finished(group: Group, member: Member) -> bool:
+    """Whether nothing is left to do for a member."""
+    return member.model is not None and (group.evaluation is None or member.evaluation is not None)
+
+
+def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
+    """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted."""
+    models = {member.job.plan.key: member.model for member in existing(group)}
+    for jobs in _together([job for job in group.jobs if models[job.plan.key] is None]):
+        if should_stop():
+            break
+        for artefact in _train(jobs, should_stop, on_progress):
+            models[artefact.key] = artefact
+    members = []
+    for job in group.jobs:
+        model = models[job.plan.key]
+        evaluation = None
+        if model is not None and model.status == "complete" and group.evaluation is not None and not should_stop():
+            evaluation = _found_evaluation(group, model) or _evaluate(group.evaluation, model)
+        members.append(Member(job, model, evaluation))
+    return members
+
+
+def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
+    """Jobs that can go on together: those whose checkpoints, if any, stand at the same epoch."""
+    batches: dict[int, list[TrainJob]] = {}
+    for job in jobs:
+        batches.setdefault(resume_epoch(job.plan.checkpoint_folder), []).append(job)
+    return list(batches.values())
+
+
+def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Artefact]:
+    folders = [job.plan.checkpoint_folder for job in jobs]
+    context = FitContext(checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress)
+    artefacts = []
+    for job, (estimator, record) in zip(jobs, fit_jobs(jobs, context), strict=True):
+        if record.interrupted and not record.metrics.get("best_epoch", 1):
+            continue  # nothing learnt yet; the checkpoint knows where to go on
+
+        def write(folder: Path, job: TrainJob = job, estimator=estimator, record=record) -> Status:  # type: ignore[no-untyped-def]
+            write_model(job, estimator, record, folder)
+            return "interrupted" if record.interrupted else "complete"
+
+        artefacts.append(make(job.plan, write))
+        if not record.interrupted:
+            drop_checkpoint(job.plan.checkpoint_folder)
+    return artefacts
+
+
+def _found_evaluation(group: Group, model: Artefact | None) -> Artefact | None:
+    if model is None or group.evaluation is None or "evaluate" in group.force:
+        return None
+    e = group.evaluation
+    return find(plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output).plan)
+
+
+def _evaluate(e: Evaluation, model: Artefact) -> Artefact:
+    job = plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output)
+    return make(job.plan, lambda folder: write_evaluation(job, folder))

@@ -1,0 +1,128 @@
+"""Looking at data sets and files: what `vehest data list | show | check` print."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.data.channels import CHANNELS
+from vehest.data.checks import checks_of_recording
+from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.recording import Recording
+from vehest.sources.base import open_source
+from vehest.sources.tabular import TabularSource
+from vehest.stages.config import compose_config
+from vehest.stages.config_files import choices
+
+
+def dataset_rows() -> list[dict[str, str]]:
+    """A row a data set: name, kind, source, whether its files are here, title, licence."""
+    rows = []
+    for name in choices("dataset"):
+        dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
+        rows.append(
+            {
+                "dataset": name,
+                "kind": str(dataset.get("kind", "")),
+                "source": str(dataset.get("source", "")),
+                "here": _is_here(dataset),
+                "title": str(dataset.get("title", "")),
+                "licence": " ".join(str(dataset.get("licence", "")).split()),
+            }
+        )
+    return rows
+
+
+def describe(source: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Recordings of a data set or file, with ranges of their channels.
+
+    Raises:
+        VehestError: they cannot be read.
+    """
+    recordings = []
+    for recording in _recordings(source, overrides):
+        if isinstance(recording, tuple):
+            raise recording[1]
+        channels = [
+            {
+                "name": name,
+                "unit": CHANNELS[name].unit,
+                "min": float(np.nanmin(samples)),
+                "mean": float(np.nanmean(samples)),
+                "max": float(np.nanmax(samples)),
+                "std": float(np.nanstd(samples)),
+            }
+            for name, samples in recording.channels.items()
+        ]
+        recordings.append(
+            {
+                "id": recording.id,
+                "vehicle": recording.vehicle,
+                "kind": recording.kind,
+                "rate_hz": recording.rate_hz,
+                "start": recording.start_time,
+                "end": recording.end_time,
+                "samples": len(recording),
+                "channels": channels,
+                "provenance": dict(recording.provenance),
+            }
+        )
+    return {"source": source, "recordings": recordings}
+
+
+def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
+    """What the checks find, a row a finding; a recording that cannot be read is an error too."""
+    rows = []
+    for recording in _recordings(source, overrides):
+        if isinstance(recording, tuple):
+            name, error = recording
+            rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
+            continue
+        for finding in checks_of_recording(recording):
+            rows.append(
+                {
+                    "level": finding.level,
+                    "recording": recording.id,
+                    "check": finding.check,
+                    "channel": finding.channel,
+                    "message": finding.message,
+                }
+            )
+    return rows
+
+
+def _recordings(source: str, overrides: Sequence[str]) -> Iterator[Recording | tuple[str, VehestError]]:
+    """Recordings one after another; one that cannot be read comes as its name and the error."""
+    if source not in choices("dataset"):
+        file = Path(source)
+        if not file.exists():
+            raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
+        config = compose_config("estimate", overrides)
+        try:
+            yield TabularSource(config["dataset"]).read_file(file)
+        except DataError as error:
+            yield file.name, error
+        return
+    config = compose_config("ingest", [f"dataset={source}", *overrides])
+    origin = open_source(config["dataset"])
+    for recording_id in origin.ids():
+        try:
+            yield origin.read(recording_id)
+        except DataError as error:
+            yield recording_id, error
+
+
+def _is_here(dataset: dict[str, Any]) -> str:
+    if dataset.get("source") == "simulated":
+        return "yes"
+    if not os.environ.get("VEHEST_DATA"):
+        return "no root"
+    try:
+        open_source(dataset).inputs()
+    except VehestError:
+        return "no"
+    return "yes"

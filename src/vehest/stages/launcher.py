@@ -1,0 +1,165 @@
+"""Runs jobs on the machine's cores; a job that fails is returned as a value and the others go on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any, Generic, TypeVar
+
+from vehest.data.errors import VehestError
+from vehest.stages.signals import StopSignals
+from vehest.training.context import Progress
+
+Outcome = TypeVar("Outcome")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job that failed.
+
+    Args:
+        message: one line.
+        detail: traceback, where it was a defect rather than an expected error.
+        exit_code: what a command that runs this job alone leaves with.
+    """
+
+    message: str
+    detail: str = ""
+    exit_code: int = 1
+
+
+@dataclass(frozen=True)
+class Task(Generic[Outcome]):
+    """Something to run.
+
+    Args:
+        name: for people.
+        run: called with (should_stop, on_progress); picklable.
+    """
+
+    name: str
+    run: Callable[[Callable[[], bool], Callable[[Progress], None]], Outcome]
+
+
+@dataclass(frozen=True)
+class Done(Generic[Outcome]):
+    """How a task ended."""
+
+    position: int
+    outcome: Outcome | Failure
+
+
+Reporter = Callable[[int, Progress | None], None]
+
+
+def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+    """Run tasks, as many at a time as ``jobs`` says, and yield them as they end.
+
+    Args:
+        tasks: started in this order.
+        jobs: processes; 1 runs everything in this one.
+        stop: when a signal came, running tasks are asked to end and no other is started.
+        report: called with the task's position and its progress (None when it starts).
+    """
+    if min(jobs, len(tasks)) <= 1:
+        yield from _launch_here(tasks, stop, report)
+    else:
+        yield from _launch_in_processes(tasks, min(jobs, len(tasks)), stop, report)
+
+
+def default_jobs() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+    use_one_thread()
+    for position, task in enumerate(tasks):
+        if stop.requested():
+            return
+        report(position, None)
+        with stop.deferred():
+            outcome = _guarded(task, stop.requested, lambda progress, at=position: report(at, progress))  # type: ignore[misc]
+        yield Done(position, outcome)
+
+
+def _launch_in_processes(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+    context = get_context("spawn")
+    stopping, messages = context.Event(), context.SimpleQueue()
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(stopping, messages, os.getpid()))
+    with stop.deferred(), pool:
+        futures = {pool.submit(_work, position, task): position for position, task in enumerate(tasks)}
+        waiting = set(futures)
+        while waiting:
+            done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+            while not messages.empty():
+                report(*messages.get())
+            if stop.requested() and not stopping.is_set():
+                stopping.set()
+                for future in waiting:
+                    future.cancel()
+            for future in done:
+                if future.cancelled():
+                    continue
+                error = future.exception()
+                outcome = future.result() if error is None else Failure(f"a worker process ended unexpectedly ({error})")
+                if outcome is not None:
+                    yield Done(futures[future], outcome)
+
+
+_worker: dict[str, Any] = {}
+
+
+def _start_worker(stopping: Any, messages: Any, parent: int) -> None:
+    """Leave signals to the parent, end with it, and use one thread."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    use_one_thread()
+    _worker.update(stopping=stopping, messages=messages)
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
+
+
+def _work(position: int, task: Task[Outcome]) -> Outcome | Failure | None:
+    stopping, messages = _worker["stopping"], _worker["messages"]
+    if stopping.is_set():
+        return None
+    messages.put((position, None))
+    last = 0.0
+
+    def on_progress(progress: Progress) -> None:
+        nonlocal last
+        if time.monotonic() - last > 0.2:
+            last = time.monotonic()
+            messages.put((position, progress))
+
+    return _guarded(task, stopping.is_set, on_progress)
+
+
+def _guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> Outcome | Failure:
+    try:
+        return task.run(should_stop, on_progress)
+    except VehestError as error:
+        return Failure(str(error), exit_code=error.exit_code)
+    except Exception as error:
+        import traceback
+
+        return Failure(f"{type(error).__name__}: {error}", detail=traceback.format_exc())
+
+
+def use_one_thread() -> None:
+    """Recursions over small states gain nothing from more threads, and jobs run side by side."""
+    import torch
+
+    torch.set_num_threads(1)

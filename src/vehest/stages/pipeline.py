@@ -1,0 +1,234 @@
+"""A pipeline: sweeps of trainings, the evaluations they feed, and the study that draws tables and figures from them."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
+from vehest.data.splits import split_from_config
+from vehest.stages.artefacts import Artefact
+from vehest.stages.config import Config, compose_config, expand, has_key, key_of
+from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
+from vehest.stages.evaluate import protocol_from_config
+from vehest.stages.group import Evaluation, Group, existing, is_finished
+from vehest.stages.report import ReportJob, leaderboard_of, plan_report, publish, write_report
+from vehest.stages.tracking import Tracker
+from vehest.stages.train import TrainJob, plan_train
+from vehest.stages.workshop import Workshop
+
+KEYS = {"study", "title", "about", "report", "split", "sweeps", "evaluation", "publish"}
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A study as pipelines/*.yaml describes it.
+
+    Args:
+        study: its name.
+        title: for people.
+        about: a paragraph on what is compared and why.
+        report: module of `vehest.studies` that draws it.
+        split: conf/split it works on.
+        sweeps: overrides of each sweep, several values allowed.
+        evaluation: overrides of conf/eval.yaml's ``evaluation``.
+        publish: whether its outcome also goes to results/<study>.
+        file: where it was read from.
+    """
+
+    study: str
+    title: str
+    about: str
+    report: str
+    split: str
+    sweeps: tuple[tuple[str, ...], ...]
+    evaluation: tuple[str, ...]
+    publish: bool
+    file: Path
+
+
+@dataclass(frozen=True)
+class PipelineOutcome:
+    """What a pipeline made.
+
+    Args:
+        report: artefact of the report stage.
+        leaderboard: its table, one row an estimator and test set.
+        published: folder in results/, if it was published.
+    """
+
+    report: Artefact
+    leaderboard: pd.DataFrame
+    published: Path | None
+
+
+def read_pipeline(name: str) -> Pipeline:
+    """Read a pipeline by path or name.
+
+    Raises:
+        MissingError: there is none of that name.
+        ConfigurationError: the file is not a pipeline.
+    """
+    file = find_pipeline(name)
+    if file is None:
+        close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
+        hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
+        raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict) or set(content) - KEYS or not {"study", "report", "split", "sweeps"} <= set(content):
+        wrong = sorted(set(content) - KEYS)[:1] if isinstance(content, dict) else []
+        reason = f"unknown key '{wrong[0]}'" if wrong else "it needs study, report, split and sweeps"
+        raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
+    sweeps = content["sweeps"]
+    if not isinstance(sweeps, list) or not all(isinstance(sweep, list) and sweep for sweep in sweeps):
+        raise ConfigurationError(f"'{file}': sweeps must be a list of lists of overrides")
+    if importlib.util.find_spec(f"vehest.studies.{content['report']}") is None:
+        raise ConfigurationError(f"'{file}': there is no study module '{content['report']}' in vehest.studies")
+    return Pipeline(
+        study=str(content["study"]),
+        title=str(content.get("title", content["study"])),
+        about=" ".join(str(content.get("about", "")).split()),
+        report=str(content["report"]),
+        split=str(content["split"]),
+        sweeps=tuple(tuple(str(override) for override in sweep) for sweep in sweeps),
+        evaluation=tuple(f"evaluation.{key}={value}" for key, value in (content.get("evaluation") or {}).items()),
+        publish=bool(content.get("publish", False)),
+        file=file,
+    )
+
+
+def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Config]:
+    """The configuration of every job; further overrides apply to the sweeps that have their key.
+
+    Raises:
+        ConfigurationError: an override that suits none of the sweeps.
+    """
+    used: set[str] = set()
+    configs: list[Config] = []
+    for sweep in pipeline.sweeps:
+        for job in expand([f"split={pipeline.split}", *pipeline.evaluation, *sweep]):
+            seeds = [override for override in job if key_of(override) == "seed"]
+            shared = tuple(override for override in job if override not in seeds)
+            base = _composed(shared)
+            suiting = [override for override in overrides if key_of(override) in GROUPS or has_key(base, key_of(override))]
+            used.update(suiting)
+            config = dict(_composed((*shared, *suiting)))
+            own_seed = any(key_of(override) == "seed" for override in suiting)
+            if seeds and not own_seed:
+                config["seed"] = compose_seed(seeds[-1])
+            if config not in configs:
+                configs.append(config)
+    for override in overrides:
+        if override not in used:
+            raise ConfigurationError(f"'{override}' suits no sweep of '{pipeline.file.name}': none has an option '{key_of(override)}'")
+    return configs
+
+
+def compose_seed(override: str) -> Any:
+    """The value of ``seed=…``."""
+    return yaml.safe_load(override.split("=", 1)[1])
+
+
+_composed_cache: dict[tuple[str, ...], Config] = {}
+
+
+def _composed(overrides: tuple[str, ...]) -> Config:
+    if overrides not in _composed_cache:
+        _composed_cache[overrides] = compose_config("eval", overrides)
+    return _composed_cache[overrides]
+
+
+def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Workshop, *, only_report: bool = False) -> PipelineOutcome:
+    """Run every stage of a pipeline; what is there is skipped.
+
+    Args:
+        pipeline: the study.
+        configs: its jobs, from `pipeline_configs`.
+        workshop: where stages run.
+        only_report: draw the report from what is there, train and evaluate nothing.
+
+    Raises:
+        JobsFailedError: some jobs failed; the others are kept.
+        MissingError: ``only_report`` and something is missing.
+        NotThereYet: in a dry run.
+        Stopped: a signal came.
+    """
+    first = configs[0]
+    workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn)
+    workshop.tags = {"vehest.study": pipeline.study}
+    groups = _groups(configs, workshop)
+    if only_report:
+        for group in groups:
+            for member in existing(group):
+                if not is_finished(group, member):
+                    raise MissingError(
+                        f"{member.job.plan.label} has not been trained and evaluated; run 'vehest run {pipeline.file}' first"
+                    )
+    members, failures = workshop.run_groups(groups)
+    if failures:
+        listed = "; ".join(f"{name}: {failure.message}" for name, failure in failures)
+        for name, failure in failures:
+            if failure.detail:
+                workshop.messages.warn(f"{name}:\n{failure.detail}")
+        raise JobsFailedError(f"{len(failures)} of {len(groups)} groups of jobs failed, the others are kept; {listed}")
+    order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
+    members.sort(key=lambda member: order[member.job.plan.key])
+    evaluation = groups[0].evaluation
+    assert evaluation is not None
+    titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
+    job = ReportJob(
+        study=pipeline.study,
+        title=pipeline.title,
+        about=pipeline.about,
+        command=f"vehest run pipelines/{pipeline.file.name}",
+        module=pipeline.report,
+        members=members,
+        evaluation=evaluation,
+        data_titles=titles,
+        training=_training_facts(configs),
+    )
+    report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
+    published = None
+    if pipeline.publish:
+        published = Path("results") / pipeline.study
+        if publish(report, published):
+            workshop.messages.line("done", "publish", str(published))
+    return PipelineOutcome(report, leaderboard_of(job), published)
+
+
+def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
+    """Jobs that fit one batch, with the data they need, which is made on the way."""
+    groups: dict[tuple[Any, ...], list[TrainJob]] = {}
+    evaluations: dict[tuple[Any, ...], Evaluation] = {}
+    for config in configs:
+        split = split_from_config(config["split"])
+        protocol = protocol_from_config(config["evaluation"])
+        data = workshop.data_for(split, float(config["estimator"]["rate_hz"]), config)
+        references = workshop.data_for(split, protocol.rate_hz, config)
+        job = plan_train(config, split, data)
+        groups.setdefault(job.group, []).append(job)
+        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
+    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
+
+
+def _training_facts(configs: Sequence[Config]) -> list[str]:
+    """What each training scheme was allowed, a line each."""
+    facts = []
+    for config in configs:
+        training = config["training"]
+        options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
+        names = sorted({c["estimator"]["name"] for c in configs if c["training"] == training})
+        fact = f"{', '.join(names)}: {training['name']} ({options})"
+        if fact not in facts:
+            facts.append(fact)
+    return facts

@@ -1,0 +1,66 @@
+"""Ctrl-C and SIGTERM: a fit ends cleanly with the best so far, any other stage is dropped without a trace."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+class Stopped(BaseException):
+    """A signal asked vehest to stop.
+
+    Args:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.exit_code = 128 + number
+
+
+class StopSignals:
+    """Remembers the first SIGINT or SIGTERM; raises `Stopped` at once, or later where a fit is to end cleanly."""
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self._deferred = False
+
+    def requested(self) -> bool:
+        """Whether a signal came."""
+        return self.number is not None
+
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Listen, and put the former handlers back afterwards."""
+        former = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Only remember a first signal in here; a second one stops at once."""
+        self._deferred = True
+        try:
+            yield
+        finally:
+            self._deferred = False
+
+    def raise_if_requested(self) -> None:
+        """Stop now if a signal came.
+
+        Raises:
+            Stopped: it did.
+        """
+        if self.number is not None:
+            raise Stopped(self.number)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        first = self.number is None
+        self.number = self.number or number
+        if not (self._deferred and first):
+            raise Stopped(number)

@@ -1,0 +1,187 @@
+"""Where stages are run: what is there is skipped, what is missing is made, and every step is said."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from vehest.data.splits import Split
+from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
+from vehest.stages.config import Config, compose_config
+from vehest.stages.console import Messages
+from vehest.stages.downsample import plan_downsample, write_downsample
+from vehest.stages.evaluate import METRICS, VALIDATION
+from vehest.stages.group import Group, Member, existing, is_finished, run_group
+from vehest.stages.ingest import plan_ingest, write_ingest
+from vehest.stages.launcher import Failure, Task, launch
+from vehest.stages.signals import StopSignals
+from vehest.stages.tracking import Tracker
+from vehest.stages.train import HISTORY, read_fit_metrics
+
+
+class NotThereYet(Exception):
+    """A dry run met a stage that waits for one that has not run."""
+
+
+@dataclass
+class Workshop:
+    """Runs stages into one output root.
+
+    Args:
+        output: the output root.
+        messages: where to say what happens.
+        stop: signals.
+        jobs: processes.
+        force: stages to run although their artefacts are there.
+        dry_run: say what would run, run nothing.
+        tracker: where runs are logged; none for no tracking.
+    """
+
+    output: Path
+    messages: Messages
+    stop: StopSignals
+    jobs: int = 1
+    force: frozenset[str] = frozenset()
+    dry_run: bool = False
+    tracker: Tracker | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
+    _made: dict[str, Artefact] = field(default_factory=dict)
+
+    def ingest(self, config: Config) -> Artefact:
+        """The recordings of a data set at their native rate.
+
+        Raises:
+            NotThereYet: in a dry run, if they would have to be made.
+        """
+        plan = plan_ingest(config)
+        with self.messages.bars() as bars:
+
+            def report(done: int, total: int, name: str) -> None:
+                bars.step(f"ingest {plan.label}", done, total, name)
+
+            return self._ensure(plan, lambda folder: write_ingest(config, folder, report))
+
+    def downsample(self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]) -> Artefact:
+        """The recordings of a data set at another rate."""
+        plan = plan_downsample(ingested, rate_hz, options, self.output)
+        return self._ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
+
+    def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
+        """Every data set of a split at a rate."""
+        return {
+            name: self.downsample(self.ingest(self.dataset_config(name, config)), rate_hz, config["downsample"]) for name in split.datasets
+        }
+
+    def dataset_config(self, name: str, config: Config) -> Config:
+        """The configuration of a data set's ingest, with the root and output of another command's."""
+        overrides = [f"dataset={name}", f"output={_quoted(config['output'])}"]
+        if config.get("root") is not None:
+            overrides.append(f"root={_quoted(config['root'])}")
+        return compose_config("ingest", overrides)
+
+    def kinds_of(self, split: Split, config: Config) -> dict[str, str]:
+        """Data set -> ``real`` or ``simulated``."""
+        return {name: str(self.dataset_config(name, config)["dataset"].get("kind", "real")) for name in split.datasets}
+
+    def run_groups(self, groups: Sequence[Group]) -> tuple[list[Member], list[tuple[str, Failure]]]:
+        """Train and evaluate groups, side by side where there are cores; returns members and failures.
+
+        Raises:
+            Stopped: a signal came; what was finished stays.
+            NotThereYet: in a dry run, if anything would have to be made.
+        """
+        members: list[Member] = []
+        waiting: list[Group] = []
+        for group in groups:
+            found = existing(group)
+            for member in found:
+                if is_finished(group, member):
+                    members.append(member)
+                    self._say_skipped(member)
+            missing = [member.job for member in found if not is_finished(group, member)]
+            if missing:
+                waiting.append(Group(missing, group.evaluation, group.force))
+        if self.dry_run and waiting:
+            for group in waiting:
+                stages = "train and evaluate" if group.evaluation else "train"
+                self.messages.line("plan", stages, group.name)
+            raise NotThereYet
+        failures: list[tuple[str, Failure]] = []
+        tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
+        with self.messages.bars() as bars:
+            for done in launch(tasks, self.jobs, self.stop, lambda at, progress: bars.fit(tasks[at].name, progress)):
+                name = tasks[done.position].name
+                bars.close(name)
+                if isinstance(done.outcome, Failure):
+                    failures.append((name, done.outcome))
+                    self.messages.line("fail", "train", name, done.outcome.message)
+                    continue
+                for member in done.outcome:
+                    members.append(member)
+                    self._say_made(member)
+        self.stop.raise_if_requested()
+        return members, failures
+
+    def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
+        """Make an artefact unless it is there."""
+        return self._ensure(plan, write)
+
+    def _ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
+        if plan.key in self._made:
+            return self._made[plan.key]
+        found = None if plan.stage in self.force else find(plan)
+        if found is not None:
+            self.messages.line("skip", plan.stage, plan.label, "up to date")
+        elif self.dry_run:
+            self.messages.line("plan", plan.stage, plan.label)
+            raise NotThereYet
+        else:
+            found = make(plan, write)
+            self.messages.line("done", plan.stage, plan.label, f"{found.provenance['seconds']:.1f} s, {found.folder}")
+        self._made[plan.key] = found
+        return found
+
+    def _say_skipped(self, member: Member) -> None:
+        self.messages.line("skip", "train", member.job.plan.label, "up to date")
+        if member.evaluation is not None:
+            self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
+
+    def _say_made(self, member: Member) -> None:
+        if member.model is None:
+            self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
+            return
+        if not member.model.skipped:
+            fit = read_fit_metrics(member.model.folder)
+            if member.model.status == "interrupted":
+                detail = f"the best so far is kept in {member.model.folder}; the next run goes on"
+                self.messages.line("stop", "train", member.model.label, detail)
+            else:
+                epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
+                self.messages.line("done", "train", member.model.label, f"{epochs}validation MSE {fit['best_validation_loss']:.4g} m²/s²")
+            self._log(member.model, fit)
+        if member.evaluation is not None and not member.evaluation.skipped:
+            figures = test_figures(member.evaluation)
+            shown = ", ".join(f"{name} {value:.3f}°" for name, value in figures.items() if name.startswith("rmse_sideslip"))
+            self.messages.line("done", "evaluate", member.evaluation.label, shown)
+            self._log(member.evaluation, figures)
+
+    def _log(self, artefact: Artefact, figures: Mapping[str, float]) -> None:
+        if self.tracker is not None:
+            self.tracker.log(artefact, artefact.label, self.tags, figures, artefact.folder / HISTORY)
+
+
+def test_figures(evaluation: Artefact) -> dict[str, float]:
+    """Figures of an evaluation, ``<metric>.<test set>`` -> value."""
+    with open(evaluation.folder / METRICS, newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    return {f"{row['metric']}.{row['test_set']}": float(row["value"]) for row in rows if row["test_set"] != VALIDATION}
+
+
+def _quoted(text: Any) -> str:
+    """A value as Hydra's grammar reads it back, whatever characters it has."""
+    escaped = str(text).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{escaped}'"
