@@ -1,0 +1,1 @@
+"""What studies share: documents, styles of tables and figures, the self-contained page."""

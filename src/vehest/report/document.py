@@ -1,0 +1,307 @@
+"""A report as data, and its two forms: a Markdown file with tables and figures beside it, and one self-contained page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from markdown_it import MarkdownIt
+    from matplotlib.figure import Figure as MatplotlibFigure
+    from plotly.graph_objects import Figure as PlotlyFigure
+
+PNG_DPI = 150
+PNG_COLOURS = 256
+_NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a column of a table is shown; its CSV file keeps every digit.
+
+    Args:
+        header: what it is called, unit included.
+        digits: significant digits of its typical value, from which the decimals of all follow.
+        decimals: decimals of every value, instead of ``digits``.
+    """
+
+    header: str
+    digits: int = 3
+    decimals: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table with a caption.
+
+    Args:
+        name: file name without ending: small letters, digits, ``_``, ``-`` and ``.``.
+        caption: Markdown.
+        frame: the values, with short names as columns.
+        columns: column of the frame -> how it is shown, in this order; all of them, by their own names, if empty.
+    """
+
+    name: str
+    caption: str
+    frame: pd.DataFrame
+    columns: Mapping[str, Column] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """A figure with a caption.
+
+    Args:
+        name: file name without ending, as in `Table`.
+        caption: Markdown; its first sentence is what those are told who cannot see the figure.
+        static: matplotlib figure, for PNG, SVG and print.
+        interactive: plotly figure for the page, where one helps.
+    """
+
+    name: str
+    caption: str
+    static: MatplotlibFigure
+    interactive: PlotlyFigure | None = None
+
+
+Block: TypeAlias = "str | Table | Figure"
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """A report.
+
+    Args:
+        title: plain text.
+        blocks: Markdown text (headings from ``##`` down), tables and figures, in reading order.
+
+    Raises:
+        ValueError: two tables or two figures share a name, or a name is no file name.
+    """
+
+    title: str
+    blocks: Sequence[Block]
+
+    def __post_init__(self) -> None:
+        for kind in (Table, Figure):
+            names = [block.name for block in self.blocks if isinstance(block, kind)]
+            for name in names:
+                if not _NAME.fullmatch(name):
+                    raise ValueError(f"'{name}' cannot name a file of a report")
+                if names.count(name) > 1:
+                    raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
+
+
+def write_document(document: Document, folder: Path, *, page: bool = True) -> None:
+    """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html`` where ``page`` is set.
+
+    The same document gives the same bytes.
+
+    Args:
+        document: what to write.
+        folder: an existing folder.
+        page: whether to write the self-contained page too.
+    """
+    numbers = _numbers(document)
+    images: dict[str, bytes] = {}
+    for block in document.blocks:
+        if isinstance(block, Table):
+            (folder / "tables").mkdir(exist_ok=True)
+            block.frame.to_csv(folder / "tables" / f"{block.name}.csv", index=False, lineterminator="\n", encoding="utf-8")
+        elif isinstance(block, Figure):
+            (folder / "figures").mkdir(exist_ok=True)
+            (folder / "figures" / f"{block.name}.png").write_bytes(_png(block.static))
+            images[block.name] = _svg(block.static)
+            (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
+    _write_text(folder / "report.md", _markdown(document, numbers))
+    if page:
+        _write_text(folder / "report.html", _page(document, numbers, images))
+
+
+def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
+    """What a table shows.
+
+    Returns:
+        Headers, rows of cells, and for each column whether it holds numbers.
+    """
+    from pandas.api.types import is_bool_dtype, is_numeric_dtype
+
+    shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
+    columns, numeric = [], []
+    for name, column in shown.items():
+        values = table.frame[name]
+        is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
+        numeric.append(is_number)
+        columns.append(_number_cells(values.tolist(), column) if is_number else [_text_cell(value) for value in values.tolist()])
+    return [column.header for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
+
+
+def _number_cells(values: list[Any], column: Column) -> list[str]:
+    if all(isinstance(value, int) for value in values):
+        return [fixed(value, 0) for value in values]
+    numbers = [float(value) if value is not None and value == value else math.nan for value in values]
+    decimals = decimals_for(numbers, column.digits) if column.decimals is None else column.decimals
+    return [fixed(number, decimals) for number in numbers]
+
+
+def _text_cell(value: Any) -> str:
+    return MISSING if value is None or value != value else str(value)
+
+
+def _numbers(document: Document) -> dict[int, str]:
+    """Position of a table or figure -> ``Table 1``, ``Figure 3``."""
+    counts = {"Table": 0, "Figure": 0}
+    numbers = {}
+    for position, block in enumerate(document.blocks):
+        if not isinstance(block, str):
+            kind = type(block).__name__
+            counts[kind] += 1
+            numbers[position] = f"{kind} {counts[kind]}"
+    return numbers
+
+
+def _png(figure: MatplotlibFigure) -> bytes:
+    """A figure as pixels, in as few colours as look the same: a third of the size."""
+    from PIL import Image
+
+    buffer, small = io.BytesIO(), io.BytesIO()
+    with paper_style():
+        figure.savefig(buffer, format="png", dpi=PNG_DPI)
+    with Image.open(buffer) as image:
+        few = image.convert("RGB").quantize(PNG_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(small, format="png", optimize=True, dpi=(PNG_DPI, PNG_DPI))
+    return small.getvalue()
+
+
+def _svg(figure: MatplotlibFigure) -> bytes:
+    buffer = io.BytesIO()
+    with paper_style():
+        figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
+def _for_both_schemes(svg: bytes) -> bytes:
+    """An SVG figure that has other colours where its reader prefers a dark page."""
+    text = svg.decode("utf-8")
+    colours = sorted(set(re.findall(r"(?:fill|stroke): (#[0-9a-f]{6})", text)))
+    rules = [
+        f'[style*="{kind}: {colour}"]{{{kind}:{on_dark(colour)}!important}}'
+        for colour in colours
+        for kind in ("fill", "stroke")
+        if f"{kind}: {colour}" in text
+    ]
+    style = f"<style>@media (prefers-color-scheme: dark){{svg{{fill:{on_dark(REFERENCE_COLOUR)}}}{''.join(rules)}}}</style>"
+    return re.sub(r"(<svg\b[^>]*>)", lambda opening: opening[0] + style, text, count=1).encode("utf-8")
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_bytes(text.encode("utf-8"))
+
+
+def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
+    parts = [f"# {document.title}"]
+    for position, block in enumerate(document.blocks):
+        if isinstance(block, str):
+            parts.append(block.strip())
+        elif isinstance(block, Table):
+            parts.append(f"**{numbers[position]}.** {block.caption} ([CSV](tables/{block.name}.csv))")
+            parts.append(_pipe_table(block))
+        else:
+            parts.append(f"![{_spoken(block.caption)}](figures/{block.name}.png)")
+            parts.append(f"**{numbers[position]}.** {block.caption} ([SVG](figures/{block.name}.svg))")
+    return "\n\n".join(parts) + "\n"
+
+
+def _pipe_table(table: Table) -> str:
+    headers, rows, numeric = formatted(table)
+    lines = [headers, ["--:" if is_number else ":--" for is_number in numeric], *rows]
+    return "\n".join("| " + " | ".join(_in_pipes(cell) for cell in line) + " |" for line in lines)
+
+
+def _in_pipes(cell: str) -> str:
+    return cell.replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+
+
+def _spoken(caption: str) -> str:
+    """First sentence of a caption, without marks that mean something in Markdown."""
+    plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", caption)
+    plain = re.sub(r"[*`\[\]<>|]", "", plain).replace("\n", " ").strip()
+    return re.split(r"(?<=\.)\s", plain, maxsplit=1)[0]
+
+
+def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markupsafe import Markup
+
+    markdown = _markdown_parser()
+    blocks: list[dict[str, Any]] = []
+    for position, block in enumerate(document.blocks):
+        if isinstance(block, str):
+            blocks.append({"kind": "text", "html": Markup(markdown.render(block))})
+            continue
+        shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(block.caption))}
+        if isinstance(block, Table):
+            headers, rows, numeric = formatted(block)
+            csv = block.frame.to_csv(index=False, lineterminator="\n").encode()
+            blocks.append(
+                {"kind": "table", **shared, "headers": headers, "rows": rows, "numeric": numeric, "csv": _data_uri(csv, "text/csv")}
+            )
+        else:
+            alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
+            blocks.append({"kind": "figure", **shared, **alternative, "json": _plotly_json(block.interactive)})
+    interactive = any(block.get("json") for block in blocks)
+    environment = Environment(
+        loader=PackageLoader("vehest.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template("page.html.j2").render(
+        title=document.title,
+        blocks=blocks,
+        style=Markup(_packaged("page.css")),
+        script=Markup(_packaged("page.js")),
+        plotly=Markup(_plotly_library()) if interactive else "",
+        missing=MISSING,
+    )
+
+
+def _markdown_parser() -> MarkdownIt:
+    from markdown_it import MarkdownIt
+
+    return MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
+
+
+def _plotly_json(figure: PlotlyFigure | None) -> Any:
+    """A plotly figure as JSON that can stand inside a script element."""
+    from markupsafe import Markup
+
+    return None if figure is None else Markup(figure.to_json().replace("<", "\\u003c"))
+
+
+def _plotly_library() -> str:
+    from plotly.offline import get_plotlyjs
+
+    library: str = get_plotlyjs()
+    return library
+
+
+def _packaged(name: str) -> str:
+    from importlib.resources import files
+
+    return (files("vehest.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _data_uri(content: bytes, media_type: str) -> str:
+    return f"data:{media_type};base64,{base64.b64encode(content).decode()}"

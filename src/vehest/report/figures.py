@@ -1,0 +1,393 @@
+"""The figures that studies share, as functions of plain arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vehest.data.recording import FloatArray
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, on_dark, paper_style, significant
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+    from plotly.graph_objects import Figure as PlotlyFigure
+
+STATIC_POINTS = 500
+INTERACTIVE_POINTS = 6000
+LEAST_SAMPLES = 20
+LOGARITHMIC_FROM = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """One row of a dot plot.
+
+    Args:
+        label: what the row shows.
+        line: its looks.
+        values: one value a seed, shape (S,); those that are not finite are left out.
+        chosen: value of the chosen seed.
+    """
+
+    label: str
+    line: Line
+    values: FloatArray
+    chosen: float
+
+
+@dataclass(frozen=True, eq=False)
+class Traces:
+    """Time series of one source on the common grid; NaN breaks a line.
+
+    Args:
+        label: name of the source.
+        line: its looks.
+        vy: lateral velocity [m/s], shape (K,).
+        sideslip: [deg], shape (K,).
+    """
+
+    label: str
+    line: Line
+    vy: FloatArray
+    sideslip: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Sideslip errors of one estimator.
+
+    Args:
+        label: name of the estimator.
+        line: its looks.
+        error: estimate minus reference [deg], shape (K,).
+    """
+
+    label: str
+    line: Line
+    error: FloatArray
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square [deg]."""
+        return _rms(self.error)
+
+
+@dataclass(frozen=True, eq=False)
+class Learning:
+    """Losses of one training run.
+
+    Args:
+        label: name of the estimator.
+        line: its looks.
+        epoch: shape (E,).
+        train: training loss, shape (E,).
+        validation: validation loss, shape (E,).
+    """
+
+    label: str
+    line: Line
+    epoch: FloatArray
+    train: FloatArray
+    validation: FloatArray
+
+
+def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
+    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick.
+
+    Args:
+        rows: from top to bottom.
+        quantity: label of the axis.
+    """
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2))
+        axes = figure.add_subplot()
+        for position, row in enumerate(rows):
+            values = row.values[np.isfinite(row.values)]
+            others = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
+            offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(others))
+            axes.scatter(others, position + offsets, s=11, color=row.line.colour, alpha=0.65, linewidths=0, zorder=3)
+            if len(values) > 1:
+                axes.plot([values.min(), values.max()], [position] * 2, color=row.line.colour, linewidth=0.8, alpha=0.5, zorder=2)
+                axes.plot([np.median(values)] * 2, [position - 0.36, position + 0.36], color=row.line.colour, linewidth=1.6, zorder=2)
+            axes.scatter(row.chosen, position, s=30, marker="D", color=row.line.colour, edgecolors="black", linewidths=0.8, zorder=4)
+        axes.set_yticks(range(len(rows)), [row.label for row in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.grid(axis="x")
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel(quantity)
+        _scale_of_spread(axes, np.concatenate([row.values for row in rows]))
+        _key_of_spread(axes)
+    return figure
+
+
+def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
+    """Reference and estimate over a whole test set, one row an estimator: lateral velocity left, sideslip right.
+
+    Args:
+        time: [s], shape (K,).
+        reference: measured.
+        estimates: from top to bottom.
+        time_label: label of the time axes.
+    """
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2))
+        grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
+        for (left, right), estimate in zip(grid, estimates, strict=True):
+            for axes, measured, estimated in ((left, reference.vy, estimate.vy), (right, reference.sideslip, estimate.sideslip)):
+                axes.plot(*decimated(time, estimated, STATIC_POINTS), color=estimate.line.colour, linewidth=1.2)
+                axes.plot(*decimated(time, measured, STATIC_POINTS), color=reference.line.colour, linewidth=0.6)
+                axes.margins(x=0.005)
+            left.set_title(estimate.label, loc="left", color=estimate.line.colour, pad=2.0, fontsize=7.5, fontweight="bold")
+            right.set_title(f"RMSE(β) {significant(_rms(estimate.sideslip - reference.sideslip))}°", loc="right", pad=2.0, fontsize=7.0)
+        for column, label in enumerate(("lateral velocity [m/s]", "sideslip angle [deg]")):
+            grid[-1][column].set_xlabel(time_label)
+            grid[(len(estimates) - 1) // 2][column].set_ylabel(label)
+    return figure
+
+
+def zoom_figure(
+    time: FloatArray, ay: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str, *, error_limit: float = math.inf
+) -> MatplotlibFigure:
+    """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration.
+
+    Args:
+        time: [s], shape (K,).
+        ay: measured lateral acceleration [m/s²], shape (K,).
+        reference: measured.
+        estimates: in the order of the legend.
+        time_label: label of the time axis.
+        error_limit: errors are drawn up to this size [deg].
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 6.0)
+        top, middle, below, bottom = figure.subplots(4, 1, sharex=True, height_ratios=(1.5, 1.5, 1.2, 0.6))
+        for source in (*reversed(estimates), reference):
+            looks = {"color": source.line.colour, "linestyle": source.line.dash, "linewidth": 1.4 if source is reference else 1.0}
+            top.plot(time, source.vy, label=source.label, **looks)
+            middle.plot(time, source.sideslip, **looks)
+            if source is not reference:
+                error = source.sideslip - reference.sideslip
+                below.plot(time, np.where(np.abs(error) <= error_limit, error, np.nan), **looks)
+        below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
+        bottom.plot(time, ay, color="#444444", linewidth=0.8)
+        labels = ("lateral velocity [m/s]", "sideslip [deg]", "sideslip error [deg]", "$a_y$ [m/s²]")
+        for axes, label in zip((top, middle, below, bottom), labels, strict=True):
+            axes.set_ylabel(label)
+            axes.margins(x=0.0)
+        bottom.set_xlabel(time_label)
+        figure.align_ylabels()
+        bottom.xaxis.set_major_locator(MaxNLocator(nbins=11, integer=True))
+        _legend_above(figure, top)
+    return figure
+
+
+def interactive_traces(
+    time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str, zoom: tuple[float, float]
+) -> PlotlyFigure:
+    """Reference and all estimates, to zoom, scroll and switch on and off; the range slider lies below the sideslip.
+
+    ``layout.meta["views"]`` holds ranges for which the page draws buttons, ``meta["dark"]`` of a trace its colour on a dark page.
+
+    Args:
+        time: [s], shape (K,).
+        reference: measured.
+        estimates: in the order of the legend.
+        time_label: label of the time axis.
+        zoom: a range that deserves a button [s].
+    """
+    import plotly.graph_objects as go
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    for rank, source in [*reversed(list(enumerate(estimates, start=2))), (1, reference)]:
+        for row, values in enumerate((source.vy, source.sideslip), start=1):
+            at, shown = decimated(time, values, INTERACTIVE_POINTS)
+            trace = go.Scatter(
+                x=at.astype(np.float32),
+                y=shown.astype(np.float32),
+                mode="lines",
+                name=source.label,
+                legendgroup=source.label,
+                showlegend=row == 1,
+                legendrank=rank,
+                meta={"dark": on_dark(source.line.colour)},
+                line={"color": source.line.colour, "width": 1.8 if source is reference else 1.3, "dash": _plotly_dash(source.line)},
+                hovertemplate="%{y:.2f}",
+            )
+            figure.add_trace(trace, row=row, col=1)
+    figure.update_yaxes(title_text="v [m/s]", row=1, col=1)
+    figure.update_yaxes(title_text="β [deg]", row=2, col=1)
+    figure.update_xaxes(title_text=time_label, rangeslider={"visible": True, "thickness": 0.08}, row=2, col=1)
+    whole = [float(time[0]), float(time[-1])]
+    figure.update_xaxes(range=whole)
+    figure.update_layout(
+        template="none",
+        margin={"l": 50, "r": 34, "t": 12, "b": 40},
+        hovermode="x unified",
+        font={"size": 12},
+        legend={"orientation": "h", "yanchor": "bottom", "y": 1.03, "x": 0, "xanchor": "left"},
+        modebar={"orientation": "v", "bgcolor": "rgba(0,0,0,0)"},
+        meta={"views": {"whole range": whole, f"busiest {zoom[1] - zoom[0]:.0f} s": list(zoom)}},
+    )
+    return figure
+
+
+def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
+    """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.2)
+        axes = figure.add_subplot()
+        limit = max(float(np.quantile(np.abs(estimate.error), 0.995)) for estimate in estimates)
+        limit = limit if limit > 0 else 1.0
+        edges = np.linspace(-limit, limit, 81)
+        for estimate in reversed(estimates):
+            counts, _ = np.histogram(np.clip(estimate.error, -limit, limit), edges)
+            density = counts / len(estimate.error) / np.diff(edges)
+            label = f"{estimate.label}: {significant(estimate.rmse)}°"
+            axes.stairs(density, edges, color=estimate.line.colour, linestyle=estimate.line.dash, linewidth=1.2, label=label)
+        axes.axvline(0.0, color=REFERENCE.colour, linewidth=0.7)
+        axes.set_xlabel("sideslip error, estimate - reference [deg]".replace("-", "\N{MINUS SIGN}"))
+        axes.set_ylabel("density [1/deg]")
+        axes.set_xlim(-limit, limit)
+        axes.set_ylim(bottom=0.0)
+        samples = len(estimates[0].error) * (edges[1] - edges[0])
+        counts_axis = axes.secondary_yaxis("right", functions=(lambda density: density * samples, lambda count: count / samples))
+        counts_axis.set_ylabel("samples a bin")
+        handles, labels = axes.get_legend_handles_labels()
+        axes.legend(handles[::-1], labels[::-1], loc="upper right", title="RMSE(β)", alignment="left")
+    return figure
+
+
+def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.0) -> MatplotlibFigure:
+    """RMSE of the sideslip in bins of |a_y|, and how many samples each bin holds; bins of fewer than 20 samples show none.
+
+    Args:
+        ay: lateral acceleration at the scored times [m/s²], shape (K,).
+        estimates: errors at the same times.
+        width: of a bin [m/s²].
+    """
+    n_bins = max(math.ceil(float(np.abs(ay).max()) / width), 1)
+    edges = width * np.arange(n_bins + 1)
+    centres = edges[:-1] + width / 2
+    index = np.minimum((np.abs(ay) / width).astype(int), n_bins - 1)
+    counts = np.bincount(index, minlength=n_bins)
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.4)
+        axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
+        for estimate in reversed(estimates):
+            squares = np.bincount(index, weights=np.square(estimate.error), minlength=n_bins)
+            rmse = np.sqrt(np.divide(squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES))
+            line = estimate.line
+            axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=estimate.label)
+        below.bar(centres, counts, width=0.9 * width, color="#b5b9be")
+        axes.set_ylabel("RMSE(β) [deg]")
+        axes.set_ylim(bottom=0.0)
+        below.set_ylabel("samples")
+        below.set_xlabel("$|a_y|$ [m/s²]")
+        below.set_xlim(0.0, edges[-1])
+        figure.align_ylabels()
+        _legend_above(figure, axes)
+    return figure
+
+
+def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure:
+    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest.
+
+    Args:
+        runs: in the order of the legend.
+        quantity: label of the loss axis.
+    """
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.0)
+        left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+        for run in reversed(runs):
+            looks = {"color": run.line.colour, "linestyle": run.line.dash}
+            best = int(np.nanargmin(run.validation)) if np.isfinite(run.validation).any() else 0
+            left.plot(run.epoch, run.train, label=run.label, **looks)
+            right.plot(run.epoch, run.validation, **looks)
+            for axes, losses in ((left, run.train), (right, run.validation)):
+                axes.plot(
+                    run.epoch[best], losses[best], color=run.line.colour, marker=run.line.marker, markeredgecolor="black", markersize=4.5
+                )
+        for axes, title in ((left, "training"), (right, "validation")):
+            axes.set_title(title, loc="left")
+            axes.set_yscale("log")
+            axes.set_xlabel("epoch")
+            axes.set_xlim(left=0)
+        left.set_ylabel(quantity)
+        _legend_above(figure, left)
+    return figure
+
+
+def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
+    """Fewer points of a time series that keep its peaks: lowest and highest value of each stretch, in their order.
+
+    Args:
+        time: shape (K,).
+        values: shape (K,); a stretch that is NaN throughout stays a gap.
+        n_points: about how many points to keep.
+
+    Returns:
+        Times and values, unchanged if there are not more than ``n_points``.
+    """
+    if len(values) <= n_points:
+        return time, values
+    kept: list[int] = []
+    for stretch in np.array_split(np.arange(len(values)), max(n_points // 2, 1)):
+        part = values[stretch]
+        finite = np.isfinite(part)
+        if not finite.all():
+            kept.append(int(stretch[np.argmin(finite)]))
+        if finite.any():
+            kept += [int(stretch[np.nanargmin(part)]), int(stretch[np.nanargmax(part)])]
+    order = np.unique([0, *kept, len(values) - 1])
+    return time[order], values[order]
+
+
+def _scale_of_spread(axes: Any, values: FloatArray) -> None:
+    finite = values[np.isfinite(values)]
+    if len(finite) and finite.min() > 0 and finite.max() / finite.min() > LOGARITHMIC_FROM:
+        axes.set_xscale("log")
+    elif len(finite):
+        axes.set_xlim(0.0, 1.04 * float(finite.max()) or 1.0)
+
+
+def _key_of_spread(axes: Any) -> None:
+    from matplotlib.lines import Line2D
+
+    grey = "#666666"
+    handles = [
+        Line2D([], [], linestyle="none", marker="o", color=grey, markersize=3.5, label="a seed"),
+        Line2D([], [], linestyle="none", marker="|", color=grey, markersize=9, markeredgewidth=1.6, label="median"),
+        Line2D([], [], linestyle="none", marker="D", color=grey, markeredgecolor="black", markersize=5, label="seed chosen on validation"),
+    ]
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
+
+
+def _legend_above(figure: Any, axes: Any) -> None:
+    """A legend over the whole width, in the reverse of the order in which lines were drawn."""
+    handles, labels = (entries[::-1] for entries in axes.get_legend_handles_labels())
+    fitting = [n for n in range(1, len(labels) + 1) if _legend_width(labels, n) <= figure.get_figwidth()]
+    columns = max(fitting, default=1)
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns, columnspacing=1.2, handlelength=2.8)
+
+
+def _legend_width(labels: Sequence[str], columns: int) -> float:
+    """About how wide a legend of 7 pt gets [in]; its entries fill one column after another."""
+    widths = [max(len(label) for label in column) for column in np.array_split(np.array(labels, dtype=object), columns)]
+    return sum(0.54 + 0.052 * width for width in widths)
+
+
+def _plotly_dash(line: Line) -> str:
+    return {"solid": "solid", "dashed": "dash", "dotted": "dot", "dashdot": "dashdot"}[line.dash]
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))

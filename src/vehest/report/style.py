@@ -1,0 +1,204 @@
+"""One look for all studies: widths, colours, lines and the way numbers are written."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+SINGLE_COLUMN = 3.5  # in, one column of a two-column journal
+DOUBLE_COLUMN = 7.16  # in, both columns
+MISSING = "–"
+
+REFERENCE_COLOUR = "#000000"
+LUENBERGER_GREY = "#767676"
+LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
+NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
+GRU_PURPLE = "#8e24aa"
+LSTM_PURPLE = "#c792dd"
+OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
+
+_DARK_PAPER, _DARK_INK = 0x1A, 0xE6  # as in templates/page.css
+_DASHES = ("solid", "dashed", "dotted", "dashdot")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+
+_PAPER = {
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "axes.titlesize": 8.0,
+    "axes.labelsize": 7.5,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.2,
+    "axes.linewidth": 0.6,
+    "axes.edgecolor": "#444444",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e2e2e2",
+    "grid.linewidth": 0.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "lines.linewidth": 1.1,
+    "lines.markersize": 3.5,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "figure.constrained_layout.h_pad": 0.03,
+    "figure.constrained_layout.w_pad": 0.03,
+    "axes.formatter.use_mathtext": True,
+    "path.simplify": True,
+    "path.simplify_threshold": 0.25,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "vehest",
+}
+
+
+@dataclass(frozen=True)
+class Line:
+    """How one estimator is drawn, the same in every figure.
+
+    Args:
+        colour: hexadecimal, readable on white.
+        dash: ``solid``, ``dashed``, ``dotted`` or ``dashdot``.
+        marker: matplotlib's marker, where points are drawn.
+    """
+
+    colour: str
+    dash: str = "solid"
+    marker: str = "o"
+
+
+REFERENCE = Line(REFERENCE_COLOUR)
+
+
+def colour_of(estimator: str, variant: str = "") -> str:
+    """Colour of an estimator: one hue a family, as in Fig. 6 of Da Lio et al. 2023.
+
+    Luenberger is grey, KS-NN with linear feedback blue, with nonlinear feedback orange (the darker shade has biases), GRU
+    and LSTM are purple. Any other name gets a colour of its own that depends on the name only.
+    """
+    if estimator == "luenberger":
+        return LUENBERGER_GREY
+    if estimator == "ksnn":
+        shades = NONLINEAR_ORANGES if "nonlinear" in variant else LINEAR_BLUES
+        return shades[_has_bias(variant)]
+    if estimator == "gru":
+        return GRU_PURPLE
+    if estimator == "lstm":
+        return LSTM_PURPLE
+    return OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)]
+
+
+def line_of(estimator: str, variant: str = "") -> Line:
+    """Line of an estimator; what its colour says, dash and marker say too, for those who see colours differently."""
+    colour = colour_of(estimator, variant)
+    if estimator == "luenberger":
+        return Line(colour, "solid", "s")
+    if estimator == "ksnn":
+        return Line(colour, "solid" if _has_bias(variant) else "dashed", "^" if "nonlinear" in variant else "o")
+    if estimator in {"gru", "lstm"}:
+        return Line(colour, "solid" if estimator == "gru" else "dashed", "D" if estimator == "gru" else "v")
+    return Line(colour, "solid", "P")
+
+
+def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
+    """Lines of several (estimator, variant), all different as long as dashes and markers last.
+
+    The first of those that would look alike keeps its own line; the later ones change dash, then marker.
+    """
+    lines: dict[tuple[str, str], Line] = {}
+    for name in names:
+        own = line_of(*name)
+        dashes = (own.dash, *(dash for dash in _DASHES if dash != own.dash))
+        markers = (own.marker, *(marker for marker in _MARKERS if marker != own.marker))
+        taken = set(lines.values())
+        options = (replace(own, dash=dash, marker=marker) for marker in markers for dash in dashes)
+        lines[name] = next((line for line in options if line not in taken), own)
+    return lines
+
+
+def on_dark(colour: str) -> str:
+    """The colour that stands for ``colour`` on a dark page: greys change places with their opposites, hues get lighter.
+
+    Args:
+        colour: hexadecimal, of a figure on white.
+    """
+    red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
+    if max(red, green, blue) - min(red, green, blue) <= 12:
+        level = _DARK_INK + (_DARK_PAPER - _DARK_INK) * (red + green + blue) / (3 * 255)
+        return f"#{round(level):02x}{round(level):02x}{round(level):02x}"
+    return "#" + "".join(f"{round(0.65 * part + 0.35 * 255):02x}" for part in (red, green, blue))
+
+
+@contextmanager
+def paper_style() -> Iterator[None]:
+    """Matplotlib settings of all figures, in force inside the ``with`` block only."""
+    import matplotlib
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_PAPER)
+        yield
+
+
+def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> MatplotlibFigure:
+    """An empty figure that no global state knows of; call it inside `paper_style`.
+
+    Args:
+        width: [in].
+        height: [in].
+    """
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def with_unit(quantity: str, unit: str) -> str:
+    """Header of a column or label of an axis: ``RMSE(β) [deg]``; no brackets where there is no unit."""
+    return quantity if unit in {"", "1"} else f"{quantity} [{unit}]"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A number to some significant digits, never in exponents between 1e-4 and 1e6; `MISSING` if it is not finite."""
+    if not math.isfinite(value):
+        return MISSING
+    return _grouped(value, decimals_for([value], digits)) if value == 0 or 1e-4 <= abs(value) < 1e6 else f"{value:.{digits - 1}e}"
+
+
+def decimals_for(values: Sequence[float], digits: int = 3) -> int:
+    """Decimals that show the typical of some numbers with so many significant digits, so that a column lines up."""
+    sizes = sorted(abs(value) for value in values if math.isfinite(value) and value != 0)
+    if not sizes:
+        return 0
+    typical = sizes[(len(sizes) - 1) // 2]
+    return min(max(digits - 1 - math.floor(math.log10(typical)), 0), 6)
+
+
+def fixed(value: float, decimals: int) -> str:
+    """A number with a fixed count of decimals, thousands set apart; `MISSING` if it is not finite."""
+    return _grouped(value, decimals) if math.isfinite(value) else MISSING
+
+
+def percent_below(value: float, other: float) -> str:
+    """By how much ``value`` lies below ``other``, in whole per cent, for example ``12 %``."""
+    return f"{100 * (1 - value / other):.0f} %"
+
+
+def _grouped(value: float, decimals: int) -> str:
+    text = f"{value:,.{decimals}f}" if abs(value) >= 1e4 else f"{value:.{decimals}f}"
+    return text.replace(",", "\N{NARROW NO-BREAK SPACE}").replace("-", "\N{MINUS SIGN}")
+
+
+def _has_bias(variant: str) -> bool:
+    return "bias" in variant and "no_bias" not in variant
