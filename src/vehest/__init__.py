@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__version__ = "0.1.0"
+from vehest.version import __version__
 
 _API = ("Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate")
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-import vehest
 from vehest.data.errors import ConfigurationError, VehestError
 from vehest.stages.completion import complete_override
 from vehest.stages.config_files import choices, pipeline_names, summary
+from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.stages.config import Config
@@ -85,7 +85,7 @@ def _overrides(command: str) -> Any:
 @app.callback(invoke_without_command=True)
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False) -> None:
     if version:
-        typer.echo(f"vehest {vehest.__version__}")
+        typer.echo(f"vehest {__version__}")
         raise typer.Exit
 
 

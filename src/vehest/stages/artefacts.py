@@ -21,9 +21,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-import vehest
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import remove_leftovers, sha256_of, written_aside
+from vehest.version import __version__
 
 MANIFEST = "manifest.json"
 Status = Literal["complete", "interrupted"]
@@ -182,7 +182,7 @@ def provenance(seconds: float) -> dict[str, Any]:
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(seconds, 3),
-        "vehest": vehest.__version__,
+        "vehest": __version__,
         "commit": commit(),
         "python": platform.python_version(),
         "libraries": library_versions(),
@@ -207,7 +207,7 @@ def library_versions() -> dict[str, str]:
 @cache
 def commit() -> str:
     """Commit of the checkout that vehest runs from, with a mark if it has changes; empty if it is no checkout."""
-    folder = Path(vehest.__file__).resolve().parents[2]
+    folder = Path(__file__).resolve().parents[3]
     if not (folder / ".git").exists() or "site-packages" in folder.parts:
         return ""
     try:

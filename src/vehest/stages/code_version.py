@@ -9,12 +9,10 @@ from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
-import vehest
-
-_ROOT = Path(vehest.__file__).resolve().parent
+_ROOT = Path(__file__).resolve().parents[1]
 
 
-def code_version(modules: Iterable[str], *, own: Iterable[str] = ()) -> str:
+def code_version(modules: Iterable[str], *, own: Iterable[str] = (), files: Iterable[str] = ()) -> str:
     """Hash of modules and of every vehest module that they import, directly or not.
 
     Comments, docstrings and layout do not count: only what is executed does.
@@ -22,6 +20,7 @@ def code_version(modules: Iterable[str], *, own: Iterable[str] = ()) -> str:
     Args:
         modules: module names, followed through their imports (also those inside functions).
         own: module names that count themselves, without what they import.
+        files: folders in the package whose files count too, such as templates.
     """
     found: dict[str, str] = {name: _module(name)[0] for name in own}
     waiting = list(modules)
@@ -31,6 +30,9 @@ def code_version(modules: Iterable[str], *, own: Iterable[str] = ()) -> str:
             digest, imported = _module(name)
             found[name] = digest
             waiting.extend(other for other in imported if other not in found)
+    for folder in files:
+        for file in sorted((_ROOT / folder).iterdir()):
+            found[f"{folder}/{file.name}"] = hashlib.sha256(file.read_bytes()).hexdigest()
     text = "\n".join(f"{name} {digest}" for name, digest in sorted(found.items()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import vehest
-
 GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "tracking")
 
 
@@ -66,6 +64,6 @@ def pipeline_names() -> list[str]:
 
 
 def _packaged(name: str) -> Path:
-    package = Path(vehest.__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     inside = package / name
     return inside if inside.is_dir() else package.parents[1] / name

@@ -14,7 +14,7 @@ import numpy as np
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
-from vehest.data.store import read_recording, write_estimate
+from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_module
@@ -136,6 +136,15 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(rows)
+
+
+def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:
+    """Estimate and reference of an evaluation on each range of a test set."""
+    parts = []
+    for position, span in enumerate(test_sets(split)[test_set]):
+        estimate = read_estimate(evaluation.folder / test_set / f"{position}.parquet")
+        parts.append(score(estimate, read_recording(recording_file(references[span.dataset], span)), span, protocol))
+    return parts
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:

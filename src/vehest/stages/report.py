@@ -67,7 +67,7 @@ def plan_report(job: ReportJob, output: Path) -> StagePlan:
         label=job.study,
         config={**config, "data_titles": dict(job.data_titles), "protocol": asdict(job.evaluation.protocol)},
         inputs=inputs,
-        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__]),
+        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
         output=output,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -50,6 +51,8 @@ class Workshop:
     tracker: Tracker | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
     _made: dict[str, Artefact] = field(default_factory=dict)
+    _datasets: dict[str, Config] = field(default_factory=dict)
+    _data: dict[tuple[str, float, str], Artefact] = field(default_factory=dict)
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate.
@@ -72,16 +75,22 @@ class Workshop:
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
         """Every data set of a split at a rate."""
-        return {
-            name: self.downsample(self.ingest(self.dataset_config(name, config)), rate_hz, config["downsample"]) for name in split.datasets
-        }
+        return {name: self._data_at(name, rate_hz, config) for name in split.datasets}
+
+    def _data_at(self, name: str, rate_hz: float, config: Config) -> Artefact:
+        wanted = (name, rate_hz, json.dumps(config["downsample"], sort_keys=True))
+        if wanted not in self._data:
+            self._data[wanted] = self.downsample(self.ingest(self.dataset_config(name, config)), rate_hz, config["downsample"])
+        return self._data[wanted]
 
     def dataset_config(self, name: str, config: Config) -> Config:
         """The configuration of a data set's ingest, with the root and output of another command's."""
-        overrides = [f"dataset={name}", f"output={_quoted(config['output'])}"]
-        if config.get("root") is not None:
-            overrides.append(f"root={_quoted(config['root'])}")
-        return compose_config("ingest", overrides)
+        if name not in self._datasets:
+            overrides = [f"dataset={name}", f"output={_quoted(config['output'])}"]
+            if config.get("root") is not None:
+                overrides.append(f"root={_quoted(config['root'])}")
+            self._datasets[name] = compose_config("ingest", overrides)
+        return self._datasets[name]
 
     def kinds_of(self, split: Split, config: Config) -> dict[str, str]:
         """Data set -> ``real`` or ``simulated``."""
