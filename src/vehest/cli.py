@@ -175,6 +175,7 @@ def evaluate(
     from vehest.stages.artefacts import find, read_artefact
     from vehest.stages.estimate import find_model
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
+    from vehest.stages.group import Evaluation
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
@@ -195,8 +196,9 @@ def evaluate(
         job = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
         artefact = workshop.ensure(job.plan, lambda folder: write_evaluation(job, folder))
         figures = test_figures(artefact)
-        if not artefact.skipped and workshop.tracker is not None:
-            workshop.tracker.log(artefact, artefact.label, {}, figures)
+        if not artefact.skipped:
+            how = Evaluation(split, data, references, job.kinds, protocol, workshop.output)
+            workshop.log_evaluation(artefact, trained, how, figures)
     _say(as_json, {"folder": str(artefact.folder), "skipped": artefact.skipped, **figures})
 
 

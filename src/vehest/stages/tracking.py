@@ -40,30 +40,43 @@ class Tracker:
         return str(self._uri) if self._uri else f"sqlite:///{(self._output / SQLITE).resolve()}"
 
     def log(
-        self, artefact: Artefact, name: str, tags: Mapping[str, str], metrics: Mapping[str, float], history: Path | None = None
+        self,
+        artefact: Artefact,
+        tags: Mapping[str, str],
+        metrics: Mapping[str, float],
+        history: Path | None = None,
+        figures: Mapping[str, Callable[[], Any]] | None = None,
     ) -> None:
-        """Log one artefact as a run: its configuration, figures, figures over epochs, files and manifest.
+        """Log one artefact as a run: its configuration, figures, figures over epochs, files, manifest and drawings.
 
         Args:
-            artefact: what a stage made.
-            name: of the run.
+            artefact: what a stage made; its label is the run's name.
             tags: study, data set and the like.
             metrics: final figures.
             history: CSV with a column ``epoch`` and figures over it.
+            figures: file name -> what draws it (a matplotlib figure, or none if there is nothing to draw).
         """
         if not self._wanted:
             return
+        drawings = {name: draw() for name, draw in (figures or {}).items()}
         try:
-            self._log(artefact, name, tags, metrics, history)
+            self._log(artefact, tags, metrics, history, drawings)
         except Exception as error:  # whatever a tracking server does, results matter more
             self._wanted = False
             self._warn(f"MLflow at {self.uri} does not answer ({_first_line(error)}); going on without tracking")
 
-    def _log(self, artefact: Artefact, name: str, tags: Mapping[str, str], metrics: Mapping[str, float], history: Path | None) -> None:
+    def _log(
+        self, artefact: Artefact, tags: Mapping[str, str], metrics: Mapping[str, float], history: Path | None, drawings: Mapping[str, Any]
+    ) -> None:
         client = self._connected()
         from mlflow.entities import Metric, Param, RunTag
 
-        all_tags = {"mlflow.runName": name, "vehest.stage": artefact.stage, "vehest.key": artefact.key, "vehest.status": artefact.status}
+        all_tags = {
+            "mlflow.runName": artefact.label,
+            "vehest.stage": artefact.stage,
+            "vehest.key": artefact.key,
+            "vehest.status": artefact.status,
+        }
         run = client.create_run(self._experiment_id, tags={**all_tags, **tags})
         stamp = run.info.start_time
         points = [Metric(key, value, stamp, 0) for key, value in metrics.items()]
@@ -77,15 +90,19 @@ class Tracker:
             folder = Path(file).parent.as_posix()
             if not file.endswith(".parquet"):
                 client.log_artifact(run.info.run_id, str(artefact.folder / file), None if folder == "." else folder)
+        for name, drawing in drawings.items():
+            if drawing is not None:
+                client.log_figure(run.info.run_id, drawing, f"figures/{name}")
         client.set_terminated(run.info.run_id, "FINISHED" if artefact.status == "complete" else "KILLED")
 
     def _connected(self) -> Any:
         if self._client is None:
             os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
             os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
-            for noisy in ("mlflow", "alembic"):
-                logging.getLogger(noisy).setLevel(logging.ERROR)
             from mlflow import MlflowClient
+
+            for noisy in ("mlflow", "mlflow.store.db.utils", "alembic"):
+                logging.getLogger(noisy).setLevel(logging.ERROR)
 
             self._output.mkdir(parents=True, exist_ok=True)
             client = MlflowClient(self.uri)

@@ -10,13 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
+
 from vehest.data.splits import Split
+from vehest.estimators.model_files import read_description
 from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
 from vehest.stages.config import Config, compose_config
 from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
-from vehest.stages.evaluate import METRICS, VALIDATION
-from vehest.stages.group import Group, Member, existing, is_finished, run_group
+from vehest.stages.evaluate import METRICS, VALIDATION, read_scored
+from vehest.stages.group import Evaluation, Group, Member, existing, is_finished, run_group
 from vehest.stages.ingest import plan_ingest, write_ingest
 from vehest.stages.launcher import Failure, Task, launch
 from vehest.stages.signals import StopSignals
@@ -131,7 +135,7 @@ class Workshop:
                     continue
                 for member in done.outcome:
                     members.append(member)
-                    self._say_made(member)
+                    self._say_made(member, waiting[done.position].evaluation)
         self.stop.raise_if_requested()
         return members, failures
 
@@ -159,7 +163,7 @@ class Workshop:
         if member.evaluation is not None:
             self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
 
-    def _say_made(self, member: Member) -> None:
+    def _say_made(self, member: Member, how: Evaluation | None) -> None:
         if member.model is None:
             self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
             return
@@ -171,16 +175,25 @@ class Workshop:
             else:
                 epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
                 self.messages.line("done", "train", member.model.label, f"{epochs}validation MSE {fit['best_validation_loss']:.4g} m²/s²")
-            self._log(member.model, fit)
+            self.log_fit(member.model, fit)
         if member.evaluation is not None and not member.evaluation.skipped:
             figures = test_figures(member.evaluation)
             shown = ", ".join(f"{name} {value:.3f}°" for name, value in figures.items() if name.startswith("rmse_sideslip"))
             self.messages.line("done", "evaluate", member.evaluation.label, shown)
-            self._log(member.evaluation, figures)
+            if how is not None:
+                self.log_evaluation(member.evaluation, member.model, how, figures)
 
-    def _log(self, artefact: Artefact, figures: Mapping[str, float]) -> None:
+    def log_fit(self, model: Artefact, figures: Mapping[str, float]) -> None:
+        """Track a training: figures, figures over epochs, learning curve."""
         if self.tracker is not None:
-            self.tracker.log(artefact, artefact.label, self.tags, figures, artefact.folder / HISTORY)
+            drawn = {"learning.png": partial(_learning_figure, model)}
+            self.tracker.log(model, self.tags, figures, model.folder / HISTORY, drawn)
+
+    def log_evaluation(self, evaluation: Artefact, model: Artefact, how: Evaluation, figures: Mapping[str, float]) -> None:
+        """Track an evaluation: figures, and traces over each test set."""
+        if self.tracker is not None:
+            drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
+            self.tracker.log(evaluation, self.tags, figures, None, drawn)
 
 
 def test_figures(evaluation: Artefact) -> dict[str, float]:
@@ -188,6 +201,25 @@ def test_figures(evaluation: Artefact) -> dict[str, float]:
     with open(evaluation.folder / METRICS, newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     return {f"{row['metric']}.{row['test_set']}": float(row["value"]) for row in rows if row["test_set"] != VALIDATION}
+
+
+def _learning_figure(model: Artefact) -> Any:
+    from vehest.report.run_figures import fit_figure
+
+    if not (model.folder / HISTORY).is_file():
+        return None
+    about = read_description(model.folder)
+    return fit_figure(model.label, about["estimator"], about["variant"], pd.read_csv(model.folder / HISTORY))
+
+
+def _trace_figure(evaluation: Artefact, model: Artefact, how: Evaluation, test_set: str) -> Any:
+    from vehest.report.run_figures import trace_figure
+
+    about = read_description(model.folder)
+    parts = read_scored(evaluation, how.split, how.references, how.protocol, test_set)
+    series = [np.concatenate([getattr(part, name) for part in parts]) for name in ("vy_ref", "sideslip_ref", "vy", "sideslip")]
+    time = parts[0].time[0] + np.arange(len(series[0])) / how.protocol.rate_hz  # several ranges stand end to end
+    return trace_figure(model.label, about["estimator"], about["variant"], time, (series[0], series[1]), (series[2], series[3]))
 
 
 def _quoted(text: Any) -> str:

@@ -1,0 +1,63 @@
+# Two commands for everyone: `make run` and `make test`. Both set up .venv by themselves; the second time they are quicker.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+TORCH ?= 2.13.0
+TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+JOBS ?= 2
+
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive bench-training
+
+help: ## list the targets
+	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
+
+install: $(INSTALLED) ## set up .venv (GPU=1 for a CUDA build of torch)
+
+# The CPU build of torch where there is one: no CUDA download on a machine without a GPU.
+$(INSTALLED): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "vehest needs Python 3.11 or newer; set PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+ifeq ($(GPU),1)
+	$(BIN)/python -m pip install -q "torch>=2.6"
+else
+	$(BIN)/python -m pip install -q "torch==$(TORCH)+cpu" 2>/dev/null \
+	  || $(BIN)/python -m pip install -q "torch>=2.6" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
+	  || { echo "warning: no CPU build of torch found, installing the default one, which may bring CUDA along"; \
+	       $(BIN)/python -m pip install -q "torch>=2.6"; }
+endif
+	$(BIN)/python -m pip install -q -e ".[dev]"
+	touch $@
+
+run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
+	$(BIN)/vehest run pipelines/quickstart.yaml
+
+test: $(INSTALLED) lint ## lint, types, layers, tests (at most 10 minutes)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for the real recordings
+	$(BIN)/python -m pytest -m slow
+
+ui: $(INSTALLED) ## look at all runs in MLflow
+	$(BIN)/mlflow ui --backend-store-uri sqlite:///$(CURDIR)/$${VEHEST_OUTPUT:-outputs}/mlflow.db
+
+docs: $(INSTALLED) ## write the reference pages that are made from the code
+	$(BIN)/python docs/make_reference.py
+
+ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
+	$(BIN)/vehest run pipelines/ferrari_drive.yaml
+
+bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
+	$(BIN)/python benchmarks/training.py
+
+clean: ## remove what can be made again (not outputs/)
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
