@@ -1,0 +1,47 @@
+"""Small recordings that are quick to learn from, and where the real ones are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from vehest.data.recording import Recording
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """Folder of the real recordings; tests that need it are skipped where it is not set."""
+    root = os.environ.get("VEHEST_DATA")
+    if not root:
+        pytest.skip("VEHEST_DATA is not set: the real recordings are not here")
+    return Path(root)
+
+
+def planar_drive(seconds: float = 60.0, rate_hz: float = 20.0, seed: int = 0, noise: float = 0.0, name: str = "drive") -> Recording:
+    """A drive that obeys planar kinematics exactly (up to noise): smooth vx, yaw rate and vy, accelerations derived from them."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(round(seconds * rate_hz)) / rate_hz
+    phases = generator.uniform(0, 2 * np.pi, 6)
+    yaw_rate = 0.35 * np.sin(0.5 * time + phases[0]) + 0.15 * np.sin(1.3 * time + phases[1])
+    yaw_rate_dot = 0.35 * 0.5 * np.cos(0.5 * time + phases[0]) + 0.15 * 1.3 * np.cos(1.3 * time + phases[1])
+    vx = 25.0 + 4.0 * np.sin(0.2 * time + phases[2])
+    vx_dot = 0.8 * np.cos(0.2 * time + phases[2])
+    vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + phases[3])
+    vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + phases[3])
+    ay, ax = vy_dot + vx * yaw_rate, vx_dot - vy * yaw_rate
+    measured = {"vx": vx, "yaw_rate": yaw_rate, "ay": ay, "ax": ax}
+    noisy = {key: values + noise * generator.standard_normal(len(time)) for key, values in measured.items()}
+    references = {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
+    return Recording(name, "test car", rate_hz, 0.0, {**noisy, **references}, "simulated")
+
+
+@pytest.fixture
+def drive() -> Recording:
+    """One minute at 20 Hz without noise."""
+    return planar_drive()
