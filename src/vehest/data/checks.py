@@ -7,18 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import FloatArray, Recording
 
+BoolArray = NDArray[np.bool_]
 Level = Literal["error", "warning", "note"]
 
 STUCK_SECONDS = 1.0
 SATURATED_FRACTION = 2e-3
+SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
+STANDSTILL_SPEED = 0.1  # m/s
+STANDSTILL_YAW_RATE = 0.05  # rad/s
+STANDSTILL_SHAKING = 0.3  # m/s²
+MOST_DRIFT = 0.5  # intervals
 KINEMATIC_BAND_HZ = (0.1, 2.0)
 SIGN_CORRELATION = 0.3
 DEGREES_PER_RADIAN = 180.0 / np.pi
@@ -48,12 +55,12 @@ def checks_of_clock(time: FloatArray) -> list[Finding]:
         time: time stamps [s], shape (T,).
     """
     findings: list[Finding] = []
-    steps = np.diff(time)
-    if len(steps) == 0:
+    if len(time) < 2:
         return [Finding("error", "clock", "time", "fewer than two time stamps")]
     if not np.isfinite(time).all():
         row = int(np.flatnonzero(~np.isfinite(time))[0])
         return [Finding("error", "clock", "time", f"time stamp of sample {row} is not a number")]
+    steps = np.diff(time)
     for what, bad in (("goes backwards", steps < 0), ("repeats", steps == 0)):
         if bad.any():
             where = np.flatnonzero(bad)
@@ -80,6 +87,13 @@ def checks_of_clock(time: FloatArray) -> list[Finding]:
     if jitter > 0.01:
         findings.append(
             Finding("warning", "jitter", "time", f"intervals deviate by up to {100 * jitter:.2g} % from the median of {interval:.6g} s")
+        )
+    uniform = np.linspace(time[0], time[-1], len(time))
+    drift = float(np.abs(time - uniform).max() / interval)
+    if drift > MOST_DRIFT and not len(gaps):
+        worst = time[np.argmax(np.abs(time - uniform))]
+        findings.append(
+            Finding("warning", "drift", "time", f"the clock drifts: at {worst:.6g} s it is {drift:.2g} intervals away from a uniform one")
         )
     return findings
 
@@ -140,8 +154,8 @@ def _yaw_rate_unit(recording: Recording) -> list[Finding]:
                 "warning",
                 "sign",
                 "yaw_rate",
-                f"ay runs against vx·yaw_rate (slope {slope:.3g}, correlation {correlation:.2f}): the sign of ay or of yaw_rate is not ISO 8855's; "
-                f"set sign: -1 for it",
+                f"ay runs against vx·yaw_rate (slope {slope:.3g}, correlation {correlation:.2f}): "
+                f"the sign of ay or of yaw_rate is not ISO 8855's; set sign: -1 for it",
             )
         ]
     if not 0.5 < slope < 2.0:
@@ -160,11 +174,12 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
     names = ("vx", "yaw_rate", "ay", "vy_ref")
     if any(np.isnan(recording[name]).any() for name in names) or recording.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
         return []
-    band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=recording.rate_hz, output="sos")
-    if len(recording) < 10 * recording.rate_hz:
+    moving = ~_standstill(recording)
+    if moving.sum() < 10 * recording.rate_hz:
         return []
-    predicted = signal.sosfiltfilt(band, recording["ay"] - recording["vx"] * recording["yaw_rate"])
-    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)
+    band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=recording.rate_hz, output="sos")
+    predicted = signal.sosfiltfilt(band, recording["ay"] - recording["vx"] * recording["yaw_rate"])[moving]
+    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)[moving]
     if predicted.std() == 0.0 or derived.std() < 1e-3:
         return []
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
@@ -185,10 +200,12 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
                 "warning",
                 "kinematics",
                 "vy_ref",
-                f"ay - vx·yaw_rate hardly follows d(vy_ref)/dt (correlation {correlation:.2f} {where}): check units, delays and where the sensors sit",
+                f"ay - vx·yaw_rate hardly follows d(vy_ref)/dt (correlation {correlation:.2f} {where}): "
+                f"check units, delays and where the sensors sit",
             )
         ]
     residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording["vx"] * recording["yaw_rate"])
+    residual = residual[moving]
     return [
         Finding(
             "note",
@@ -209,58 +226,81 @@ def _not_measured(recording: Recording) -> list[Finding]:
 
 
 def _stuck(recording: Recording) -> list[Finding]:
+    """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
     findings = []
-    shortest = max(int(STUCK_SECONDS * recording.rate_hz), 3)
+    moving = ~_standstill(recording)
     for name, samples in recording.channels.items():
-        start, length = _longest_run(samples)
-        if length == len(samples) and length > 1:
-            findings.append(Finding("warning", "stuck", name, f"never changes: {samples[0]:.6g} {CHANNELS[name].unit} throughout"))
-        elif length >= shortest:
-            time = recording.start_time + start / recording.rate_hz
-            findings.append(
-                Finding(
-                    "warning",
-                    "stuck",
-                    name,
-                    f"stays at {samples[start]:.6g} {CHANNELS[name].unit} for {length / recording.rate_hz:.3g} s from {time:.6g} s",
-                )
-            )
+        known = np.flatnonzero(~np.isnan(samples))
+        unit = CHANNELS[name].unit
+        if len(known) > 1 and (samples[known] == samples[known[0]]).all():
+            findings.append(Finding("warning", "stuck", name, f"never changes: {samples[known[0]]:.6g} {unit} throughout"))
+            continue
+        longest, first = 0, 0
+        for start, length in _runs(samples[known], at_least=3):
+            stretch = slice(known[start], known[start + length - 1] + 1)
+            held = int(moving[stretch].sum())
+            if held > longest:
+                longest, first = held, int(known[start] + np.argmax(moving[stretch]))
+        if longest >= STUCK_SECONDS * recording.rate_hz:
+            seconds, time = longest / recording.rate_hz, recording.time[first]
+            message = f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.6g} s"
+            findings.append(Finding("warning", "stuck", name, message))
     return findings
 
 
 def _saturated(recording: Recording) -> list[Finding]:
+    """Samples that pile up at the highest or lowest value, again and again, far more often than at the value next to it."""
     findings = []
+    moving = ~_standstill(recording)
     for name, samples in recording.channels.items():
-        known = samples[np.isfinite(samples)]
-        if len(known) < 100 or known.min() == known.max():
+        known = samples[np.isfinite(samples) & moving]
+        if len(known) < 100:
             continue
-        for side, extreme in (("highest", known.max()), ("lowest", known.min())):
-            share = float((known == extreme).mean())
-            # a value that the channel rests at (0 at standstill) is not a saturated one
-            if share > SATURATED_FRACTION and abs(extreme) > 0.5 * np.abs(known).max() and _held_share(known) < 0.5:
-                findings.append(
-                    Finding(
-                        "warning",
-                        "saturated",
-                        name,
-                        f"{100 * share:.2g} % of the samples sit at the {side} value, {extreme:.6g} {CHANNELS[name].unit}",
-                    )
-                )
+        levels, counts = np.unique(known, return_counts=True)
+        if len(levels) < 3:
+            continue
+        largest = np.abs(levels[[0, -1]]).max()
+        for side, extreme, at, beside in (("highest", levels[-1], counts[-1], counts[-2]), ("lowest", levels[0], counts[0], counts[1])):
+            if at <= SATURATED_FRACTION * len(known) or at < SATURATED_EXCESS * beside or abs(extreme) < 0.1 * largest:
+                continue
+            if np.count_nonzero(np.diff(np.concatenate([[0], known == extreme])) == 1) < 2:
+                continue
+            share = 100 * at / len(known)
+            message = f"{share:.2g} % of the samples sit at the {side} value, {extreme:.6g} {CHANNELS[name].unit}"
+            findings.append(Finding("warning", "saturated", name, message))
     return findings
 
 
-def _held_share(samples: FloatArray) -> float:
-    """Share of samples equal to the one before: a slower sensor whose value is held."""
-    return float((np.diff(samples) == 0).mean())
+def _standstill(recording: Recording) -> BoolArray:
+    """Where the car stands: the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
+    standing = np.zeros(len(recording), dtype=bool)
+    if "vx" not in recording:
+        return standing
+    for start, length in _runs(np.abs(recording["vx"]) < STANDSTILL_SPEED):
+        stretch = slice(start, start + length)
+        if not abs(recording["vx"][start]) < STANDSTILL_SPEED:
+            continue
+        turning = "yaw_rate" in recording and bool((np.abs(recording["yaw_rate"][stretch]) > STANDSTILL_YAW_RATE).any())
+        shaken = any(name in recording and _spread(recording[name][stretch]) > STANDSTILL_SHAKING for name in ("ax", "ay"))
+        if not (turning or shaken):
+            standing[stretch] = True
+    return standing
 
 
-def _longest_run(samples: FloatArray) -> tuple[int, int]:
-    """Start and length of the longest run of equal values."""
-    changes = np.flatnonzero(samples[1:] != samples[:-1]) + 1
-    edges = np.concatenate([[0], changes, [len(samples)]])
+def _spread(samples: FloatArray) -> float:
+    """Standard deviation of what is known of the samples."""
+    known = samples[np.isfinite(samples)]
+    return float(known.std()) if len(known) else 0.0
+
+
+def _runs(samples: NDArray[Any], at_least: int = 1) -> list[tuple[int, int]]:
+    """Start and length of every run of equal values that is long enough."""
+    if len(samples) == 0:
+        return []
+    edges = np.concatenate([[0], np.flatnonzero(samples[1:] != samples[:-1]) + 1, [len(samples)]])
     lengths = np.diff(edges)
-    longest = int(np.argmax(lengths))
-    return int(edges[longest]), int(lengths[longest])
+    long = lengths >= at_least
+    return list(zip(edges[:-1][long].tolist(), lengths[long].tolist(), strict=True))
 
 
 _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
+from vehest.data.recording import FloatArray, clock_tolerance
 
 Mode = Literal["causal", "offline"]
 
@@ -38,7 +38,7 @@ class Estimate:
         covariance: of the state (vy first), shape (T, n, n), where the method has one.
 
     Raises:
-        DataError: a quantity is unknown or of another length.
+        DataError: a quantity is unknown or of another length, or the covariance is not of shape (T, n, n).
     """
 
     recording_id: str
@@ -57,6 +57,10 @@ class Estimate:
             lengths.add(len(values))
         if len(lengths) != 1:
             raise DataError(f"estimate of '{self.recording_id}': quantities must have one common length, not {sorted(lengths)}")
+        if self.covariance is not None:
+            shape = self.covariance.shape
+            if len(shape) != 3 or shape[0] != len(self) or shape[1] != shape[2]:
+                raise DataError(f"estimate of '{self.recording_id}': the covariance must be of shape ({len(self)}, n, n), not {shape}")
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))
@@ -83,6 +87,7 @@ class Estimate:
         Returns:
             Shape (K,).
         """
-        index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + 1e-6).astype(np.int64)
+        tolerance = clock_tolerance(self.start_time, self.start_time + len(self) / self.rate_hz, self.rate_hz)
+        index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(np.int64)
         values = self[name][np.clip(index, 0, len(self) - 1)]
         return np.where((index >= 0) & (index < len(self)), values, np.nan)

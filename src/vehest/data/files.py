@@ -8,7 +8,7 @@ import os
 import shutil
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError, VehestError
@@ -38,7 +38,8 @@ def written_aside(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise writing_error(path, error) from error
     finally:
-        remove(aside)
+        with suppress(OSError):  # nothing was written where the folder itself cannot be
+            remove(aside)
 
 
 def writing_error(path: Path, error: OSError) -> VehestError:

@@ -34,7 +34,7 @@ class Recording:
         provenance: where the samples come from (JSON values only); not part of the data.
 
     Raises:
-        DataError: no samples, unknown channel, unequal lengths, or values that are not finite.
+        DataError: no samples, unknown channel, unequal lengths, values that are not finite, or a rate, start or kind that makes no sense.
     """
 
     id: str
@@ -49,6 +49,12 @@ class Recording:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise DataError(f"recording '{self.id}': the sampling rate must be positive, not {self.rate_hz}")
+        if not math.isfinite(self.start_time):
+            raise DataError(f"recording '{self.id}': the start time must be finite, not {self.start_time}")
+        if self.kind not in ("real", "simulated"):
+            raise DataError(f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'")
+        object.__setattr__(self, "rate_hz", float(self.rate_hz))
+        object.__setattr__(self, "start_time", float(self.start_time))
         if not self.channels:
             raise DataError(f"recording '{self.id}' has no channels")
         frozen: dict[str, FloatArray] = {}
@@ -157,10 +163,20 @@ class Recording:
 
 
 def index_at_or_after(recording: Recording, time: float) -> int:
-    """Index of the first sample taken at or after ``time`` [s], to a millionth of a sample; clipped to 0 … T."""
+    """Index of the first sample taken at or after ``time`` [s], to the tolerance of its clock; clipped to 0 … T."""
     if time == math.inf:
         return len(recording)
     if time == -math.inf:
         return 0
     position = (time - recording.start_time) * recording.rate_hz
-    return min(max(math.ceil(position - 1e-6), 0), len(recording))
+    tolerance = clock_tolerance(recording.start_time, recording.end_time, recording.rate_hz)
+    return min(max(math.ceil(position - tolerance), 0), len(recording))
+
+
+def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
+    """How far from a sample a time may lie and still be that sample's, in samples.
+
+    A millionth of a sample, or what a double resolves where the times are large: at 1.7e9 s (unix time) 0.24 µs.
+    """
+    resolution = math.ulp(max(abs(start_time), abs(end_time)))
+    return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)

@@ -101,9 +101,13 @@ def split_from_config(config: Mapping[str, Any]) -> Split:
     )
 
 
-def _spans(split: str, default_dataset: Any, entries: Sequence[Mapping[str, Any]]) -> tuple[Span, ...]:
+def _spans(split: str, default_dataset: Any, entries: Any) -> tuple[Span, ...]:
+    if not isinstance(entries, Sequence) or isinstance(entries, str):
+        raise ConfigurationError(f"split '{split}': ranges come as a list of recording, start and stop, not {entries}")
     spans = []
     for entry in entries:
+        if not isinstance(entry, Mapping):
+            raise ConfigurationError(f"split '{split}': a range is {{recording, start, stop}}, not {entry}")
         unknown = set(entry) - {"dataset", "recording", "start", "stop"}
         if unknown:
             raise ConfigurationError(f"split '{split}': unknown key '{sorted(unknown)[0]}' in {dict(entry)}")

@@ -19,6 +19,13 @@ from vehest.data.recording import Recording
 _METADATA_KEY = b"vehest"
 _FORMAT = 1
 _COVARIANCE = "covariance"
+_LAYOUT: dict[str, Any] = {
+    "compression": "zstd",
+    "use_dictionary": False,
+    "use_byte_stream_split": True,
+    "write_statistics": False,
+    "write_page_checksum": True,  # a flipped bit decompresses to other numbers without complaint
+}
 
 
 def write_recording(recording: Recording, path: Path) -> None:
@@ -64,8 +71,7 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 def is_stored_recording(path: Path) -> bool:
     """Whether ``path`` is a Parquet file that vehest wrote as a recording."""
     try:
-        metadata = pq.read_schema(path).metadata or {}
-        return json.loads(metadata.get(_METADATA_KEY, b"{}")).get("content") == "recording"
+        return bool(_description(pq.read_schema(path)).get("content") == "recording")
     except (OSError, pa.ArrowException, ValueError):
         return False
 
@@ -119,11 +125,15 @@ def read_estimate(path: Path) -> Estimate:
 
 
 def _write(path: Path, columns: Mapping[str, Any], description: Mapping[str, Any]) -> None:
+    try:
+        described = json.dumps(description).encode()
+    except (TypeError, ValueError) as error:
+        raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({_first_line(error)})") from None
     arrays = {name: pa.array(np.asarray(values, dtype=np.float64)) for name, values in columns.items()}
-    table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: json.dumps(description).encode()})
+    table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: described})
     with written_aside(path) as aside:
         try:
-            pq.write_table(table, aside, compression="zstd", use_dictionary=False, use_byte_stream_split=True, write_statistics=False)
+            pq.write_table(table, aside, **_LAYOUT)
         except pa.ArrowException as error:
             raise writing_error(path, OSError(str(error))) from error
 
@@ -134,9 +144,8 @@ def _read(path: Path, content: str, names: list[str] | None) -> tuple[dict[str, 
     if path.stat().st_size == 0:
         raise DataError(f"'{path}' is empty; make it again")
     try:
-        with pq.ParquetFile(path) as file:
-            metadata = file.schema_arrow.metadata or {}
-            description = json.loads(metadata.get(_METADATA_KEY, b"{}"))
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            description = _description(file.schema_arrow)
             if description.get("content") != content:
                 raise DataError(f"'{path}' is a Parquet file, but not a {content} that vehest wrote")
             if description["format"] > _FORMAT:
@@ -146,9 +155,15 @@ def _read(path: Path, content: str, names: list[str] | None) -> tuple[dict[str, 
                 have = ", ".join(file.schema_arrow.names)
                 raise DataError(f"'{path}' has no channel '{missing[0]}' (it has {have})")
             table = file.read(columns=names)
-    except (OSError, pa.ArrowException, ValueError) as error:
+    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
         raise DataError(f"'{path}' is truncated or damaged ({_first_line(error)}); make it again") from error
     return {name: table.column(name).to_numpy() for name in table.column_names}, description
+
+
+def _description(schema: Any) -> dict[str, Any]:
+    """What vehest wrote beside the table; empty for a table of someone else's."""
+    described = json.loads((schema.metadata or {}).get(_METADATA_KEY, b"{}"))
+    return described if isinstance(described, dict) else {}
 
 
 def _first_line(error: Exception) -> str:

@@ -34,8 +34,8 @@ class Transform(Protocol):
 class Resample:
     """Change the sampling rate by any rational ratio; the first sample keeps its time.
 
-    ``polyphase`` applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so nothing is shifted and
-    what lies above the new Nyquist frequency is removed before it can alias. ``decimate`` keeps every n-th sample as it is
+    ``polyphase`` applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so nothing is
+    shifted and what lies above the new Nyquist frequency is removed before it can alias. ``decimate`` keeps every n-th sample as it is
     (integer ratios only), which is what a slower sensor or a naive logger would deliver.
 
     Args:
@@ -50,7 +50,7 @@ class Resample:
     method: Literal["polyphase", "decimate"] = "polyphase"
     zero_crossings: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
-    cutoff: ClassVar[float] = 0.9
+    cutoff: ClassVar[float] = 0.86  # of the slower Nyquist frequency, where the stop band has then begun
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
@@ -109,8 +109,15 @@ class Resample:
         slower = max(up, down)
         half = self.zero_crossings * slower
         taps = signal.firwin(2 * half + 1, self.cutoff / slower, window=("kaiser", self.kaiser_beta))
-        for phase in range(up):  # unit gain at 0 Hz in every branch: a constant stays that constant
-            taps[phase::up] /= up * taps[phase::up].sum()
+        window = signal.get_window(("kaiser", self.kaiser_beta), len(taps), fftbins=False)
+        lag = np.arange(-half, half + 1) / half
+        for phase in range(up):  # every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line that line
+            branch = slice(phase, None, up)
+            taps[branch] /= up * taps[branch].sum()
+            shapes = window[branch] * lag[branch] ** np.array([[0], [1]])
+            moments = lag[branch] ** np.array([[0], [1]])
+            excess = moments @ taps[branch] - np.array([1.0 / up, 0.0])
+            taps[branch] -= np.linalg.solve(moments @ shapes.T, excess) @ shapes
         return taps
 
 
@@ -129,6 +136,10 @@ class LowPass:
     cutoff_hz: float
     channels: tuple[str, ...] = ()
     direction: Literal["causal", "zero_phase"] = "zero_phase"
+
+    def __post_init__(self) -> None:
+        if self.direction not in ("causal", "zero_phase"):
+            raise ConfigurationError(f"low-pass direction '{self.direction}' is not one of: causal, zero_phase")
 
     @property
     def mode(self) -> Mode:
@@ -174,6 +185,12 @@ class RemoveOutliers:
     threshold: float = 6.0
     channels: tuple[str, ...] = ()
     mode: ClassVar[Mode] = "offline"
+
+    def __post_init__(self) -> None:
+        if self.half_window < 1 or self.threshold <= 0:
+            raise ConfigurationError(
+                f"outlier removal needs half_window of 1 or more and a positive threshold, not {self.half_window} and {self.threshold}"
+            )
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -222,13 +239,14 @@ class MountingCorrection:
         """Correct ax and ay.
 
         Raises:
-            DataError: ax, ay or yaw_rate is missing.
+            DataError: ax, ay or yaw_rate is missing or has gaps.
         """
+        _require_no_gaps(recording, ("ax", "ay", "yaw_rate"))
         ax, ay, yaw_rate = recording["ax"], recording["ay"], recording["yaw_rate"]
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
         if self.mode == "offline":
-            yaw_acceleration = np.gradient(yaw_rate) * recording.rate_hz
+            yaw_acceleration = np.gradient(yaw_rate) * recording.rate_hz if len(yaw_rate) > 1 else np.zeros(1)
             rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
             rotated_y = rotated_y - yaw_acceleration * self.lever_x + yaw_rate**2 * self.lever_y
         return replace(recording, channels={**recording.channels, "ax": rotated_x, "ay": rotated_y})
@@ -249,6 +267,8 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
         ConfigurationError: an unknown name or argument.
     """
     arguments = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items() if key != "name"}
+    if isinstance(arguments.get("channels"), str):
+        arguments["channels"] = (arguments["channels"],)
     name = config.get("name")
     if name not in TRANSFORMS:
         raise ConfigurationError(f"transform '{name}' is not one of: {', '.join(TRANSFORMS)}")
@@ -268,8 +288,12 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray) -> Flo
 
 
 def _with_changed(recording: Recording, names: tuple[str, ...], change: Callable[[FloatArray], FloatArray]) -> Recording:
-    for name in names or recording.channels:
-        if name in recording.gappy:
-            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out")
+    _require_no_gaps(recording, names or tuple(recording.channels))
     changed = {name: change(recording[name]) for name in names or tuple(recording.channels)}
     return replace(recording, channels={**recording.channels, **changed})
+
+
+def _require_no_gaps(recording: Recording, names: tuple[str, ...]) -> None:
+    for name in names:
+        if name in recording.gappy:
+            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out")

@@ -38,10 +38,13 @@ def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target:
     """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1).
 
     Raises:
-        DataError: no recording is long enough.
+        DataError: no recording is long enough, or a gappy channel has gaps: a network cannot read "not measured".
     """
     series, targets, starts, offset = [], [], [], 0
     for recording in recordings:
+        for name in (*channels, target):
+            if name in recording.gappy and np.isnan(recording[name]).any():
+                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps; windows need a value at every sample")
         first = window_starts(len(recording), n_window)
         series.append(recording.stack(channels))
         targets.append(recording[target][first + n_window])

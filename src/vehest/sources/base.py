@@ -42,6 +42,9 @@ class Source(ABC):
                 f"data set '{self.name}': source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {known}"
             )
 
+        if dataset.get("kind", "real") not in ("real", "simulated"):
+            raise ConfigurationError(f"data set '{self.name}': kind '{dataset['kind']}' is not one of: real, simulated")
+
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
         """What the recordings are made from: name -> file, or a version where there is no file.

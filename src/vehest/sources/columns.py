@@ -16,6 +16,9 @@ from vehest.data.units import factor_to_si
 
 ClockPolicy = Literal["strict", "interpolate"]
 
+MOST_DRIFT = 0.01  # of an interval, over a whole recording, that may come from the resolution of the stamps
+INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
+
 
 @dataclass(frozen=True)
 class Column:
@@ -43,6 +46,8 @@ def columns_from_config(entries: Mapping[str, Any], dataset: str) -> dict[str, C
     Raises:
         ConfigurationError: an unknown channel, unit or key.
     """
+    if not isinstance(entries, Mapping):
+        raise ConfigurationError(f"data set '{dataset}': channels must map a channel to its column and unit, not {entries}")
     columns = {}
     for name, entry in entries.items():
         where = f"data set '{dataset}': channel '{name}'"
@@ -69,6 +74,21 @@ def column_from_config(entry: Any, where: str) -> Column:
     return Column(str(entry["column"]), str(entry["unit"]), int(entry.get("sign", 1)))
 
 
+def time_column_from_config(entry: Any, dataset: str) -> Column:
+    """The declaration of the time column.
+
+    Raises:
+        ConfigurationError: it does not say column and unit, or the unit is none of time.
+    """
+    where = f"data set '{dataset}': time"
+    column = column_from_config(entry, where)
+    try:
+        factor_to_si(column.unit, "s")
+    except DataError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
+    return column
+
+
 def identity_columns(names: list[str]) -> dict[str, Column]:
     """Columns that already carry a channel's name and unit."""
     return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
@@ -90,11 +110,20 @@ class Clock:
     n_samples: int
     stamps: FloatArray | None = None
 
-    def align(self, samples: FloatArray) -> FloatArray:
-        """Samples on the uniform clock, by linear interpolation where the file's own clock jitters."""
+    def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
+        """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
+
+        A gappy channel's samples go to the nearest tick instead: interpolation would lose every one that stands between two gaps.
+        """
         if self.stamps is None:
             return samples
-        return np.interp(self.start_time + np.arange(self.n_samples) / self.rate_hz, self.stamps, samples)
+        elapsed = self.stamps - self.stamps[0]
+        if not gappy:
+            return np.interp(np.arange(self.n_samples) / self.rate_hz, elapsed, samples)
+        aligned = np.full(self.n_samples, np.nan)
+        measured = np.flatnonzero(~np.isnan(samples))
+        aligned[np.clip(np.rint(elapsed[measured] * self.rate_hz).astype(np.int64), 0, self.n_samples - 1)] = samples[measured]
+        return aligned
 
 
 def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict") -> Clock:
@@ -103,25 +132,40 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     Args:
         stamps: time stamps [s], shape (T,).
         where: file, for messages.
-        policy: ``strict`` refuses gaps and jitter above 1 % of an interval, ``interpolate`` bridges them.
+        policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them.
 
     Raises:
         DataError: stamps repeat or go backwards, or are not uniform and ``policy`` is strict.
     """
     for finding in checks_of_clock(stamps):
         if finding.level == "error" and (finding.check == "clock" or policy == "strict"):
-            fix = "cut the range out or set clock: interpolate" if finding.check == "gap" else "remove or sort the rows"
+            fix = "cut the range out or set clock: interpolate" if finding.check == "gap" else "repair, remove or sort the rows"
             raise DataError(f"{where}: {finding.message}; {fix}")
-        if finding.check == "jitter" and policy == "strict":
+        if finding.check in {"jitter", "drift"} and policy == "strict":
             raise DataError(f"{where}: {finding.message}; set clock: interpolate to bring the samples to a uniform clock")
+    elapsed = float(stamps[-1] - stamps[0])
     if policy == "interpolate":
-        interval = float(np.median(np.diff(stamps)))
-        rate = _rounded(1.0 / interval)
-        return Clock(float(stamps[0]), rate, int(np.floor((stamps[-1] - stamps[0]) * rate + 1e-6)) + 1, stamps)
-    rate = _rounded((len(stamps) - 1) / (stamps[-1] - stamps[0]))
+        rate = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
+        return Clock(float(stamps[0]), rate, int(np.floor(elapsed * rate + 1e-3)) + 1, stamps)
+    intervals = len(stamps) - 1
+    rate = plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4))
     return Clock(float(stamps[0]), rate, len(stamps))
 
 
-def _rounded(rate: float) -> float:
-    """The rate without the dust of floating point, for example 100.0 for 99.99999999999999."""
-    return float(f"{rate:.9g}")
+def plain_rate(rate: float, tolerance: float) -> float:
+    """The rate that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
+
+    Time stamps carry the dust of their resolution (a double holds unix time to 0.24 µs), and the rate computed from them would
+    not be a rational multiple of any other.
+
+    Args:
+        rate: as computed from time stamps [Hz].
+        tolerance: relative deviation that is put down to the stamps.
+    """
+    for scale in (1.0, 1e3):
+        hertz = round(rate * scale) / scale
+        interval = round(1e3 * scale / rate) / (1e3 * scale)
+        candidates = [candidate for candidate in (hertz, 1.0 / interval if interval else 0.0) if abs(candidate / rate - 1.0) <= tolerance]
+        if candidates:
+            return min(candidates, key=lambda candidate: abs(candidate - rate))
+    return rate

@@ -5,6 +5,7 @@ Layouts: ``text``, a folder a recording and a text file a channel, as re-laid by
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray, Recording
 from vehest.sources.base import Source, existing_folder, require_files
-from vehest.sources.columns import column_from_config, columns_from_config, uniform_clock
+from vehest.sources.columns import columns_from_config, time_column_from_config, uniform_clock
 
 LAYOUTS = ("text",)
 
@@ -33,7 +34,7 @@ class RevsSource(Source):
         if dataset.get("layout") not in LAYOUTS:
             raise ConfigurationError(f"data set '{self.name}': layout '{dataset.get('layout')}' is not one of: {', '.join(LAYOUTS)}")
         self.columns = columns_from_config(dataset.get("channels") or {}, self.name)
-        self.time = column_from_config(dataset.get("time"), f"data set '{self.name}': time")
+        self.time = time_column_from_config(dataset.get("time"), self.name)
 
     def ids(self) -> list[str]:
         """The recordings that the data set names."""
@@ -79,11 +80,17 @@ class RevsSource(Source):
 def _read_numbers(file: Path) -> FloatArray:
     """One number a line."""
     try:
-        values = np.loadtxt(file, dtype=np.float64, ndmin=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there are no numbers is said below
+            values = np.loadtxt(file, dtype=np.float64, ndmin=1, encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
     except ValueError as error:
         raise DataError(
             f"'{file}' holds something that is not a number ({str(error).splitlines()[0]}); repair or remove the line"
         ) from None
+    if values.size == 0:
+        raise DataError(f"'{file}' holds no numbers; the copy is incomplete")
     if values.ndim != 1:
         raise DataError(f"'{file}' holds {values.shape[1]} numbers a line; one is expected")
     return values

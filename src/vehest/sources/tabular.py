@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,12 +13,12 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
-from vehest.data.channels import channel
+from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import Source, existing_folder, require_files
-from vehest.sources.columns import Clock, Column, column_from_config, columns_from_config, identity_columns, uniform_clock
+from vehest.sources.columns import Clock, Column, columns_from_config, identity_columns, time_column_from_config, uniform_clock
 
 
 class TabularSource(Source):
@@ -33,11 +35,16 @@ class TabularSource(Source):
         declared = dataset.get("channels")
         self.columns = None if declared is None else columns_from_config(declared, self.name)
         time = dataset.get("time")
-        self.time = None if time is None else column_from_config(time, f"data set '{self.name}': time")
+        self.time = None if time is None else time_column_from_config(time, self.name)
         if dataset.get("clock", "strict") not in ("strict", "interpolate"):
             raise ConfigurationError(f"data set '{self.name}': clock '{dataset['clock']}' is not one of: strict, interpolate")
-        if self.time is None and not dataset.get("rate_hz"):
+        rate = dataset.get("rate_hz")
+        if self.time is None and rate is None:
             raise ConfigurationError(f"data set '{self.name}': without a time column, rate_hz must be given")
+        if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+            raise ConfigurationError(f"data set '{self.name}': rate_hz must be a positive number, not {rate}")
+        self.gappy = self._gappy_channels(dataset.get("gappy") or [])
+        _require_options(dataset, self.name)
 
     def ids(self) -> list[str]:
         """Stems of the files, in alphabetical order."""
@@ -72,6 +79,8 @@ class TabularSource(Source):
             )
         wanted = [column.column for column in columns.values()] + ([self.time.column] if self.time else [])
         for name in wanted:
+            if names.count(name) > 1:
+                raise DataError(f"'{file}' has {names.count(name)} columns called '{name}'; rename or remove all but one")
             if name not in names:
                 raise DataError(
                     f"'{file}' has no column '{name}' (it has {_listed(names)}); correct the map in conf/dataset/{self.name}.yaml"
@@ -87,8 +96,10 @@ class TabularSource(Source):
             clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), f"'{file}'", self.dataset.get("clock", "strict"))
         else:
             clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
-        gappy = frozenset(str(name) for name in self.dataset.get("gappy") or [])
-        channels = {name: clock.align(column.to_si(values[column.column], channel(name).unit)) for name, column in columns.items()}
+        channels = {
+            name: clock.align(column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy)
+            for name, column in columns.items()
+        }
         try:
             return Recording(
                 id=file.stem,
@@ -97,11 +108,19 @@ class TabularSource(Source):
                 start_time=clock.start_time,
                 channels=channels,
                 kind=self.dataset.get("kind", "real"),
-                gappy=gappy,
+                gappy=self.gappy,
                 provenance={"dataset": self.name, "source": "tabular", "file": file.name, "citation": self.dataset.get("citation", "")},
             )
         except DataError as error:
             raise DataError(f"'{file}': {error}") from None
+
+    def _gappy_channels(self, names: Any) -> frozenset[str]:
+        if isinstance(names, str):
+            raise ConfigurationError(f"data set '{self.name}': gappy is a list of channels, for example [{names}], not '{names}'")
+        for name in names:
+            if name not in (CHANNELS if self.columns is None else self.columns):
+                raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
+        return frozenset(names)
 
     def _files(self) -> list[Path]:
         folder = existing_folder(self.dataset.get("path"), self.name)
@@ -114,6 +133,24 @@ class TabularSource(Source):
         if doubled:
             raise DataError(f"data set '{self.name}': two files are called '{doubled[0]}', a recording's name must be unique")
         return files
+
+
+def _require_options(dataset: Mapping[str, Any], name: str) -> None:
+    for option, default in (("delimiter", ","), ("decimal", ".")):
+        value = dataset.get(option, default)
+        if not isinstance(value, str) or len(value) != 1:
+            raise ConfigurationError(f"data set '{name}': {option} must be one character, not '{value}'")
+    encoding = str(dataset.get("encoding", "utf8"))
+    try:
+        codecs.lookup(encoding)
+    except LookupError:
+        raise ConfigurationError(f"data set '{name}': encoding '{encoding}' is not known; use for example utf8 or latin-1") from None
+    skip_rows = dataset.get("skip_rows", 0)
+    if not isinstance(skip_rows, int) or skip_rows < 0:
+        raise ConfigurationError(f"data set '{name}': skip_rows must be a whole number of lines, not {skip_rows}")
+    pattern = str(dataset.get("files", "*.csv"))
+    if not pattern or Path(pattern).is_absolute():
+        raise ConfigurationError(f"data set '{name}': files must be a pattern inside path, such as '*.csv', not '{pattern}'")
 
 
 def _is_parquet(file: Path) -> bool:
@@ -170,7 +207,7 @@ def _point_at_text(file: Path, names: list[str], dataset: Mapping[str, Any]) -> 
     for name in names:
         for row, text in enumerate(table.column(name).to_pylist(), start=1):
             try:
-                float((text or "nan").replace(str(dataset.get("decimal", ".")), "."))
+                float((text or "nan").replace(str(dataset.get("decimal", ".")), ".").replace("_", "?"))
             except ValueError:
                 raise DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {row}; numbers are needed") from None
 
@@ -179,7 +216,7 @@ def _numbers(table: pa.Table, name: str, file: Path) -> FloatArray:
     column = table.column(name)
     if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
         raise DataError(f"'{file}': column '{name}' is of type {column.type}; numbers are needed")
-    return column.cast(pa.float64()).to_numpy().astype(np.float64)
+    return column.cast(pa.float64(), safe=False).to_numpy().astype(np.float64)  # nanoseconds of unix time exceed 2^53
 
 
 def _unreadable(file: Path, error: Exception) -> DataError:

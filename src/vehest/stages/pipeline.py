@@ -113,16 +113,23 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
     Raises:
         ConfigurationError: an override that suits none of the sweeps.
     """
+    composed: dict[tuple[str, ...], Config] = {}
+
+    def config_of(job: tuple[str, ...]) -> Config:
+        if job not in composed:
+            composed[job] = compose_config("eval", job)
+        return composed[job]
+
     used: set[str] = set()
     configs: list[Config] = []
     for sweep in pipeline.sweeps:
         for job in expand([f"split={pipeline.split}", *pipeline.evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
             shared = tuple(override for override in job if override not in seeds)
-            base = _composed(shared)
+            base = config_of(shared)
             suiting = [override for override in overrides if key_of(override) in GROUPS or has_key(base, key_of(override))]
             used.update(suiting)
-            config = dict(_composed((*shared, *suiting)))
+            config = dict(config_of((*shared, *suiting)))
             own_seed = any(key_of(override) == "seed" for override in suiting)
             if seeds and not own_seed:
                 config["seed"] = compose_seed(seeds[-1])
@@ -137,15 +144,6 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
 def compose_seed(override: str) -> Any:
     """The value of ``seed=…``."""
     return yaml.safe_load(override.split("=", 1)[1])
-
-
-_composed_cache: dict[tuple[str, ...], Config] = {}
-
-
-def _composed(overrides: tuple[str, ...]) -> Config:
-    if overrides not in _composed_cache:
-        _composed_cache[overrides] = compose_config("eval", overrides)
-    return _composed_cache[overrides]
 
 
 def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Workshop, *, only_report: bool = False) -> PipelineOutcome:

@@ -1,0 +1,597 @@
+"""The command line from end to end, on a small data set of its own: what runs, what is skipped, what is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+import vehest
+from conftest import planar_drive
+from vehest.cli import main
+from vehest.data.files import ASIDE_PREFIX
+from vehest.data.store import read_recording
+from vehest.stages import code_version
+from vehest.stages.artefacts import read_artefact
+
+PIPELINE = {
+    "study": "small",
+    "title": "A small study",
+    "report": "drive",
+    "split": "mine",
+    "sweeps": [
+        ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],
+        ["estimator=ksnn", "estimator.n_hidden=0", "seed=0,1", "training.max_epochs=2"],
+        ["estimator=gru", "estimator.n_states=2", "training.max_epochs=2"],
+    ],
+}
+
+
+def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
+    """A drive at 100 Hz as a table with columns of its own names and units."""
+    drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
+    table = pd.DataFrame(
+        {
+            "Time": drive.time,
+            "Speed": drive["vx"] * 3.6,
+            "Yaw": np.degrees(drive["yaw_rate"]),
+            "LatAcc": -drive["ay"],
+            "LongAcc": drive["ax"],
+            "Vy": drive["vy_ref"],
+        }
+    )
+    table.to_csv(path, index=False)
+    return table
+
+
+DATASET = {
+    "name": "mine",
+    "title": "My car",
+    "kind": "simulated",
+    "vehicle": "my car",
+    "licence": "none",
+    "citation": "none",
+    "source": "tabular",
+    "path": "${root}",
+    "files": "*.csv",
+    "time": {"column": "Time", "unit": "s"},
+    "channels": {
+        "vx": {"column": "Speed", "unit": "km/h"},
+        "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
+        "ay": {"column": "LatAcc", "unit": "m/s²", "sign": -1},
+        "ax": {"column": "LongAcc", "unit": "m/s²"},
+        "vy_ref": {"column": "Vy", "unit": "m/s"},
+    },
+}
+
+
+class Place:
+    """A working folder with data, configuration and a pipeline of its own."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self._capsys = folder, capsys
+        for name, seed in (("one", 1), ("two", 2), ("three", 3)):
+            (folder / "raw").mkdir(exist_ok=True)
+            write_csv(folder / "raw" / f"{name}.csv", seed)
+        split = {
+            "name": "mine",
+            "dataset": "mine",
+            "train": [{"recording": "one"}],
+            "validation": [{"recording": "two"}],
+            "tests": {"test": [{"recording": "three"}]},
+        }
+        for group, content in (("dataset", DATASET), ("split", split)):
+            (folder / "conf" / group).mkdir(parents=True, exist_ok=True)
+            (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+        (folder / "pipelines").mkdir()
+        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
+
+    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+        """Exit code, standard output and standard error of a command."""
+        former, code = sys.argv, 0
+        sys.argv = ["vehest", *arguments]
+        try:
+            main()
+        except SystemExit as leave:
+            code = int(leave.code or 0)
+        finally:
+            sys.argv = former
+        out, err = self._capsys.readouterr()
+        return code, out, err
+
+    def refused(self, *arguments: str) -> tuple[int, str]:
+        """Exit code and the one line of a command that must fail and leave nothing behind."""
+        before = self.files()
+        code, _, err = self(*arguments)
+        assert code != 0
+        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
+        assert len(lines) == 1, err
+        assert lines[0].startswith("error: ")
+        assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
+        assert not any(ASIDE_PREFIX in name for name in self.files())
+        return code, lines[0]
+
+    def files(self) -> set[str]:
+        """Every file in the output root."""
+        return {str(file) for file in (self.folder / "outputs").rglob("*") if file.is_file()}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch, capsys) -> Place:
+    """A fresh place to work in, without tracking noise and without a data root from outside."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    return Place(tmp_path, capsys)
+
+
+def _statuses(err: str) -> list[tuple[str, str]]:
+    return [tuple(line.split()[:2]) for line in err.splitlines() if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")]  # type: ignore[misc]
+
+
+def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
+    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 0, err
+    assert "KS-NN linear no bias, P = 2" in out
+    assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
+    made = place.files()
+
+    code, again, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert again == out
+    assert place.files() == made
+
+    (place.folder / "README.md").write_text("changed")
+    _, _, err = place("run", "small", "tracking=none", "--dry-run")
+    assert {status for status, _ in _statuses(err)} == {"skipped"}
+
+    _, _, err = place("run", "small", "--jobs", "1", "tracking=none", "training.learning_rate=0.002")
+    done = [line for line in err.splitlines() if line.startswith("done")]
+    assert not any("luenberger" in line for line in done), "its training has no learning rate"
+    assert sum(" train " in line for line in done) == 3
+    assert not any(" ingest " in line or " downsample " in line for line in done)
+
+
+def test_dry_run_tells_and_makes_nothing(place):
+    code, _, err = place("run", "small", "--dry-run")
+    assert code == 0
+    assert ("would", "ingest") in _statuses(err)
+    assert place.files() == set()
+
+
+def test_two_processes_give_the_same_numbers_as_one(place):
+    place("run", "small", "--jobs", "1", "tracking=none", "output=one")
+    code, _, err = place("run", "small", "--jobs", "2", "tracking=none", "output=two")
+    assert code == 0, err
+    for model in (place.folder / "one" / "train").iterdir():
+        other = place.folder / "two" / "train" / model.name
+        assert (model / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
+
+
+def test_train_eval_estimate_report_one_by_one(place):
+    arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
+    code, out, err = place("train", *arguments, "--json")
+    assert code == 0, err
+    trained = json.loads(out)
+    assert trained["status"] == "complete"
+    assert trained["n_parameters"] == 28
+    assert json.loads(place("train", *arguments, "--json")[1])["skipped"] is True
+    assert json.loads(place("train", *arguments, "--json", "--force")[1])["skipped"] is False
+
+    code, out, err = place("eval", *arguments, "--json")
+    assert code == 0, err
+    by_overrides = json.loads(out)
+    name = Path(trained["model"]).name
+    code, out, err = place("eval", "--model", name, "split=mine", "tracking=none", "--json")
+    assert code == 0, err
+    assert json.loads(out)["rmse_sideslip.test"] == by_overrides["rmse_sideslip.test"]
+
+    table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
+    table.to_csv(place.folder / "lap.csv", index=False)
+    (place.folder / "conf" / "dataset" / "lap.yaml").write_text(
+        yaml.safe_dump(
+            {**DATASET, "name": "lap", "channels": {k: v for k, v in DATASET["channels"].items() if k != "vy_ref"}}, allow_unicode=True
+        )
+    )
+    for suffix in (".parquet", ".csv"):
+        code, out, err = place("estimate", name, "lap.csv", "dataset=lap", "-o", f"out{suffix}", "--json")
+        assert code == 0, err
+        assert json.loads(out)["estimated"] == 600 - 30
+    frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
+    assert list(frame.columns) == ["time", "vy", "sideslip"]
+    assert np.allclose(frame["vy"], text["vy"], equal_nan=True)
+
+    model = vehest.load_model(trained["model"])
+    estimate = vehest.estimate(model, vehest.read_recording("lap.csv", ["dataset=lap"]))
+    vehest.write_estimate(estimate, "api.parquet")
+    assert np.array_equal(estimate["vy"], frame["vy"], equal_nan=True)
+
+
+def test_report_draws_what_is_there_and_asks_for_what_is_not(place):
+    code, line = place.refused("report", "small", "tracking=none")
+    assert code == 4
+    assert "run 'vehest run" in line
+    place("run", "small", "--jobs", "1", "tracking=none")
+    code, out, err = place("report", "small", "tracking=none", "--json")
+    assert code == 0, err
+    assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
+    metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
+    assert list(metrics.columns[:6]) == ["study", "estimator", "variant", "trained_on", "dataset", "kind"]
+    assert set(metrics["kind"]) == {"simulated"}
+    assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs", "step_seconds"} <= set(metrics["metric"])
+
+
+def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
+    code, out, err = place("ingest", "mine", "--json")
+    assert code == 0, err
+    recording = read_recording(Path(json.loads(out)["folder"]) / "one.parquet")
+    truth = planar_drive(30.0, 100.0, seed=1, noise=0.02)
+    for name in ("vx", "yaw_rate", "ay", "ax", "vy_ref"):
+        assert np.allclose(recording[name], truth[name], rtol=0, atol=1e-9), name
+    code, out, err = place("downsample", "mine", "rate_hz=20", "--json")
+    assert code == 0, err
+    assert read_recording(Path(json.loads(out)["folder"]) / "one.parquet").rate_hz == 20.0
+
+
+def test_data_commands_list_show_and_check(place):
+    rows = json.loads(place("data", "list", "--json")[1])
+    assert {"mine", "ferrari_250lm", "sim_quickstart"} <= {row["dataset"] for row in rows}
+    assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
+    shown = json.loads(place("data", "show", "mine", "--json")[1])
+    assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
+    assert shown["recordings"][0]["rate_hz"] == 100.0
+    code, out, _ = place("data", "check", "mine")
+    assert code == 0
+    assert "follows ay - vx·yaw_rate" in out
+    assert "yaw_rate" in place("data", "channels")[1]
+    assert "one: simulated" in place("data", "show", "mine")[1]
+
+
+def test_check_reports_a_reference_that_points_the_wrong_way(place):
+    (place.folder / "conf" / "dataset" / "mirrored.yaml").write_text(
+        yaml.safe_dump(
+            {**DATASET, "channels": {**DATASET["channels"], "vy_ref": {"column": "Vy", "unit": "m/s", "sign": -1}}}, allow_unicode=True
+        )
+    )
+    code, out, _ = place("data", "check", "mirrored")
+    assert code == 0
+    assert "disagrees in sign with d(vy_ref)/dt" in out
+
+
+def test_config_prints_what_a_command_would_use(place):
+    shown = yaml.safe_load(place("config", "train", "estimator=lstm", "seed=4")[1])
+    assert shown["estimator"]["name"] == "lstm"
+    assert shown["seed"] == 4
+    assert json.loads(place("config", "ingest", "dataset=mine", "--json")[1])["dataset"]["source"] == "tabular"
+
+
+def test_doctor_finds_this_machine_fit(place):
+    code, out, _ = place("doctor", "--json")
+    assert code == 0
+    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
+
+
+def test_help_shows_choices_and_answers_quickly(place):
+    _, out, _ = place("train", "--help")
+    assert "luenberger" in out
+    assert "ferrari_drive" in out
+    code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
+    code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
+
+
+def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
+    code, _, err = place("run", "small", "--jobs", "1")
+    assert code == 0, err
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("vehest")
+    runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+    assert len(runs) == 8
+    trained = runs["ksnn-linear_no_bias_p2-seed0"]
+    assert trained.data.params["estimator.n_local"] == "2"
+    assert trained.data.params["training.learning_rate"] == "0.001"
+    assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
+    kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
+    assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
+    evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
+    assert evaluated.data.metrics["rmse_sideslip.test"] > 0
+    assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
+
+
+def test_training_goes_on_when_the_tracking_server_is_away(place):
+    code, _, err = place("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
+    assert code == 0
+    assert err.count("does not answer") == 1
+    assert "going on without tracking" in err
+
+
+# --- input that cannot be used -------------------------------------------------------------------------------------
+
+
+def _rewrite(place: Place, change) -> None:
+    path = place.folder / "raw" / "one.csv"
+    table = pd.read_csv(path)
+    change(table).to_csv(path, index=False)
+
+
+def _with(column, row, value):
+    def change(table):
+        table = table.astype({column: object})
+        table.loc[row, column] = value
+        return table
+
+    return change
+
+
+BAD_TABLES = {
+    "missing column": (lambda t: t.drop(columns="Yaw"), r"has no column 'Yaw' \(it has Time, Speed"),
+    "NaN": (_with("LatAcc", 500, np.nan), r"one\.csv.*channel 'ay' holds 1 NaN between 5 s and 5 s"),
+    "text": (_with("Speed", 41, "fast"), r"one\.csv': column 'Speed' holds the text 'fast' in data row 42"),
+    "repeated time": (_with("Time", 10, 0.09), r"one\.csv': time repeats 1 times, first at sample 10"),
+    "backward time": (_with("Time", 10, 0.05), r"one\.csv': time goes backwards 1 times"),
+    "gap": (lambda t: t.drop(index=range(100, 200)), r"one\.csv': 1 gaps, the longest of 1\.01 s after 0\.99 s.*clock: interpolate"),
+    "header only": (lambda t: t.iloc[:0], r"one\.csv' has a header and no rows"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_TABLES)
+def test_bad_tables_are_one_clear_line(place, fault):
+    import re
+
+    change, message = BAD_TABLES[fault]
+    _rewrite(place, change)
+    for command in (("ingest", "mine"), ("train", "split=mine", "tracking=none"), ("run", "small", "tracking=none")):
+        code, line = place.refused(*command)
+        assert code in (3, 4)
+        assert re.search(message, line), line
+    assert place.files() == set()
+
+
+def test_degrees_taken_as_radians_are_one_clear_line(place):
+    content = yaml.safe_load((place.folder / "conf" / "dataset" / "mine.yaml").read_text())
+    content["channels"]["yaw_rate"]["unit"] = "rad/s"
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+    code, line = place.refused("ingest", "mine")
+    assert code == 3
+    assert "recording 'one': channel 'yaw_rate'" in line
+    assert "degrees" in line
+    assert place.files() == set()
+    code, out, _ = place("data", "check", "mine")
+    assert code == 3
+    assert "degrees" in out
+
+
+def test_empty_and_truncated_files_are_one_clear_line(place):
+    path = place.folder / "raw" / "one.csv"
+    pd.read_csv(path).to_parquet(place.folder / "raw" / "one.parquet")
+    path.write_text("")
+    assert "one.csv' is empty" in place.refused("ingest", "mine")[1]
+    whole = (place.folder / "raw" / "one.parquet").read_bytes()
+    (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
+    code, line = place.refused("ingest", "mine", "dataset.files=one.parquet")
+    assert code == 3
+    assert "one.parquet' cannot be read as a table" in line
+    assert "truncated" in line
+
+
+def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place, monkeypatch):
+    code, line = place.refused("ingest", "mine", "root=/no/such/folder")
+    assert code == 4
+    assert "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA" in line
+    assert place.refused("ingest", "mine", "dataset.colour=red")[0] == 2
+    assert "choices" in place.refused("train", "estimator=transformer")[1]
+    assert "unknown option 'estimator.depth'" in place.refused("train", "estimator.depth=3")[1]
+    assert place.refused("eval", "split=mine", "tracking=none")[0] == 4
+    assert place.refused("estimate", "nothing", "lap.csv")[0] == 4
+    assert "has no recording 'four'" in place.refused("train", "split=mine", "split.train=[{recording: four}]", "tracking=none")[1]
+    overlapping = "split.tests.test=[{recording: one, start: 5, stop: 10}]"
+    assert "share samples of recording 'one'" in place.refused("train", "split=mine", overlapping, "tracking=none")[1]
+    monkeypatch.delenv("VEHEST_DATA")
+    code, line = place.refused("ingest", "mine")
+    assert code == 4
+    assert "no data root is set" in line
+
+
+def test_estimate_refuses_a_recording_it_cannot_use(place):
+    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    drive = planar_drive(10.0, 20.0).without_references()
+    slow = pd.DataFrame({"time": drive.time, **drive.channels})
+    slow.to_csv("slow.csv", index=False)
+    assert "below the 100 Hz" in place.refused("estimate", "luenberger", "slow.csv", "-o", "out.parquet")[1]
+    slow.drop(columns="ax").to_csv("less.csv", index=False)
+    assert "no channel 'ax'" in place.refused("estimate", "luenberger", "less.csv", "-o", "out.parquet")[1]
+    assert "must end in .parquet or .csv" in place.refused("estimate", "luenberger", "slow.csv", "-o", "out.xlsx")[1]
+    assert not Path("out.parquet").exists()
+
+
+def test_truncated_artefact_is_made_again(place):
+    arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")
+    model = Path(json.loads(place(*arguments)[1])["model"])
+    weights = model / "model.safetensors"
+    whole = weights.read_bytes()
+    weights.write_bytes(whole[:50])
+    code, out, _ = place(*arguments)
+    assert code == 0
+    assert json.loads(out)["skipped"] is False
+    assert weights.read_bytes() == whole
+
+
+# --- code versions ---------------------------------------------------------------------------------------------------
+
+
+def test_code_version_ignores_comments_and_docstrings_and_sees_code(tmp_path, monkeypatch):
+    module = tmp_path / "own_estimator.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def version(text: str) -> str:
+        module.write_text(text)
+        code_version._module.cache_clear()
+        return code_version.code_version(["own_estimator"])
+
+    first = version('"""Doc."""\n\ndef f(x):\n    """Doc."""\n    return x + 1\n')
+    assert version('"""Other."""\n# comment\n\ndef f(x):\n    """Longer doc."""\n\n    return x + 1\n') == first
+    assert version('"""Doc."""\n\ndef f(x):\n    return x + 2\n') != first
+    code_version._module.cache_clear()
+
+
+def test_code_of_one_estimator_does_not_concern_another():
+    modules = set()
+
+    def walk(name):
+        for other in code_version._module(name)[1]:
+            if other not in modules:
+                modules.add(other)
+                walk(other)
+
+    walk("vehest.estimators.gru")
+    assert "vehest.estimators.kernels.gru" in modules
+    assert "vehest.training.supervised" in modules
+    assert not modules & {"vehest.estimators.ksnn", "vehest.estimators.luenberger", "vehest.cli", "vehest.stages.config"}
+
+
+# --- signals, kills and full disks -----------------------------------------------------------------------------------
+
+LONG = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none", "split=mine")
+
+
+def _start(place: Place, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "vehest", *arguments], cwd=place.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def _wait_for(process: subprocess.Popen[str], condition, seconds: float = 90.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.02)
+
+
+def _checkpoint_epoch(place: Place) -> int:
+    from vehest.training.checkpoints import resume_epoch
+
+    return max((resume_epoch(folder) for folder in (place.folder / "outputs" / "checkpoints").glob("*")), default=0)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(place, number, code):
+    process = _start(place, "train", *LONG)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == code, err
+    assert "the best so far is kept in" in err
+    (model,) = (place.folder / "outputs" / "train").iterdir()
+    assert read_artefact(model).status == "interrupted"
+    assert not any(ASIDE_PREFIX in name for name in place.files())
+    reached = _checkpoint_epoch(place)
+    process = _start(place, "train", *LONG)
+    _wait_for(process, lambda: _checkpoint_epoch(place) > reached)
+    process.kill()
+    process.communicate()
+
+
+def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place):
+    budget = ("split=mine", "training.max_epochs=40", "training.patience=40", "training.checkpoint_seconds=0", "tracking=none", "--json")
+    process = _start(place, "train", *budget)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
+    process.kill()
+    process.communicate()
+    assert not list((place.folder / "outputs").glob("train/[!.]*"))
+    code, out, err = place("train", *budget)
+    assert code == 0, err
+    resumed = json.loads(out)
+    code, out, err = place("train", *budget, "output=undisturbed")
+    whole = json.loads(out)
+    assert resumed["epochs"] == whole["epochs"] == 40
+    weights = [(Path(model) / "model.safetensors").read_bytes() for model in (resumed["model"], whole["model"])]
+    assert weights[0] == weights[1]
+    assert not any("checkpoint" in name for name in place.files())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, number):
+    for seed in range(40):
+        write_csv(place.folder / "raw" / f"more_{seed}.csv", seed, 60.0)
+    process = _start(place, "ingest", "mine")
+    _wait_for(process, lambda: len(list((place.folder / "outputs" / "ingest").glob(f"{ASIDE_PREFIX}*/*.parquet"))) > 2)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == (143 if number == signal.SIGTERM else -signal.SIGKILL), err
+    assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
+    if number == signal.SIGTERM:
+        assert not any(ASIDE_PREFIX in name for name in place.files())
+    code, out, err = place("ingest", "mine", "--json")
+    assert code == 0, err
+    assert len(json.loads(out)["recordings"]) == 43
+    assert not any(ASIDE_PREFIX in name for name in place.files()), "what the killed run left is cleared away"
+
+
+def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
+    process = _start(place, "run", "small", "--jobs", "2", *LONG[:4])
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 2)
+    children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+    assert children
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2] for pid in children):
+        assert time.monotonic() < deadline, "workers must end with their parent"
+        time.sleep(0.1)
+    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 0, err
+
+
+def _limited(place: Place, limit: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command whose files may not grow beyond ``limit`` bytes: every larger write fails as on a full disk."""
+    program = (
+        f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.argv = {['vehest', *arguments]!r}\n"
+    )
+    program += "from vehest.cli import main\nmain()"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(place.folder / "numba")}
+    return subprocess.run([sys.executable, "-c", program], cwd=place.folder, capture_output=True, text=True, timeout=120, env=environment)
+
+
+def test_a_full_disk_in_ingest_and_train_is_one_line_and_leaves_nothing(place):
+    result = _limited(place, 10_000, "ingest", "mine")
+    assert result.returncode == 4
+    assert result.stderr.startswith("error: no room left to write")
+    assert place.files() == set()
+    assert place("ingest", "mine")[0] == 0
+    assert place("downsample", "mine", "rate_hz=20")[0] == 0
+    before = place.files()
+    result = _limited(place, 400, "train", "split=mine", "training.max_epochs=1", "training.compiled=false", "tracking=none")
+    assert result.returncode == 4, result.stderr
+    assert "no room left to write" in result.stderr.splitlines()[-1]
+    assert place.files() == before
+    assert place("train", "split=mine", "training.max_epochs=1", "tracking=none")[0] == 0
+
+
+def test_a_really_full_disk_is_one_line_and_leaves_nothing(place):
+    disk = place.folder / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=120k", "tmpfs", str(disk)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("a small file system cannot be mounted here (needs root)")
+    try:
+        code, line = place.refused("ingest", "mine", f"output={disk}")
+        assert code == 4
+        assert "no room left to write" in line
+        assert list(disk.rglob("*.parquet")) == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

@@ -1,0 +1,82 @@
+"""Metrics against their definitions on series whose errors are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from conftest import planar_drive
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.splits import Span
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+
+
+def _estimate(times, vy, rate_hz, start):
+    return Estimate("drive", "test", rate_hz, start, {"vy": vy, "sideslip": np.zeros(len(vy))})
+
+
+def test_accuracy_has_the_values_of_a_hand_calculation():
+    vy_ref = np.array([1.0, -1.0, 2.0, -2.0])
+    vy = vy_ref + np.array([0.1, 0.1, 0.3, 0.3])
+    part = Scored(np.arange(4.0), vy, vy_ref, np.radians([1.0, 2.0, 3.0, 4.0]), np.zeros(4), np.array([1.0, 5.0, -6.0, 0.0]))
+    figures = accuracy([part])
+    assert figures["rmse_vy"] == pytest.approx(math.sqrt((0.01 + 0.01 + 0.09 + 0.09) / 4))
+    assert figures["fvu"] == pytest.approx(0.01 / 2.5)
+    assert figures["r2"] == pytest.approx(1 - 0.01 / 2.5)
+    assert figures["rmse_sideslip"] == pytest.approx(math.sqrt(30 / 4))
+    assert figures["mse_sideslip"] == pytest.approx(7.5)
+    assert figures["mse_sideslip_nonlinear"] == pytest.approx((4 + 9) / 2)
+    assert figures["max_error_sideslip"] == pytest.approx(4.0)
+    assert figures["max_error_sideslip_nonlinear"] == pytest.approx(3.0)
+    assert figures["p99_sideslip"] == pytest.approx(np.quantile([1, 2, 3, 4], 0.99))
+    assert set(figures) <= set(UNITS)
+
+
+def test_a_constant_offset_does_not_count_in_fvu_but_does_in_rmse(drive):
+    part = Scored(drive.time, drive["vy_ref"] + 0.5, drive["vy_ref"], drive["sideslip_ref"], drive["sideslip_ref"], drive["ay"])
+    figures = accuracy([part])
+    assert figures["fvu"] == pytest.approx(0.0, abs=1e-12)
+    assert figures["rmse_vy"] == pytest.approx(0.5)
+
+
+def test_without_nonlinear_samples_nonlinear_metrics_are_nan():
+    part = Scored(np.arange(3.0), np.ones(3), np.arange(3.0), np.zeros(3), np.zeros(3), np.zeros(3))
+    assert math.isnan(accuracy([part])["mse_sideslip_nonlinear"])
+
+
+def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
+    """A 100 Hz estimate is read at 20 Hz at the same instant; one that starts late is held."""
+    times = np.arange(0, 60, 0.01)
+    estimate = _estimate(times, times.copy(), 100.0, 0.0)
+    scored = score(estimate, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
+    assert scored.time[0] == pytest.approx(11.5)
+    assert scored.time[-1] == pytest.approx(19.95)
+    assert np.allclose(scored.vy, scored.time, atol=1e-9)
+    slow = _estimate(times[::50], times[::50].copy(), 2.0, 0.0)
+    held = score(slow, drive, Span("d", "drive", 10.0, 20.0), Protocol(20.0, 10.0, 1.5))
+    assert np.allclose(held.vy, np.floor(held.time * 2 + 1e-6) / 2)
+    assert (held.vy <= held.time + 1e-9).all()
+
+
+def test_the_first_second_and_a_half_is_not_scored(drive):
+    vy = np.where(drive.time < 11.5 - 1e-9, 1e6, drive["vy_ref"])
+    scored = score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol())
+    assert accuracy([scored])["rmse_vy"] == 0.0
+
+
+def test_sideslip_uses_the_measured_forward_velocity():
+    drive = planar_drive(noise=0.3)
+    scored = score(_estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+    vx = drive["vx"][30:]
+    assert np.allclose(scored.sideslip_ref, np.arctan2(drive["vy_ref"][30:], vx))
+    assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
+
+
+def test_estimate_with_holes_is_an_error_not_a_better_score(drive):
+    vy = drive["vy_ref"].copy()
+    vy[500] = np.nan
+    with pytest.raises(DataError, match="has no estimate for 1 of"):
+        score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
