@@ -48,7 +48,7 @@ test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for t
 	$(BIN)/python -m pytest -m slow
 
 ui: $(INSTALLED) ## look at all runs in MLflow
-	$(BIN)/mlflow ui --backend-store-uri sqlite:///$(CURDIR)/$${VEHEST_OUTPUT:-outputs}/mlflow.db
+	$(BIN)/mlflow ui --backend-store-uri "sqlite:///$$(realpath "$${VEHEST_OUTPUT:-outputs}")/mlflow.db"
 
 docs: $(INSTALLED) ## write the reference pages that are made from the code
 	$(BIN)/python docs/make_reference.py

@@ -26,6 +26,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="Train, run and compare published estimators of a car's lateral velocity and sideslip angle.\n\n"
     "Options of a command are set by overrides after it: `vehest train estimator=ksnn estimator.n_local=3 seed=7`.",
     epilog="Exit codes: 0 done, 1 defect of vehest, 2 wrong usage or configuration, 3 unusable data, 4 something is missing, "

@@ -66,7 +66,10 @@ def checks_of_clock(time: FloatArray) -> list[Finding]:
             where = np.flatnonzero(bad)
             findings.append(
                 Finding(
-                    "error", "clock", "time", f"time {what} {len(where)} times, first at sample {where[0] + 1} ({time[where[0] + 1]:.6g} s)"
+                    "error",
+                    "clock",
+                    "time",
+                    f"time {what} {len(where)} times, first at sample {where[0] + 1} ({time[where[0] + 1]:.12g} s)",
                 )
             )
     if findings:
@@ -80,7 +83,7 @@ def checks_of_clock(time: FloatArray) -> list[Finding]:
                 "error",
                 "gap",
                 "time",
-                f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {time[longest]:.6g} s (interval {interval:.6g} s)",
+                f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {time[longest]:.12g} s (interval {interval:.6g} s)",
             )
         )
     jitter = float(np.abs(steps[steps <= 1.5 * interval] - interval).max() / interval)
@@ -93,7 +96,7 @@ def checks_of_clock(time: FloatArray) -> list[Finding]:
     if drift > MOST_DRIFT and not len(gaps):
         worst = time[np.argmax(np.abs(time - uniform))]
         findings.append(
-            Finding("warning", "drift", "time", f"the clock drifts: at {worst:.6g} s it is {drift:.2g} intervals away from a uniform one")
+            Finding("warning", "drift", "time", f"the clock drifts: at {worst:.12g} s it is {drift:.2g} intervals away from a uniform one")
         )
     return findings
 
@@ -120,7 +123,7 @@ def _impossible_values(recording: Recording) -> list[Finding]:
                 "impossible",
                 name,
                 f"{len(outside)} samples beyond what a vehicle can do, {samples[worst]:.6g} {described.unit} at "
-                f"{recording.time[worst]:.6g} s (possible: {described.low:.4g} to {described.high:.4g}); {hint}",
+                f"{recording.time[worst]:.12g} s (possible: {described.low:.4g} to {described.high:.4g}); {hint}",
             )
         )
     return findings
@@ -243,7 +246,7 @@ def _stuck(recording: Recording) -> list[Finding]:
                 longest, first = held, int(known[start] + np.argmax(moving[stretch]))
         if longest >= STUCK_SECONDS * recording.rate_hz:
             seconds, time = longest / recording.rate_hz, recording.time[first]
-            message = f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.6g} s"
+            message = f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s"
             findings.append(Finding("warning", "stuck", name, message))
     return findings
 

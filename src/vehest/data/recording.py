@@ -83,7 +83,7 @@ class Recording:
         first, last = (self.start_time + where[[0, -1]] / self.rate_hz).tolist()
         what = "NaN" if np.isnan(samples[bad]).all() else "infinite values"
         raise DataError(
-            f"recording '{self.id}': channel '{name}' holds {len(where)} {what} between {first:.6g} s and {last:.6g} s; "
+            f"recording '{self.id}': channel '{name}' holds {len(where)} {what} between {first:.12g} s and {last:.12g} s; "
             f"cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
         )
 
@@ -148,8 +148,8 @@ class Recording:
         first, last = self.index_range(start, stop)
         if first >= last:
             raise DataError(
-                f"recording '{self.id}' spans {self.start_time:.6g} s to {self.end_time:.6g} s; "
-                f"it has no samples between {start:.6g} s and {stop:.6g} s"
+                f"recording '{self.id}' spans {self.start_time:.12g} s to {self.end_time:.12g} s; "
+                f"it has no samples between {start:.12g} s and {stop:.12g} s"
             )
         return replace(
             self,

@@ -32,7 +32,7 @@ class Span:
         """For messages and reports, for example ``lap3 [150, 450) s``."""
         if self.start == -math.inf and self.stop == math.inf:
             return f"{self.recording} (all)"
-        return f"{self.recording} [{self.start:g}, {self.stop:g}) s"
+        return f"{self.recording} [{self.start:.12g}, {self.stop:.12g}) s"
 
 
 @dataclass(frozen=True)

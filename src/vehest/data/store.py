@@ -147,7 +147,8 @@ def _read(path: Path, content: str, names: list[str] | None) -> tuple[dict[str, 
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             description = _description(file.schema_arrow)
             if description.get("content") != content:
-                raise DataError(f"'{path}' is a Parquet file, but not a {content} that vehest wrote")
+                article = "an" if content == "estimate" else "a"
+                raise DataError(f"'{path}' is a Parquet file, but not {article} {content} that vehest wrote")
             if description["format"] > _FORMAT:
                 raise DataError(f"'{path}' was written by a newer vehest (format {description['format']}); update vehest")
             missing = [name for name in names or [] if name not in file.schema_arrow.names]

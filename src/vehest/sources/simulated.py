@@ -23,11 +23,20 @@ class SimulatedSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.drives = {}
+        self.drives: dict[str, Mapping[str, Any]] = {}
         for drive in dataset.get("drives") or []:
-            if set(drive) != {"id", "seed", "duration"}:
-                raise ConfigurationError(f"data set '{self.name}': a drive has an id, a seed and a duration, not {dict(drive)}")
+            if not isinstance(drive, Mapping) or set(drive) != {"id", "seed", "duration"}:
+                raise ConfigurationError(f"data set '{self.name}': a drive has an id, a seed and a duration, not {drive}")
+            if not isinstance(drive["seed"], int) or not isinstance(drive["duration"], int | float) or drive["duration"] <= 0:
+                raise ConfigurationError(
+                    f"data set '{self.name}': drive '{drive['id']}' needs a whole number as seed and a positive duration [s], "
+                    f"not {drive['seed']} and {drive['duration']}"
+                )
+            if str(drive["id"]) in self.drives:
+                raise ConfigurationError(f"data set '{self.name}': two drives are called '{drive['id']}', names must differ")
             self.drives[str(drive["id"])] = drive
+        if "vehicle" not in dataset:
+            raise ConfigurationError(f"data set '{self.name}': a simulated data set needs a vehicle from conf/vehicle")
         if dataset.get("sensors", "default") not in ("default", "ideal"):
             raise ConfigurationError(f"data set '{self.name}': sensors '{dataset['sensors']}' is not one of: default, ideal")
 

@@ -193,7 +193,7 @@ def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Worksh
         members=members,
         evaluation=evaluation,
         data_titles=titles,
-        training=_training_facts(configs),
+        training=[*_training_facts(configs), _resampling_fact(configs)],
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
     published = None
@@ -217,6 +217,18 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
         groups.setdefault(job.group, []).append(job)
         evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
     return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
+
+
+def _resampling_fact(configs: Sequence[Config]) -> str:
+    """How recordings came to the rates that estimators work at."""
+    rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(configs[0]["evaluation"]["rate_hz"])})
+    options = configs[0]["downsample"]
+    how = {
+        "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
+        "decimate": "by plain decimation",
+    }[options["method"]]
+    first = f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
+    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
 
 
 def _training_facts(configs: Sequence[Config]) -> list[str]:

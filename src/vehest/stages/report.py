@@ -39,7 +39,7 @@ class ReportJob:
         members: trained and evaluated, in the order of the pipeline.
         evaluation: split, references and protocol.
         data_titles: data set -> title.
-        training: what each training scheme was allowed, a line each.
+        training: how recordings were prepared and what each training scheme was allowed, a line each.
     """
 
     study: str

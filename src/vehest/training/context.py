@@ -40,12 +40,10 @@ class FitContext:
 
     Args:
         checkpoint_folders: where each member keeps the state of its unfinished fit; empty if nothing is to be kept.
-        device: torch device name.
         should_stop: asked after every batch; True ends the fit cleanly with the best so far.
         on_progress: called after every epoch.
     """
 
     checkpoint_folders: Sequence[Path] = ()
-    device: str = "cpu"
     should_stop: Callable[[], bool] = field(default=_never)
     on_progress: Callable[[Progress], None] = field(default=_silent)

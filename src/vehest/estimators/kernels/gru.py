@@ -19,7 +19,22 @@ def last_state(input_weight: Tensor, state_weight: Tensor, bias: Tensor, prepare
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _forward(input_weight, state_weight, bias, inputs, trace):  # type: ignore[no-untyped-def]
+def _forward(input_weight, state_weight, bias, inputs, trace, states):  # type: ignore[no-untyped-def]
+    for m in range(inputs.shape[0]):
+        for block in range(inputs.shape[1]):
+            kept = trace[min(m, trace.shape[0] - 1), min(block, trace.shape[1] - 1)]
+            states[m, block] = _forward_block(input_weight[m], state_weight[m], bias[m], inputs[m, block], kept)
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _backward(input_weight, state_weight, inputs, trace, adjoint, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
+    for m in range(inputs.shape[0]):
+        for block in range(inputs.shape[1]):
+            _backward_block(state_weight[m], inputs[m, block], trace[m, block], adjoint[m, block], to_input[m], to_state[m], to_bias[m])
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy")
+def _forward_block(input_weight, state_weight, bias, inputs, trace):  # type: ignore[no-untyped-def]
     n_states, n_lanes = bias.shape[1], inputs.shape[2]
     state = np.zeros((n_states, n_lanes), bias.dtype)
     for k in range(inputs.shape[0]):
@@ -43,7 +58,7 @@ def _forward(input_weight, state_weight, bias, inputs, trace):  # type: ignore[n
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _backward(input_weight, state_weight, inputs, trace, adjoint, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
+def _backward_block(state_weight, inputs, trace, adjoint, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
     n_states, n_lanes = adjoint.shape
     one = adjoint.dtype.type(1)
     inner = np.empty((3, n_states, n_lanes), adjoint.dtype)  # adjoints of the gates' arguments

@@ -1,6 +1,7 @@
 """Recurrent cells over many windows at once: windows lie side by side in lanes, so that inner loops become vector instructions.
 
-A cell's module supplies two compiled loops, forward and backward over one block of lanes; this module wraps them for autograd.
+A cell's module supplies two compiled loops, forward and backward over members and blocks of lanes; this module wraps them for
+autograd.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 LANES = 64
+WITHOUT_TRACE = 64 * LANES  # windows at a time where no gradient is wanted, so that long recordings need little memory
 
 Loop = Callable[..., None]
 
@@ -32,7 +34,7 @@ def last_state(
     """Hidden state after each window, differentiable in the weights.
 
     Args:
-        forward: compiled loop over one block of lanes.
+        forward: compiled loop over members and blocks of lanes.
         backward: its adjoint.
         trace_rows: values a lane keeps for the adjoint at every step, in hidden-state sizes.
         input_weight: (M, G, H, C).
@@ -65,61 +67,61 @@ class _LastState(torch.autograd.Function):
         backward: Loop,
         trace_rows: int,
     ) -> Tensor:
-        wanted = any(ctx.needs_input_grad[:3])
         weights = [weight.detach().contiguous().numpy() for weight in (input_weight, state_weight, bias)]
         series, first = prepared.contiguous().numpy(), starts.contiguous().numpy()
-        members, batch = first.shape
-        states, channels = weights[0].shape[2:]
-        blocks = -(-batch // LANES)
-        kept = (members, blocks) if wanted else (1, 1)
-        inputs = np.empty((*kept, n_window, channels, LANES), series.dtype)
-        trace = np.empty((*kept, n_window, trace_rows * states, LANES), series.dtype)
-        result = np.empty((members, batch, states), series.dtype)
-        _all_blocks_forward(forward, *weights, series, first, inputs, trace, result)
-        ctx.saved = (weights, inputs, trace, backward, batch)
-        return torch.from_numpy(result)
+        rows = trace_rows * weights[0].shape[2]
+        if any(ctx.needs_input_grad[:3]):
+            inputs = _gathered(series, first, n_window)
+            trace = np.empty((*inputs.shape[:3], rows, LANES), series.dtype)
+            ctx.saved = (weights, inputs, trace, backward)
+            return torch.from_numpy(_states(forward, weights, inputs, trace)[:, : first.shape[1]])
+        scratch = np.empty((1, 1, n_window, rows, LANES), series.dtype)
+        pieces = [
+            _states(forward, weights, _gathered(series, first[:, at : at + WITHOUT_TRACE], n_window), scratch)
+            for at in range(0, first.shape[1], WITHOUT_TRACE)
+        ]
+        return torch.from_numpy(np.concatenate(pieces, axis=1)[:, : first.shape[1]])
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        weights, inputs, trace, backward, batch = ctx.saved
+        weights, inputs, trace, backward = ctx.saved
+        members, blocks = inputs.shape[:2]
+        batch, states = upstream[0].shape[1:]
+        padded = np.zeros((members, blocks * LANES, states), inputs.dtype)
+        padded[:, :batch] = upstream[0].numpy()
+        adjoint = np.ascontiguousarray(padded.reshape(members, blocks, LANES, states).swapaxes(2, 3))
         gradients = [np.zeros_like(weight) for weight in weights]
-        _all_blocks_backward(backward, *weights, inputs, trace, upstream[0].contiguous().numpy(), batch, *gradients)
+        backward(weights[0], weights[1], inputs, trace, adjoint, *gradients)
         return (*(torch.from_numpy(gradient) for gradient in gradients), None, None, None, None, None, None)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _all_blocks_forward(forward, input_weight, state_weight, bias, series, starts, inputs, trace, result):  # type: ignore[no-untyped-def]
-    members, batch = starts.shape
-    n_window, channels, lanes = inputs.shape[2:]
-    for m in range(members):
-        for block in range((batch + lanes - 1) // lanes):
-            used = min(lanes, batch - block * lanes)
-            window = inputs[min(m, inputs.shape[0] - 1), min(block, inputs.shape[1] - 1)]
-            for lane in range(lanes):  # lanes without a window repeat the last one
-                first = starts[m, block * lanes + min(lane, used - 1)]
-                for k in range(n_window):
-                    for c in range(channels):
-                        window[k, c, lane] = series[first + k, c]
-            state = forward(
-                input_weight[m], state_weight[m], bias[m], window, trace[min(m, trace.shape[0] - 1), min(block, trace.shape[1] - 1)]
-            )
-            for lane in range(used):
-                for i in range(state.shape[0]):
-                    result[m, block * lanes + lane, i] = state[i, lane]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _all_blocks_backward(backward, input_weight, state_weight, bias, inputs, trace, upstream, batch, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
+def _states(forward: Loop, weights: list[Any], inputs: Any, trace: Any) -> Any:
+    """Hidden states after all windows, (M, blocks · lanes, H)."""
     members, blocks = inputs.shape[:2]
-    lanes, states = inputs.shape[4], upstream.shape[2]
+    states = np.empty((members, blocks, weights[0].shape[2], LANES), inputs.dtype)
+    forward(*weights, inputs, trace, states)
+    return np.ascontiguousarray(states.swapaxes(2, 3)).reshape(members, blocks * LANES, -1)
+
+
+def _gathered(series: Any, starts: Any, n_window: int) -> Any:
+    """Windows side by side, (M, blocks, N, C, lanes); lanes without a window repeat the last one."""
+    members, batch = starts.shape
+    blocks = -(-batch // LANES)
+    inputs = np.empty((members, blocks, n_window, series.shape[1], LANES), series.dtype)
+    _gather(series, np.ascontiguousarray(starts), inputs)
+    return inputs
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _gather(series, starts, inputs):  # type: ignore[no-untyped-def]
+    members, blocks, n_window, channels, lanes = inputs.shape
     for m in range(members):
         for block in range(blocks):
-            used = min(lanes, batch - block * lanes)
-            adjoint = np.zeros((states, lanes), upstream.dtype)
-            for lane in range(used):
-                for i in range(states):
-                    adjoint[i, lane] = upstream[m, block * lanes + lane, i]
-            backward(input_weight[m], state_weight[m], inputs[m, block], trace[m, block], adjoint, to_input[m], to_state[m], to_bias[m])
+            for lane in range(lanes):
+                first = starts[m, min(block * lanes + lane, starts.shape[1] - 1)]
+                for k in range(n_window):
+                    for c in range(channels):
+                        inputs[m, block, k, c, lane] = series[first + k, c]
 
 
 @numba.njit(inline="always")

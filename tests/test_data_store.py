@@ -1,0 +1,311 @@
+"""The store: what is read back is what was written, bit for bit, and a failure leaves what was there before."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from textwrap import dedent
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vehest.data.channels import CHANNELS
+from vehest.data.errors import DataError, MissingError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
+
+PROPERTY = settings(max_examples=40, deadline=None, derandomize=True, database=None)
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64)  # -0.0 and denormals included
+not_measured = st.integers(1, 2**51 - 1).map(lambda payload: np.array([0x7FF8 << 48 | payload], dtype=np.uint64).view(np.float64)[0])
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.text(max_size=8) | finite,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> Recording:
+    length = draw(st.integers(1, 50))
+    names = draw(st.lists(st.sampled_from(sorted(CHANNELS)), min_size=1, max_size=4, unique=True))
+    gappy = frozenset(name for name in names if draw(st.booleans()))
+    channels = {name: draw(arrays(np.float64, length, elements=finite | not_measured if name in gappy else finite)) for name in names}
+    return Recording(
+        id=draw(st.text(min_size=1, max_size=10)),
+        vehicle=draw(st.text(max_size=10)),
+        rate_hz=draw(st.floats(1e-3, 1e5)),
+        start_time=draw(st.floats(-1e12, 1e12)),
+        channels=channels,
+        kind=draw(st.sampled_from(["real", "simulated"])),
+        gappy=gappy,
+        provenance=draw(st.dictionaries(st.text(max_size=5), json_values, max_size=3)),
+    )
+
+
+def simple(samples: object = (1.0, 2.0, 3.0), **changes: object) -> Recording:
+    return Recording("lap", "car", 100.0, 5.0, {"ay": np.asarray(samples, dtype=np.float64)}, **changes)
+
+
+def bits(values: np.ndarray) -> list[int]:
+    return np.ascontiguousarray(values, dtype=np.float64).view(np.uint64).tolist()
+
+
+def assert_same_recording(read: Recording, written: Recording) -> None:
+    assert list(read.channels) == list(written.channels)
+    for name, samples in written.channels.items():
+        assert bits(read[name]) == bits(samples), name
+    about = ("id", "vehicle", "rate_hz", "start_time", "kind", "gappy")
+    assert {key: getattr(read, key) for key in about} == {key: getattr(written, key) for key in about}
+    assert dict(read.provenance) == dict(written.provenance)
+
+
+def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
+    message = str(error.value)
+    assert message
+    assert "\n" not in message
+    return message
+
+
+@PROPERTY
+@given(recordings())
+def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(recording: Recording) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "recording.parquet"
+        write_recording(recording, file)
+        assert_same_recording(read_recording(file), recording)
+        assert [path.name for path in Path(folder).iterdir()] == [file.name]
+
+
+def test_signed_zeros_denormals_and_extremes_keep_their_bits(tmp_path: Path) -> None:
+    samples = np.array([-0.0, 0.0, 5e-324, -5e-324, 2.2250738585072014e-308, 1.7976931348623157e308, 0.1 + 0.2, math.nextafter(1, 2)])
+    write_recording(simple(samples), tmp_path / "r.parquet")
+    assert bits(read_recording(tmp_path / "r.parquet")["ay"]) == bits(samples)
+
+
+def test_payloads_of_not_measured_samples_survive(tmp_path: Path) -> None:
+    patterns = [0x7FF8000000000000, 0xFFF8000000000001, 0x7FF8DEADBEEF0001, 0x3FF0000000000000]
+    samples = np.array(patterns, dtype=np.uint64).view(np.float64)
+    write_recording(simple(samples, gappy=frozenset({"ay"})), tmp_path / "r.parquet")
+    assert bits(read_recording(tmp_path / "r.parquet")["ay"]) == patterns
+
+
+def test_pandas_reads_the_same_numbers_from_the_file(tmp_path: Path) -> None:
+    samples = np.random.default_rng(0).standard_normal(1000)
+    write_recording(simple(samples), tmp_path / "r.parquet")
+    table = pd.read_parquet(tmp_path / "r.parquet")
+    assert list(table.columns) == ["ay"]
+    assert bits(table["ay"].to_numpy()) == bits(samples)
+
+
+def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_recording(simple(np.arange(500) / 7.0), tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_chosen_channels_are_read_alone_and_in_the_order_asked_for(tmp_path: Path) -> None:
+    recording = Recording(
+        "r", "car", 10.0, 0.0, {name: np.full(3, k) for k, name in enumerate(("vx", "ax", "ay"))}, gappy=frozenset({"ax"})
+    )
+    write_recording(recording, tmp_path / "r.parquet")
+    read = read_recording(tmp_path / "r.parquet", ["ay", "vx"])
+    assert {name: samples.tolist() for name, samples in read.channels.items()} == {"ay": [2.0] * 3, "vx": [0.0] * 3}
+    assert list(read.channels) == ["ay", "vx"]
+    assert read.gappy == frozenset()
+
+
+def test_a_channel_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
+    write_recording(simple(), tmp_path / "r.parquet")
+    with pytest.raises(DataError, match="no channel 'vx'") as error:
+        read_recording(tmp_path / "r.parquet", ["vx"])
+    assert "it has ay" in one_line(error)
+
+
+@PROPERTY
+@given(st.integers(1, 20), st.integers(1, 4), st.data())
+def test_an_estimate_comes_back_with_its_covariance(length: int, n_states: int, data: st.DataObject) -> None:
+    values = arrays(np.float64, length, elements=finite | st.just(math.nan))
+    estimate = Estimate(
+        recording_id=data.draw(st.text(max_size=8)),
+        estimator="ekf",
+        rate_hz=data.draw(st.floats(0.1, 1e4)),
+        start_time=data.draw(st.floats(-1e10, 1e10)),
+        channels={"vy": data.draw(values), "sideslip": data.draw(values)},
+        mode=data.draw(st.sampled_from(["causal", "offline"])),
+        covariance=data.draw(st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite)),
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "estimate.parquet"
+        write_estimate(estimate, file)
+        read = read_estimate(file)
+    assert {name: bits(samples) for name, samples in read.channels.items()} == {name: bits(s) for name, s in estimate.channels.items()}
+    about = ("recording_id", "estimator", "rate_hz", "start_time", "mode")
+    assert [getattr(read, key) for key in about] == [getattr(estimate, key) for key in about]
+    if estimate.covariance is None:
+        assert read.covariance is None
+    else:
+        assert read.covariance is not None
+        assert read.covariance.shape == estimate.covariance.shape
+        assert bits(read.covariance.ravel()) == bits(estimate.covariance.ravel())
+
+
+def test_an_estimate_carries_its_time_column_for_other_tools(tmp_path: Path) -> None:
+    write_estimate(Estimate("r", "gru", 20.0, 450.0, {"vy": np.arange(3.0), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
+    assert pd.read_parquet(tmp_path / "e.parquet")["time"].tolist() == pytest.approx([450.0, 450.05, 450.1], abs=1e-12)
+
+
+def test_a_missing_file_is_missing(tmp_path: Path) -> None:
+    with pytest.raises(MissingError, match="there is no file") as error:
+        read_recording(tmp_path / "none.parquet")
+    assert "none.parquet" in one_line(error)
+
+
+def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
+    (tmp_path / "r.parquet").touch()
+    with pytest.raises(DataError, match="is empty") as error:
+        read_recording(tmp_path / "r.parquet")
+    assert "r.parquet" in one_line(error)
+
+
+@pytest.mark.parametrize("kept", [1, 4, 200, -8, -1])
+def test_a_truncated_file_is_refused_in_one_line(tmp_path: Path, kept: int) -> None:
+    write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
+    (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
+    with pytest.raises(DataError, match="truncated or damaged") as error:
+        read_recording(tmp_path / "r.parquet")
+    assert "r.parquet" in one_line(error)
+    assert not is_stored_recording(tmp_path / "r.parquet")
+
+
+def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path: Path) -> None:
+    write_recording(simple(np.random.default_rng(1).standard_normal(64)), tmp_path / "r.parquet")
+    intact = (tmp_path / "r.parquet").read_bytes()
+    samples_end = pq.ParquetFile(tmp_path / "r.parquet").metadata.row_group(0).column(0).total_compressed_size + 4
+    for position in range(samples_end - 400, samples_end, 7):
+        damaged = bytearray(intact)
+        damaged[position] ^= 0x10
+        (tmp_path / "r.parquet").write_bytes(damaged)
+        with pytest.raises(DataError, match="damaged") as error:
+            read_recording(tmp_path / "r.parquet")
+        one_line(error)
+
+
+@pytest.mark.parametrize(
+    "metadata", [None, {b"vehest": b"[1, 2]"}, {b"vehest": b"not json"}, {b"vehest": b'{"content": "recording"}'}, {b"vehest": b"\xff"}]
+)
+def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path: Path, metadata: dict[bytes, bytes] | None) -> None:
+    pq.write_table(pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet")
+    with pytest.raises(DataError) as error:
+        read_recording(tmp_path / "foreign.parquet")
+    assert "foreign.parquet" in one_line(error)
+
+
+def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path: Path) -> None:
+    write_recording(simple(), tmp_path / "r.parquet")
+    write_estimate(Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
+    with pytest.raises(DataError, match="not an estimate|not a estimate"):
+        read_estimate(tmp_path / "r.parquet")
+    with pytest.raises(DataError, match="not a recording"):
+        read_recording(tmp_path / "e.parquet")
+    assert is_stored_recording(tmp_path / "r.parquet")
+    assert not is_stored_recording(tmp_path / "e.parquet")
+    assert not is_stored_recording(tmp_path / "none.parquet")
+
+
+def test_a_file_of_a_newer_format_says_so(tmp_path: Path) -> None:
+    described = b'{"content": "recording", "format": 99}'
+    pq.write_table(pa.table({"ay": [1.0]}).replace_schema_metadata({b"vehest": described}), tmp_path / "r.parquet")
+    with pytest.raises(DataError, match="newer vehest") as error:
+        read_recording(tmp_path / "r.parquet")
+    assert "update vehest" in one_line(error)
+
+
+def test_provenance_that_is_not_json_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="JSON") as error:
+        write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet")
+    one_line(error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_writing_below_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(MissingError, match="cannot write") as error:
+        write_recording(simple(), tmp_path / "file" / "r.parquet")
+    one_line(error)
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
+def test_a_new_version_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    write_recording(simple([1.0, 2.0]), tmp_path / "r.parquet")
+    write_recording(simple([3.0, 4.0, 5.0]), tmp_path / "r.parquet")
+    assert read_recording(tmp_path / "r.parquet")["ay"].tolist() == [3.0, 4.0, 5.0]
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def write_with_room_for(n_bytes: int, file: Path) -> str:
+    """Try, in a process of its own, to write a recording far larger than the largest file it may make."""
+    script = f"""
+        import resource, sys
+        from pathlib import Path
+        import numpy as np
+        from vehest.data.errors import VehestError
+        from vehest.data.recording import Recording
+        from vehest.data.store import write_recording
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes}))
+        recording = Recording("r", "car", 100.0, 0.0, {{"ay": np.random.default_rng(0).standard_normal(200_000)}})
+        try:
+            write_recording(recording, Path(sys.argv[1]))
+        except VehestError as error:
+            print(type(error).__name__, error)
+    """
+    command = [sys.executable, "-c", dedent(script), str(file)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no RLIMIT_FSIZE to stand in for a full disk")
+def test_running_out_of_room_leaves_nothing_and_says_so(tmp_path: Path) -> None:
+    said = write_with_room_for(100_000, tmp_path / "r.parquet")
+    assert said.startswith("MissingError no room left to write")
+    assert "r.parquet" in said
+    assert "\n" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no RLIMIT_FSIZE to stand in for a full disk")
+def test_running_out_of_room_keeps_the_old_file(tmp_path: Path) -> None:
+    written = simple(np.arange(10.0))
+    write_recording(written, tmp_path / "r.parquet")
+    assert write_with_room_for(100_000, tmp_path / "r.parquet").startswith("MissingError no room left")
+    assert_same_recording(read_recording(tmp_path / "r.parquet"), written)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_leaves_nothing_and_keeps_the_old_file(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)], capture_output=True, check=False)
+    if mounted.returncode != 0:
+        pytest.skip("mounting a tiny disk needs the rights of root")
+    try:
+        written = simple(np.arange(10.0))
+        write_recording(written, disk / "r.parquet")
+        for target in ("r.parquet", "new.parquet"):
+            with pytest.raises(MissingError, match="no room left") as error:
+                write_recording(simple(np.random.default_rng(0).standard_normal(50_000)), disk / target)
+            assert target in one_line(error)
+        assert [file.name for file in disk.iterdir()] == ["r.parquet"]
+        assert_same_recording(read_recording(disk / "r.parquet"), written)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
