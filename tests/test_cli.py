@@ -179,6 +179,18 @@ def test_two_processes_give_the_same_numbers_as_one(place):
         assert (model / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
 
 
+def test_a_failed_job_is_reported_and_the_others_are_kept(place):
+    sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
+    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 5
+    assert "1 of 4 groups of jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert "Traceback" not in err
+    kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
+    assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}
+    assert not list((place.folder / "outputs").glob("report/*"))
+
+
 def test_train_eval_estimate_report_one_by_one(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
     code, out, err = place("train", *arguments, "--json")

@@ -18,9 +18,16 @@ class InterruptedHereError(Exception):
     """Something that goes wrong half-way."""
 
 
-def interrupt_writing(path: Path) -> None:
-    with pytest.raises(InterruptedHereError), written_aside(path) as aside:
+def write_half(path: Path) -> None:
+    with written_aside(path) as aside:
         aside.write_text("half of the ne")
+        raise InterruptedHereError
+
+
+def write_half_a_folder(path: Path) -> None:
+    with written_aside(path) as aside:
+        aside.mkdir()
+        (aside / "new").write_text("half")
         raise InterruptedHereError
 
 
@@ -34,13 +41,15 @@ def test_nothing_stands_at_the_place_before_the_end(tmp_path: Path) -> None:
 
 
 def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
-    interrupt_writing(tmp_path / "file")
+    with pytest.raises(InterruptedHereError):
+        write_half(tmp_path / "file")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_failure_keeps_the_old_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("old")
-    interrupt_writing(tmp_path / "file")
+    with pytest.raises(InterruptedHereError):
+        write_half(tmp_path / "file")
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"file": "old"}
 
 
@@ -55,10 +64,8 @@ def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
 def test_a_failure_keeps_the_old_folder(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "old").write_text("old")
-    with pytest.raises(InterruptedHereError), written_aside(tmp_path / "folder") as aside:
-        aside.mkdir()
-        (aside / "new").write_text("half")
-        raise InterruptedHereError
+    with pytest.raises(InterruptedHereError):
+        write_half_a_folder(tmp_path / "folder")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 

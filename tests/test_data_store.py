@@ -115,9 +115,8 @@ def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_chosen_channels_are_read_alone_and_in_the_order_asked_for(tmp_path: Path) -> None:
-    recording = Recording(
-        "r", "car", 10.0, 0.0, {name: np.full(3, k) for k, name in enumerate(("vx", "ax", "ay"))}, gappy=frozenset({"ax"})
-    )
+    channels = {name: np.full(3, float(k)) for k, name in enumerate(("vx", "ax", "ay"))}
+    recording = Recording("r", "car", 10.0, 0.0, channels, gappy=frozenset({"ax"}))
     write_recording(recording, tmp_path / "r.parquet")
     read = read_recording(tmp_path / "r.parquet", ["ay", "vx"])
     assert {name: samples.tolist() for name, samples in read.channels.items()} == {"ay": [2.0] * 3, "vx": [0.0] * 3}
@@ -214,7 +213,7 @@ def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path: Path, metadata:
 def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path: Path) -> None:
     write_recording(simple(), tmp_path / "r.parquet")
     write_estimate(Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
-    with pytest.raises(DataError, match="not an estimate|not a estimate"):
+    with pytest.raises(DataError, match="not an estimate"):
         read_estimate(tmp_path / "r.parquet")
     with pytest.raises(DataError, match="not a recording"):
         read_recording(tmp_path / "e.parquet")

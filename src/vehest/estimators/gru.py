@@ -47,3 +47,6 @@ class Gru(RecurrentEstimator):
     name = "gru"
     title = "GRU"
     network_type = GruNetwork
+
+
+ESTIMATOR = Gru

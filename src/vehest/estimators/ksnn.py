@@ -194,3 +194,6 @@ class Ksnn(WindowedEstimator):
     def empty_network(self) -> KinematicsStructuredNetwork:
         """A network to load weights into."""
         return KinematicsStructuredNetwork(self.settings)
+
+
+ESTIMATOR = Ksnn

@@ -46,3 +46,6 @@ class Lstm(RecurrentEstimator):
     name = "lstm"
     title = "LSTM"
     network_type = LstmNetwork
+
+
+ESTIMATOR = Lstm

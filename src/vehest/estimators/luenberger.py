@@ -153,3 +153,6 @@ def _mean_squared_error(pairs: Sequence[tuple[FloatArray, FloatArray]], paramete
         total += float(np.square(vy - reference).sum())
         count += len(reference)
     return total / count
+
+
+ESTIMATOR = Luenberger

@@ -1,41 +1,38 @@
-"""Names of estimators; a name, never an import path, is what files may hold."""
+"""Names of estimators; a name, never an import path, is what files may hold.
+
+An estimator called ``name`` is the module ``vehest.estimators.name`` with its class as ``ESTIMATOR``, or an entry point of
+another package in the group ``vehest.estimators``.
+"""
 
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import pkgutil
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
+import vehest.estimators as package
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
 
 ENTRY_POINTS = "vehest.estimators"
 
-BUILT_IN: dict[str, tuple[str, str]] = {
-    "luenberger": ("vehest.estimators.luenberger", "Luenberger"),
-    "ksnn": ("vehest.estimators.ksnn", "Ksnn"),
-    "gru": ("vehest.estimators.gru", "Gru"),
-    "lstm": ("vehest.estimators.lstm", "Lstm"),
-}
 
-
+@cache
 def estimator_names() -> list[str]:
-    """Every known name, built in or installed by other packages."""
-    return [*BUILT_IN, *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in BUILT_IN)]
+    """Every known name: vehest's own, then those that other packages installed."""
+    own = [module.name for module in pkgutil.iter_modules(package.__path__) if _own_class(module.name) is not None]
+    return [*sorted(own), *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in own)]
 
 
 def estimator_module(name: str) -> str:
-    """Name of the module that holds an estimator, without importing it.
+    """Name of the module that holds an estimator.
 
     Raises:
         ConfigurationError: the name is unknown.
     """
-    if name in BUILT_IN:
-        return BUILT_IN[name][0]
-    for point in entry_points(group=ENTRY_POINTS):
-        if point.name == name:
-            return point.module
-    raise ConfigurationError(f"estimator '{name}' is not one of: {', '.join(estimator_names())}")
+    return estimator_class(name).__module__
 
 
 @cache
@@ -45,12 +42,22 @@ def estimator_class(name: str) -> type[Estimator]:
     Raises:
         ConfigurationError: the name is unknown.
     """
-    if name in BUILT_IN:
-        module, attribute = BUILT_IN[name]
-        found: type[Estimator] = getattr(importlib.import_module(module), attribute)
-        return found
-    for point in entry_points(group=ENTRY_POINTS):
-        if point.name == name:
-            loaded: type[Estimator] = point.load()
-            return loaded
+    own = _own_class(name)
+    if own is not None:
+        return own
+    point = _entry_point(name)
+    if point is not None:
+        loaded: type[Estimator] = point.load()
+        return loaded
     raise ConfigurationError(f"estimator '{name}' is not one of: {', '.join(estimator_names())}")
+
+
+def _own_class(name: str) -> type[Estimator] | None:
+    if not name.isidentifier() or importlib.util.find_spec(f"{package.__name__}.{name}") is None:
+        return None
+    found: type[Estimator] | None = getattr(importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None)
+    return found
+
+
+def _entry_point(name: str) -> EntryPoint | None:
+    return next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)

@@ -1,21 +1,18 @@
-"""What every source does, and the registry of sources."""
+"""What every source does, and how a source is found by its name."""
 
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import vehest.sources as package
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.recording import Recording
-
-SOURCES: dict[str, tuple[str, str]] = {
-    "revs": ("vehest.sources.revs", "RevsSource"),
-    "tabular": ("vehest.sources.tabular", "TabularSource"),
-    "simulated": ("vehest.sources.simulated", "SimulatedSource"),
-}
 
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept"})
 
@@ -77,21 +74,27 @@ def open_source(dataset: Mapping[str, Any]) -> Source:
     Raises:
         ConfigurationError: an unknown source or option.
     """
-    module, name = SOURCES[source_name(dataset)]
-    found: Source = getattr(importlib.import_module(module), name)(dataset)
+    found: Source = importlib.import_module(source_module(dataset)).SOURCE(dataset)
     return found
 
 
-def source_name(dataset: Mapping[str, Any]) -> str:
-    """The name of the source of a data set.
+def source_module(dataset: Mapping[str, Any]) -> str:
+    """The module of a data set's source: ``vehest.sources.NAME``, with its class as ``SOURCE``.
 
     Raises:
         ConfigurationError: there is none of that name.
     """
     name = str(dataset.get("source"))
-    if name not in SOURCES:
-        raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(SOURCES)}")
-    return name
+    if name not in source_names():
+        raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}")
+    return f"{package.__name__}.{name}"
+
+
+@cache
+def source_names() -> list[str]:
+    """Names of all sources."""
+    modules = [module.name for module in pkgutil.iter_modules(package.__path__)]
+    return sorted(name for name in modules if hasattr(importlib.import_module(f"{package.__name__}.{name}"), "SOURCE"))
 
 
 def existing_folder(path: Any, dataset: str) -> Path:

@@ -145,11 +145,19 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
             raise DataError(f"{where}: {finding.message}; set clock: interpolate to bring the samples to a uniform clock")
     elapsed = float(stamps[-1] - stamps[0])
     if policy == "interpolate":
-        rate = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
+        rate = plain_rate(1.0 / _interval(np.diff(stamps)), INTERPOLATED_TOLERANCE)
         return Clock(float(stamps[0]), rate, int(np.floor(elapsed * rate + 1e-3)) + 1, stamps)
     intervals = len(stamps) - 1
     rate = plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4))
     return Clock(float(stamps[0]), rate, len(stamps))
+
+
+def _interval(steps: FloatArray) -> float:
+    """The sampling interval behind jittering time stamps [s]: the mean, a gap counting as the samples that it lacks."""
+    interval = float(np.median(steps))
+    for _ in range(3):
+        interval = float(steps.sum() / np.maximum(np.rint(steps / interval), 1.0).sum())
+    return interval
 
 
 def plain_rate(rate: float, tolerance: float) -> float:

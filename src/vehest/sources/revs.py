@@ -94,3 +94,6 @@ def _read_numbers(file: Path) -> FloatArray:
     if values.ndim != 1:
         raise DataError(f"'{file}' holds {values.shape[1]} numbers a line; one is expected")
     return values
+
+
+SOURCE = RevsSource

@@ -67,3 +67,6 @@ class SimulatedSource(Source):
             rate_hz=float(self.dataset.get("rate_hz", 100.0)),
             sensors=ideal_sensors() if self.dataset.get("sensors") == "ideal" else SensorLevels(),
         )
+
+
+SOURCE = SimulatedSource

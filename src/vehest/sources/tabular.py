@@ -227,3 +227,6 @@ def _unreadable(file: Path, error: Exception) -> DataError:
 
 def _listed(names: list[str]) -> str:
     return ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+
+
+SOURCE = TabularSource

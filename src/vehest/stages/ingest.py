@@ -11,7 +11,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import sha256_of
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
-from vehest.sources.base import SOURCES, Source, open_source, source_name
+from vehest.sources.base import Source, open_source, source_module
 from vehest.stages.artefacts import StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.config import Config, missing_keys
@@ -42,7 +42,7 @@ def plan_ingest(config: Config) -> StagePlan:
         label=source.name,
         config={key: value for key, value in dataset.items() if key != "path"},
         inputs=inputs,
-        code=code_version([SOURCES[source_name(dataset)][0], "vehest.data.store", "vehest.data.checks"], own=[__name__]),
+        code=code_version([source_module(dataset), "vehest.data.store", "vehest.data.checks"], own=[__name__]),
         output=Path(config["output"]),
     )
 

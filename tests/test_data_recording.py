@@ -1,0 +1,192 @@
+"""Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles nothing."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.data.channels import CHANNELS, channel
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.units import factor_to_si
+
+PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+RATES = st.sampled_from([20.0, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0, 7.3, 99.997])
+STARTS = st.sampled_from([0.0, 149.99, -3.7, 1e5, 1.7e9, 1_700_000_123.456])
+
+
+def counting(length: int, rate_hz: float = 100.0, start_time: float = 0.0, **changes: object) -> Recording:
+    """A recording whose samples are their own index."""
+    return Recording("lap", "car", rate_hz, start_time, {"ay": np.arange(float(length))}, **changes)
+
+
+@PROPERTY
+@given(st.integers(1, 400), RATES, STARTS, st.lists(st.floats(-0.2, 1.2), max_size=5))
+def test_consecutive_ranges_cover_every_sample_once(length: int, rate_hz: float, start_time: float, where: list[float]) -> None:
+    recording = counting(length, rate_hz, start_time)
+    inner = [start_time + share * recording.duration for share in where]
+    bounds = [-math.inf, *sorted(inner), math.inf]
+    covered: list[float] = []
+    for start, stop in pairwise(bounds):
+        first, end = recording.index_range(start, stop)
+        if first < end:
+            covered += recording.cut(start, stop)["ay"].tolist()
+    assert covered == recording["ay"].tolist()
+
+
+@PROPERTY
+@given(st.integers(1, 400), RATES, STARTS, st.data())
+def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
+    length: int, rate_hz: float, start_time: float, data: st.DataObject
+) -> None:
+    recording = counting(length, rate_hz, start_time)
+    first = data.draw(st.integers(0, length - 1))
+    end = data.draw(st.integers(first + 1, length))
+    piece = recording.cut(recording.time[first], recording.time[end] if end < length else recording.end_time)
+    assert piece["ay"].tolist() == list(range(first, end))
+    assert piece.start_time == pytest.approx(recording.time[first], abs=1e-12, rel=1e-15)
+
+
+@PROPERTY
+@given(st.integers(2, 200), RATES, STARTS, st.data())
+def test_cutting_twice_is_cutting_once(length: int, rate_hz: float, start_time: float, data: st.DataObject) -> None:
+    recording = counting(length, rate_hz, start_time)
+    first = data.draw(st.integers(0, length - 1))
+    inner = data.draw(st.integers(first, length - 1))
+    once = recording.cut(recording.time[inner], math.inf)
+    twice = recording.cut(recording.time[first], math.inf).cut(recording.time[inner], math.inf)
+    assert twice["ay"].tolist() == once["ay"].tolist()
+
+
+def test_a_range_between_two_samples_is_refused_with_what_there_is() -> None:
+    with pytest.raises(DataError, match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s"):
+        counting(100, 100.0, 10.0).cut(10.501, 10.502)
+
+
+def test_times_of_unix_clocks_are_printed_to_the_sample() -> None:
+    with pytest.raises(DataError, match=r"spans 1700000000.5 s to 1700000001.5 s"):
+        counting(100, 100.0, 1_700_000_000.5).cut(0.0, 1.0)
+
+
+def test_samples_are_copied_and_cannot_be_written_to() -> None:
+    samples = np.zeros(3)
+    recording = Recording("r", "car", 10.0, 0.0, {"ay": samples})
+    samples[0] = 1.0
+    assert recording["ay"][0] == 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        recording["ay"][0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"channels": {}}, "no channels"),
+        ({"channels": {"ay": np.zeros(0)}}, "no samples"),
+        ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "differ in length"),
+        ({"channels": {"ay": np.zeros((3, 1))}}, "one-dimensional"),
+        ({"channels": {"vz": np.zeros(3)}}, "'vz' is not known"),
+        ({"channels": {"ay": np.array([0.0, np.nan, 0.0])}}, "channel 'ay' holds 1 NaN between 0.1 s and 0.1 s"),
+        ({"channels": {"ay": np.array([0.0, np.inf, 0.0])}}, "infinite"),
+        ({"channels": {"ay": np.array([np.nan, -np.inf])}, "gappy": frozenset({"ay"})}, "holds 1 infinite values"),
+        ({"rate_hz": 0.0}, "rate must be positive"),
+        ({"rate_hz": math.nan}, "rate must be positive"),
+        ({"start_time": math.nan}, "start time must be finite"),
+        ({"kind": "reel"}, "real or simulated"),
+    ],
+)
+def test_what_cannot_be_a_recording_is_refused(changes: dict[str, object], what: str) -> None:
+    arguments: dict[str, object] = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
+    with pytest.raises(DataError) as error:
+        Recording(**(arguments | changes))  # type: ignore[arg-type]
+    assert what in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_only_gappy_channels_may_hold_nan() -> None:
+    samples = {"ay": np.array([0.0, np.nan]), "ax": np.zeros(2)}
+    assert Recording("r", "car", 10.0, 0.0, samples, gappy=frozenset({"ay"})).gappy == {"ay"}
+    with pytest.raises(DataError, match="'ay'"):
+        Recording("r", "car", 10.0, 0.0, samples, gappy=frozenset({"ax"}))
+
+
+def test_estimators_see_no_references() -> None:
+    recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
+    assert list(recording.without_references().channels) == ["vx", "ay"]
+    with pytest.raises(DataError, match="reference channels only"):
+        recording.select(["vy_ref"]).without_references()
+
+
+def test_stacked_channels_are_columns_in_the_order_asked_for() -> None:
+    recording = Recording("r", "car", 10.0, 0.0, {"vx": np.array([1.0, 2.0]), "ay": np.array([3.0, 4.0])})
+    assert recording.stack(["ay", "vx"]).tolist() == [[3.0, 1.0], [4.0, 2.0]]
+
+
+def test_a_missing_channel_is_named_with_those_that_are_there() -> None:
+    with pytest.raises(DataError, match=r"'lap' has no channel 'vx' \(it has ay\)"):
+        _ = counting(3)["vx"]
+
+
+@PROPERTY
+@given(st.integers(1, 60), RATES, STARTS, st.integers(1, 20))
+def test_held_estimates_are_the_latest_that_are_not_in_the_future(length: int, rate_hz: float, start_time: float, finer: int) -> None:
+    values = np.arange(float(length))
+    estimate = Estimate("r", "ekf", rate_hz, start_time, {"vy": values, "sideslip": values})
+    ticks = np.arange(-finer, (length + 1) * finer)  # sample k of the estimate is tick k·finer
+    held = estimate.held_at(start_time + ticks / (rate_hz * finer), "vy")
+    naive = [float(tick // finer) if 0 <= tick // finer < length else math.nan for tick in ticks.tolist()]
+    np.testing.assert_array_equal(held, naive)
+
+
+@pytest.mark.parametrize("shape", [(3, 2), (2, 2, 2), (3, 2, 1), (4, 2, 2)])
+def test_a_covariance_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(DataError, match="covariance"):
+        Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}, covariance=np.zeros(shape))
+
+
+def test_an_estimate_of_unknown_or_unequal_quantities_is_refused() -> None:
+    with pytest.raises(DataError, match="unknown quantity 'vz'"):
+        Estimate("r", "ekf", 20.0, 0.0, {"vz": np.zeros(3)})
+    with pytest.raises(DataError, match="one common length"):
+        Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(2)})
+
+
+def test_every_channel_has_a_range_and_a_unit_that_a_file_may_use() -> None:
+    for name, described in CHANNELS.items():
+        assert name == described.name
+        assert described.low < described.high
+        assert factor_to_si(described.unit, described.unit) == 1.0
+    with pytest.raises(DataError, match="'vz' is not known"):
+        channel("vz")
+
+
+@pytest.mark.parametrize(
+    ("unit", "si_unit", "one_is"),
+    [
+        ("km/h", "m/s", 1000 / 3600),
+        ("mph", "m/s", 1609.344 / 3600),
+        ("knots", "m/s", 1852 / 3600),
+        ("g", "m/s²", 9.80665),
+        ("m/s^2", "m/s²", 1.0),
+        ("deg", "rad", np.deg2rad(1.0)),
+        ("deg/s", "rad/s", np.deg2rad(1.0)),
+        ("rpm", "rad/s", 2 * np.pi / 60),
+        ("kN", "N", 1000.0),
+        ("ms", "s", 1e-3),
+        ("ns", "s", 1e-9),
+    ],
+)
+def test_units_convert_as_defined(unit: str, si_unit: str, one_is: float) -> None:
+    assert factor_to_si(unit, si_unit) == pytest.approx(one_is, rel=1e-15)
+
+
+def test_a_unit_of_something_else_is_refused() -> None:
+    with pytest.raises(DataError, match="'deg' cannot be converted to 'm/s'"):
+        factor_to_si("deg", "m/s")
+    with pytest.raises(DataError, match="'furlong' is not known"):
+        factor_to_si("furlong", "m/s")

@@ -1,0 +1,171 @@
+"""Resampling: nothing is shifted, bent or aliased, at any rational ratio."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.data.transforms import Resample
+
+RATIOS = [(100.0, 20.0), (125.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (20.0, 100.0), (50.0, 30.0), (1000.0 / 3.0, 20.0), (400.0, 100.0)]
+PROPERTY = settings(max_examples=60, deadline=None, derandomize=True, database=None)
+SMALL = st.floats(-1e3, 1e3)
+LENGTHS = st.integers(1, 120)
+every_ratio = pytest.mark.parametrize(("rate", "new_rate"), RATIOS)
+
+
+def recorded(samples: np.ndarray, rate_hz: float, start_time: float = 0.0) -> Recording:
+    return Recording("lap", "car", rate_hz, start_time, {"ay": samples})
+
+
+def resampled(samples: np.ndarray, rate: float, new_rate: float) -> np.ndarray:
+    return Resample(new_rate)(recorded(samples, rate))["ay"]
+
+
+@PROPERTY
+@given(st.sampled_from(RATIOS), LENGTHS, SMALL)
+def test_a_constant_stays_that_constant(ratio: tuple[float, float], length: int, value: float) -> None:
+    np.testing.assert_allclose(resampled(np.full(length, value), *ratio), value, rtol=1e-12, atol=1e-12)
+
+
+@PROPERTY
+@given(st.sampled_from(RATIOS), st.integers(2, 120), SMALL, st.floats(-10, 10))
+def test_a_straight_line_stays_that_line(ratio: tuple[float, float], length: int, offset: float, slope: float) -> None:
+    rate, new_rate = ratio
+    line = offset + slope * np.arange(length)
+    out = Resample(new_rate)(recorded(line, rate))
+    np.testing.assert_allclose(out["ay"], offset + slope * out.time * rate, rtol=1e-11, atol=1e-9)
+
+
+@every_ratio
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.6])
+def test_a_slow_sine_keeps_amplitude_and_phase(rate: float, new_rate: float, share: float) -> None:
+    frequency = share * min(rate, new_rate) / 2
+    seconds = 100 / min(rate, new_rate) * 2
+    time = np.arange(round(seconds * rate)) / rate
+    out = Resample(new_rate)(recorded(np.sin(2 * np.pi * frequency * time + 0.4), rate))
+    margin = 17 / min(rate, new_rate)
+    inside = (out.time > margin) & (out.time < seconds - margin)
+    assert inside.sum() > 50
+    np.testing.assert_allclose(out["ay"][inside], np.sin(2 * np.pi * frequency * out.time[inside] + 0.4), atol=5e-4)
+
+
+@pytest.mark.parametrize(("rate", "new_rate"), [ratio for ratio in RATIOS if ratio[1] < ratio[0]])
+def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate: float, new_rate: float) -> None:
+    seconds = 200 / new_rate
+    time = np.arange(round(seconds * rate)) / rate
+    for frequency in np.linspace(new_rate / 2, rate / 2, 23):
+        out = Resample(new_rate)(recorded(np.sin(2 * np.pi * frequency * time + 0.4), rate))
+        inside = (out.time > 17 / new_rate) & (out.time < seconds - 17 / new_rate)
+        assert np.abs(out["ay"][inside]).max() < 1e-3, frequency
+
+
+def test_going_up_adds_no_images_of_the_signal() -> None:
+    time = np.arange(400) / 20
+    out = resampled(np.sin(2 * np.pi * 6.0 * time), 20.0, 100.0)[200:-200]
+    window = np.hanning(len(out))
+    spectrum = np.abs(np.fft.rfft(out * window)) / window.sum() * 2
+    frequency = np.fft.rfftfreq(len(out), 1 / 100)
+    assert spectrum[np.abs(frequency - 6.0) < 0.2].max() == pytest.approx(1.0, abs=0.02)
+    assert spectrum[frequency > 10.0].max() < 1e-3
+
+
+@every_ratio
+@pytest.mark.parametrize("length", [1, 2, 3, 50, 101])
+def test_the_first_sample_keeps_its_time_and_the_last_lies_in_the_recording(rate: float, new_rate: float, length: int) -> None:
+    recording = recorded(np.zeros(length), rate, start_time=1_700_000_000.25)
+    out = Resample(new_rate)(recording)
+    assert out.start_time == recording.start_time
+    assert out.rate_hz == new_rate
+    ratio = (Fraction(new_rate) / Fraction(rate)).limit_denominator(1000)
+    assert len(out) == math.ceil(length * ratio)
+    assert Fraction(len(out) - 1) / ratio < length
+
+
+@PROPERTY
+@given(st.integers(1, 80), st.integers(1, 40))
+def test_plain_decimation_takes_every_nth_sample_as_it_is(length: int, step: int) -> None:
+    samples = np.random.default_rng(length).standard_normal(length)
+    out = Resample(1000.0 / step, method="decimate")(recorded(samples, 1000.0))
+    assert out["ay"].tolist() == samples.tolist()[::step]
+
+
+def test_the_same_rate_changes_nothing() -> None:
+    recording = recorded(np.random.default_rng(0).standard_normal(99), 100.0)
+    for method in ("polyphase", "decimate"):
+        assert Resample(100.0, method=method)(recording) is recording
+
+
+@PROPERTY
+@given(st.sampled_from(RATIOS), st.integers(1, 60), st.data(), st.floats(-5, 5))
+def test_resampling_is_linear(ratio: tuple[float, float], length: int, data: st.DataObject, factor: float) -> None:
+    one = data.draw(arrays(np.float64, length, elements=SMALL))
+    other = data.draw(arrays(np.float64, length, elements=SMALL))
+    together = resampled(one + factor * other, *ratio)
+    np.testing.assert_allclose(together, resampled(one, *ratio) + factor * resampled(other, *ratio), rtol=1e-9, atol=1e-7)
+
+
+@PROPERTY
+@given(st.sampled_from([(100.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (50.0, 30.0)]), st.integers(1, 12), st.data())
+def test_resampling_backwards_is_the_same_backwards(ratio: tuple[float, float], periods: int, data: st.DataObject) -> None:
+    rate, new_rate = ratio
+    step = (Fraction(rate) / Fraction(new_rate)).numerator
+    length = periods * step + 1  # both ends lie on the new grid, so that it is the same grid from both sides
+    samples = data.draw(arrays(np.float64, length, elements=SMALL))
+    np.testing.assert_allclose(resampled(samples[::-1], *ratio), resampled(samples, *ratio)[::-1], rtol=1e-9, atol=1e-8)
+
+
+def test_there_and_back_keeps_a_slow_signal() -> None:
+    time = np.arange(600) / 20
+    slow = np.sin(2 * np.pi * 0.7 * time) + 0.3 * np.cos(2 * np.pi * 2.9 * time)
+    back = resampled(resampled(slow, 20.0, 125.0), 125.0, 20.0)
+    assert len(back) == len(slow)
+    np.testing.assert_allclose(back[40:-40], slow[40:-40], atol=1e-3)
+
+
+def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation() -> None:
+    samples = np.where(np.arange(20) % 4 == 0, 1.0, np.nan)
+    recording = Recording("lap", "car", 100.0, 0.0, {"ay": samples, "ax": np.zeros(20)}, gappy=frozenset({"ay"}))
+    with pytest.raises(DataError, match="'ay' has gaps") as error:
+        Resample(20.0)(recording)
+    assert "method=decimate" in str(error.value)
+    np.testing.assert_array_equal(Resample(20.0, method="decimate")(recording)["ay"], samples[::5])
+
+
+def test_a_ratio_that_is_not_of_whole_numbers_is_refused() -> None:
+    with pytest.raises(DataError, match="not a ratio of whole numbers"):
+        Resample(100.0 / math.pi)(recorded(np.zeros(10), 100.0))
+    with pytest.raises(DataError, match="not a ratio of whole numbers"):
+        Resample(20.0)(recorded(np.zeros(10), 99.997))
+    with pytest.raises(DataError, match="not a ratio of whole numbers"):
+        Resample(1e-9)(recorded(np.zeros(10), 100.0))
+
+
+def test_plain_decimation_by_a_broken_ratio_points_at_the_filter() -> None:
+    with pytest.raises(ConfigurationError, match="method=polyphase"):
+        Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0))
+
+
+@pytest.mark.parametrize("arguments", [{"rate_hz": 0.0}, {"rate_hz": math.nan}, {"rate_hz": -1.0}, {"rate_hz": 20.0, "method": "spline"}])
+def test_senseless_settings_are_refused(arguments: dict[str, object]) -> None:
+    with pytest.raises(ConfigurationError):
+        Resample(**arguments)  # type: ignore[arg-type]
+
+
+def test_only_decimation_calls_itself_causal() -> None:
+    assert Resample(20.0).mode == "offline"
+    assert Resample(20.0, method="decimate").mode == "causal"
+    recording = recorded(np.zeros(400), 100.0)
+    changed = recorded(np.where(np.arange(400) < 200, 0.0, 1.0), 100.0)
+    for method, same in (("polyphase", False), ("decimate", True)):
+        before = Resample(20.0, method=method)(recording)["ay"][:40]
+        after = Resample(20.0, method=method)(changed)["ay"][:40]
+        assert bool((before == after).all()) is same

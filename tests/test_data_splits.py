@@ -1,0 +1,190 @@
+"""Splits and windows: no sample serves two purposes, no window crosses from one recording into another."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.data.splits import Span, Split, split_from_config
+from vehest.data.windows import window_starts, windows_of
+
+PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+CONFIGURATIONS = sorted((Path(__file__).parents[1] / "conf" / "split").glob("*.yaml"))
+
+bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(0.0, 4.0)
+
+
+@st.composite
+def spans(draw: st.DrawFn) -> Span:
+    start, stop = sorted(draw(st.lists(bounds, min_size=2, max_size=2, unique=True)))
+    return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
+
+
+def samples_of(span: Span, rate_hz: float) -> set[tuple[str, int]]:
+    """Which samples of a recording of four seconds a stretch takes."""
+    recording = Recording(span.recording, "car", rate_hz, 0.0, {"ay": np.arange(4 * rate_hz)})
+    first, end = recording.index_range(span.start, span.stop)
+    return {(span.recording, index) for index in range(first, end)}
+
+
+@st.composite
+def roles(draw: st.DrawFn) -> list[tuple[Span, ...]]:
+    """Stretches for three purposes, of one recording: neighbours, or anything."""
+    if draw(st.booleans()):
+        times = sorted(draw(st.lists(bounds, min_size=4, max_size=7, unique=True)))
+        neighbours = [Span("set", "lap1", start, stop) for start, stop in pairwise(times)]
+        return [tuple(neighbours[role::3]) for role in range(3)]
+    return [tuple(draw(st.lists(spans(), min_size=1, max_size=2))) for _ in range(3)]
+
+
+@PROPERTY
+@given(roles(), st.sampled_from([20.0, 100.0, 125.0]))
+def test_train_validation_and_tests_never_share_samples(parts: list[tuple[Span, ...]], rate_hz: float) -> None:
+    train, validation, test = parts
+    taken = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
+    shared = bool(taken[0] & taken[1] or taken[0] & taken[2] or taken[1] & taken[2])
+    apart = not any(a.overlaps(b) for one, other in combinations(parts, 2) for a in one for b in other)
+    assert not (apart and shared)
+    if apart:
+        assert Split("drive", train, validation, {"test": test}).all_spans == train + validation + test
+    else:
+        with pytest.raises(ConfigurationError, match="share samples of recording"):
+            Split("drive", train, validation, {"test": test})
+
+
+@PROPERTY
+@given(spans(), spans())
+def test_overlap_goes_both_ways_and_is_that_of_the_times(one: Span, other: Span) -> None:
+    assert one.overlaps(other) is other.overlaps(one)
+    common = one.recording == other.recording and max(one.start, other.start) < min(one.stop, other.stop)
+    assert one.overlaps(other) is common
+
+
+def test_neighbouring_ranges_share_nothing() -> None:
+    parts = Split("s", (Span("d", "r", 150, 450),), (Span("d", "r", 450, 550),), {"test": (Span("d", "r", 550, 700),)})
+    assert len(parts.all_spans) == 3
+    recording = Recording("r", "car", 100.0, 149.99, {"ay": np.zeros(55_001)})
+    ranges = [recording.index_range(span.start, span.stop) for span in parts.all_spans]
+    assert ranges == [(1, 30_001), (30_001, 40_001), (40_001, 55_001)]
+
+
+def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing() -> None:
+    Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
+
+
+def test_two_test_sets_may_look_at_the_same_samples() -> None:
+    Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
+
+
+def test_a_shared_stretch_is_named_with_both_roles() -> None:
+    with pytest.raises(ConfigurationError) as error:
+        Split("s", (Span("d", "lap3", 0, 10),), (Span("d", "lap3", 10, 20),), {"wet": (Span("d", "lap3", 5, 6),)})
+    assert "train and test 'wet' share samples of recording 'lap3' (lap3 [0, 10) s and lap3 [5, 6) s)" in str(error.value)
+
+
+@pytest.mark.parametrize(("start", "stop"), [(2.0, 1.0), (1.0, 1.0), (math.nan, 1.0), (0.0, math.nan)])
+def test_a_stretch_must_run_forward(start: float, stop: float) -> None:
+    with pytest.raises(ConfigurationError, match="is not before stop"):
+        Span("d", "r", start, stop)
+
+
+def test_plain_values_make_a_split() -> None:
+    entry = {"recording": "lap", "start": 1, "stop": 2}
+    config = {
+        "name": "s",
+        "dataset": "d",
+        "train": [entry],
+        "validation": [{"recording": "v", "dataset": "e"}],
+        "tests": {"t": [{"recording": "x"}]},
+    }
+    split = split_from_config(config)
+    assert split.train == (Span("d", "lap", 1.0, 2.0),)
+    assert split.validation == (Span("e", "v", -math.inf, math.inf),)
+    assert split.tests == {"t": (Span("d", "x"),)}
+    assert split.datasets == ("d", "e")
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"trian": []}, "unknown key 'trian'"),
+        ({"train": []}, "nothing to train on"),
+        ({"validation": []}, "nothing to validate on"),
+        ({"train": [{"recording": "a", "end": 3}]}, "unknown key 'end'"),
+        ({"train": [{"start": 3}]}, "needs a recording"),
+        ({"train": [{"recording": "a", "start": "three"}]}, "must be numbers"),
+        ({"train": [{"recording": "a", "start": None}]}, "must be numbers"),
+        ({"train": ["a"]}, "a range is {recording, start, stop}, not a"),
+        ({"train": {"recording": "a"}}, "come as a list"),
+        ({"train": "a"}, "come as a list"),
+        ({"tests": [{"recording": "a"}]}, "must map a name"),
+        ({"tests": {"wet": {"recording": "a"}}}, "come as a list"),
+        ({"dataset": None}, "needs a recording and a dataset"),
+    ],
+)
+def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], what: str) -> None:
+    config = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config | changes)
+    assert what in str(error.value)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
+def test_every_split_that_is_shipped_is_one(file: Path) -> None:
+    config = yaml.safe_load(file.read_text(encoding="utf-8"))
+    assert split_from_config(config).name == file.stem
+
+
+def recorded(name: str, length: int, offset: float) -> Recording:
+    samples = offset + np.arange(float(length))
+    return Recording(name, "car", 20.0, 0.0, {"vx": samples, "ay": -samples, "vy_ref": samples + 0.5})
+
+
+@PROPERTY
+@given(st.lists(st.integers(1, 25), min_size=1, max_size=4), st.integers(1, 12))
+def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths: list[int], n_window: int) -> None:
+    recordings = [recorded(f"r{k}", length, 1000.0 * k) for k, length in enumerate(lengths)]
+    expected = []
+    for recording in recordings:
+        for now in range(n_window - 1, len(recording) - 1):
+            past = [[recording["vx"][k], recording["ay"][k]] for k in range(now - n_window + 1, now + 1)]
+            expected.append((past, recording["vy_ref"][now + 1]))
+    if not expected:
+        with pytest.raises(DataError, match=f"windows of {n_window} samples"):
+            windows_of(recordings, ["vx", "ay"], "vy_ref", n_window)
+        return
+    windows = windows_of(recordings, ["vx", "ay"], "vy_ref", n_window)
+    assert len(windows) == len(expected)
+    for start, target, (past, after) in zip(windows.starts, windows.targets, expected, strict=True):
+        assert windows.series[start : start + n_window].tolist() == past
+        assert target == after
+
+
+@PROPERTY
+@given(st.integers(0, 50), st.integers(1, 50))
+def test_window_starts_count_those_with_a_sample_after_them(n_samples: int, n_window: int) -> None:
+    assert window_starts(n_samples, n_window).tolist() == [k for k in range(n_samples) if k + n_window < n_samples]
+
+
+def test_windows_share_memory_instead_of_being_copied() -> None:
+    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
+    assert windows.series.nbytes == 1000 * 2 * 8
+
+
+def test_windows_over_gaps_are_refused_by_name() -> None:
+    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
+    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
+    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
+        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
+    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6

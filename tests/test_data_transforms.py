@@ -1,0 +1,243 @@
+"""Filters and corrections: what each says about time and truth, checked against closed forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.data.transforms import TRANSFORMS, LowPass, MountingCorrection, RemoveOutliers, Resample, transform_from_config
+
+PROPERTY = settings(max_examples=50, deadline=None, derandomize=True, database=None)
+RATE = 100.0
+
+
+def recorded(**channels: np.ndarray) -> Recording:
+    return Recording("lap", "car", RATE, 3.0, channels)
+
+
+def filtered(samples: np.ndarray, direction: str, cutoff_hz: float = 5.0) -> np.ndarray:
+    return LowPass(cutoff_hz, direction=direction)(recorded(ay=samples))["ay"]  # type: ignore[arg-type]
+
+
+def fitted_sine(samples: np.ndarray, time: np.ndarray, frequency: float) -> tuple[float, float]:
+    """Amplitude and phase of the sine that fits best."""
+    basis = np.stack([np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)], axis=1)
+    (sine, cosine), *_ = np.linalg.lstsq(basis, samples, rcond=None)
+    return float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+
+
+def bilinear(frequency: float, cutoff_hz: float) -> complex:
+    """Response of a second-order Butterworth filter made digital by the bilinear transform with pre-warping."""
+    warped = 1j * np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff_hz / RATE)
+    return complex(1.0 / (warped**2 + math.sqrt(2.0) * warped + 1.0))
+
+
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
+def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency: float) -> None:
+    time = np.arange(2000) / RATE
+    inside = slice(500, 1500)
+    response = bilinear(frequency, 5.0)
+    sine = np.sin(2 * np.pi * frequency * time)
+    gain, phase = fitted_sine(filtered(sine, "causal")[inside], time[inside], frequency)
+    assert gain == pytest.approx(abs(response), rel=1e-6)
+    assert phase == pytest.approx(np.angle(response), abs=1e-6)
+    gain, phase = fitted_sine(filtered(sine, "zero_phase")[inside], time[inside], frequency)
+    assert gain == pytest.approx(abs(response) ** 2, rel=1e-6)
+    assert phase == pytest.approx(0.0, abs=1e-6)
+
+
+@PROPERTY
+@given(arrays(np.float64, 60, elements=st.floats(-100, 100)), st.integers(1, 59), st.floats(-1e3, 1e3))
+def test_causal_low_pass_does_not_see_the_future(samples: np.ndarray, now: int, shock: float) -> None:
+    changed = samples.copy()
+    changed[now:] += shock
+    np.testing.assert_array_equal(filtered(changed, "causal")[:now], filtered(samples, "causal")[:now])
+
+
+def test_zero_phase_low_pass_sees_the_future_and_says_so() -> None:
+    step = np.where(np.arange(200) < 100, 0.0, 1.0)
+    assert abs(filtered(step, "zero_phase")[99]) > 0.1
+    assert filtered(step, "causal")[99] == 0.0
+    assert LowPass(5.0, direction="zero_phase").mode == "offline"
+    assert LowPass(5.0, direction="causal").mode == "causal"
+
+
+def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
+    bump = np.exp(-((np.arange(401) - 200.0) ** 2) / 50.0)
+    smooth = filtered(bump, "zero_phase")
+    np.testing.assert_allclose(smooth, smooth[::-1], atol=1e-9)
+    assert np.argmax(smooth) == 200
+    assert np.argmax(filtered(bump, "causal")) > 200
+
+
+@PROPERTY
+@given(st.integers(1, 40), st.floats(-1e3, 1e3), st.sampled_from(["causal", "zero_phase"]))
+def test_low_pass_keeps_a_constant_however_short(length: int, value: float, direction: str) -> None:
+    np.testing.assert_allclose(filtered(np.full(length, value), direction), value, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 50.0, 80.0, math.nan])
+def test_low_pass_beyond_nyquist_is_refused(cutoff_hz: float) -> None:
+    with pytest.raises(ConfigurationError, match="between 0 and 50 Hz"):
+        LowPass(cutoff_hz)(recorded(ay=np.zeros(10)))
+
+
+def test_only_the_named_channels_are_filtered() -> None:
+    noise = np.random.default_rng(0).standard_normal(100)
+    out = LowPass(5.0, channels=("ay",))(recorded(ay=noise, ax=noise))
+    np.testing.assert_array_equal(out["ax"], noise)
+    assert out["ay"].std() < 0.6 * noise.std()
+
+
+def drive_signal(length: int = 2000) -> np.ndarray:
+    time = np.arange(length) / RATE
+    return 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
+
+
+def test_outlier_removal_removes_planted_spikes_and_nothing_else() -> None:
+    clean = drive_signal()
+    spikes = np.random.default_rng(3).choice(np.arange(0, len(clean), 8), 60, replace=False)
+    spoilt = clean.copy()
+    spoilt[spikes] += np.random.default_rng(4).choice([-1.0, 1.0], 60) * np.random.default_rng(5).uniform(3, 50, 60)
+    out = RemoveOutliers()(recorded(ay=spoilt))["ay"]
+    assert np.abs(out - clean)[spikes].max() < 0.5
+    untouched = np.setdiff1d(np.arange(len(clean)), spikes)
+    np.testing.assert_array_equal(out[untouched], clean[untouched])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_outlier_removal_leaves_a_clean_signal_alone(noise: float) -> None:
+    clean = drive_signal() + noise * np.random.default_rng(0).standard_normal(2000)
+    out = RemoveOutliers()(recorded(ay=clean))["ay"]
+    assert np.mean(out == clean) > 0.99  # six deviations of eleven normal samples: a few in a thousand
+    if noise == 0.0:
+        np.testing.assert_array_equal(out, clean)
+
+
+def test_outlier_removal_keeps_steps_ramps_and_quantised_ramps() -> None:
+    for samples in (np.repeat([0.0, 5.0], 50), np.arange(100.0), np.round(np.arange(100.0) / 7.0), np.full(100, 2.0)):
+        np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], samples)
+
+
+def test_outlier_removal_removes_a_spike_from_a_channel_at_rest() -> None:
+    samples = np.zeros(50)
+    samples[20] = 9.0
+    np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], np.zeros(50))
+
+
+@PROPERTY
+@given(st.integers(1, 14), st.integers(1, 8), st.data())
+def test_outlier_removal_of_short_recordings_stays_within_their_values(length: int, half_window: int, data: st.DataObject) -> None:
+    samples = data.draw(arrays(np.float64, length, elements=st.floats(-10, 10)))
+    out = RemoveOutliers(half_window)(recorded(ay=samples))["ay"]
+    assert len(out) == length
+    assert out.min() >= samples.min()
+    assert out.max() <= samples.max()
+
+
+@pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
+def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
+    with pytest.raises(ConfigurationError, match="half_window"):
+        RemoveOutliers(**arguments)  # type: ignore[arg-type]
+
+
+def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, np.ndarray, np.ndarray]:
+    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
+
+    The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
+    """
+    time, step = np.arange(800) / RATE, 2e-4
+    lever, turn = complex(lever_x, lever_y), np.exp(1j * yaw)  # the plane as complex numbers
+
+    def heading(at: np.ndarray) -> np.ndarray:
+        return 0.4 * at + 0.5 * np.sin(1.5 * at)
+
+    def centre(at: np.ndarray) -> np.ndarray:
+        return 20.0 * at + 3.0 * np.sin(0.7 * at) + 5.0j * np.cos(0.5 * at)
+
+    def sensor(at: np.ndarray) -> np.ndarray:
+        return centre(at) + lever * np.exp(1j * heading(at))
+
+    def acceleration(position: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """In the vehicle's axes."""
+        return (position(time + step) - 2 * position(time) + position(time - step)) / step**2 * np.exp(-1j * heading(time))
+
+    truth, measured = acceleration(centre), acceleration(sensor) / turn
+    channels = {"ax": measured.real, "ay": measured.imag, "yaw_rate": 0.4 + 0.75 * np.cos(1.5 * time)}
+    return Recording("lap", "car", RATE, 0.0, channels), truth.real, truth.imag
+
+
+@pytest.mark.parametrize(("lever_x", "lever_y", "yaw"), [(0.0, 0.0, 0.2), (1.3, 0.0, 0.0), (0.0, -0.6, 0.0), (-0.8, 0.5, -0.15)])
+def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever_y: float, yaw: float) -> None:
+    recording, true_ax, true_ay = rigid_body(lever_x, lever_y, yaw)
+    corrected = MountingCorrection(lever_x, lever_y, yaw)(recording)
+    inside = slice(1, -1)  # central differences of the yaw rate
+    np.testing.assert_allclose(corrected["ax"][inside], true_ax[inside], atol=1e-4)
+    np.testing.assert_allclose(corrected["ay"][inside], true_ay[inside], atol=1e-4)
+    before = max(np.abs(recording["ax"] - true_ax).max(), np.abs(recording["ay"] - true_ay).max())
+    assert before > 0.1
+    assert MountingCorrection(lever_x, lever_y, yaw).mode == ("causal" if lever_x == lever_y == 0.0 else "offline")
+
+
+def test_mounting_correction_of_one_sample_knows_the_centripetal_part() -> None:
+    recording = recorded(ax=np.array([1.0]), ay=np.array([2.0]), yaw_rate=np.array([0.5]))
+    corrected = MountingCorrection(lever_x=2.0, lever_y=-1.0)(recording)
+    assert corrected["ax"].tolist() == [1.0 + 0.25 * 2.0]
+    assert corrected["ay"].tolist() == [2.0 - 0.25 * 1.0]
+
+
+def test_filters_and_corrections_refuse_channels_with_gaps() -> None:
+    channels = {name: np.array([0.0, np.nan, 1.0, 2.0]) for name in ("ax", "ay", "yaw_rate")}
+    recording = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset(channels))
+    for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0)):
+        with pytest.raises(DataError, match="has gaps and cannot be filtered"):
+            transform(recording)
+
+
+def test_a_missing_channel_is_named() -> None:
+    for transform in (LowPass(5.0, channels=("vx",)), RemoveOutliers(channels=("vx",)), MountingCorrection(1.0)):
+        with pytest.raises(DataError, match=r"no channel '(vx|ax)'"):
+            transform(recorded(ay=np.zeros(20)))
+
+
+def test_transforms_leave_the_recording_they_are_given_alone() -> None:
+    recording, *_ = rigid_body(1.0, 0.0, 0.0)
+    before = {name: samples.copy() for name, samples in recording.channels.items()}
+    for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0), Resample(20.0)):
+        out = transform(recording)
+        assert (out.id, out.start_time, out.vehicle) == (recording.id, recording.start_time, recording.vehicle)
+    for name, samples in before.items():
+        np.testing.assert_array_equal(recording[name], samples)
+
+
+def test_transforms_are_built_from_plain_values() -> None:
+    assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}) == LowPass(5, ("ax", "ay"))
+    assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
+    assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
+    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction"}
+
+
+@pytest.mark.parametrize(
+    ("config", "what"),
+    [
+        ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
+        ({}, "'None' is not one of"),
+        ({"name": "low_pass"}, "cutoff_hz"),
+        ({"name": "low_pass", "cutoff_hz": 5.0, "cutof": 1}, "cutof"),
+        ({"name": "low_pass", "cutoff_hz": 5.0, "direction": "backward"}, "causal, zero_phase"),
+        ({"name": "resample", "rate_hz": "fast"}, "resample"),
+    ],
+)
+def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        transform_from_config(config)
+    assert what in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,335 @@
+"""The documentation says what the code does: generated pages, links, commands, examples, constants."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+import yaml
+from scipy import signal
+
+import vehest
+from vehest.cli import app
+from vehest.data import checks
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
+from vehest.data.splits import split_from_config
+from vehest.data.transforms import TRANSFORMS, Resample
+from vehest.estimators.model_files import save_model
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.evaluation.metrics import UNITS
+from vehest.sources.base import COMMON_KEYS, open_source, source_names
+from vehest.stages.config import compose_config, expand
+from vehest.stages.config_files import GROUPS, choices
+from vehest.stages.pipeline import KEYS, pipeline_configs, read_pipeline
+from vehest.studies.artefacts import METRIC_COLUMNS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…")
+STUDY = ROOT / "results" / "ferrari_drive"
+
+
+def page(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def fences(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def without_fences(text: str) -> str:
+    return re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def of_pages(found: Any) -> list[Any]:
+    """Parameters from all pages, each named by its page."""
+    return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
+
+
+# Generated pages
+
+
+def generator() -> Any:
+    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_generated_pages_are_up_to_date():
+    for path, text in generator().pages().items():
+        assert path.read_text(encoding="utf-8") == text, f"{path.name} is not what the code says; run 'make docs'"
+
+
+def test_leaderboard_in_readme_follows_the_results(tmp_path):
+    source = tmp_path / "leaderboard.csv"
+    columns = "title,n_parameters,rmse_sideslip,rmse_sideslip_min,rmse_sideslip_max,n_seeds,rmse_vy,fvu"
+    source.write_text(f'{columns}\n"KS-NN, small",12,0.12345,0.1,0.2,3,0.05,0.0123\nOther,2,0.5,,,1,0.1,0.2\n')
+    made = generator().with_leaderboard(page("README.md"), source)
+    assert "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | 0.050 | 0.012 |\n| Other | 2 | 0.500 | – | 0.100 | 0.200 |" in made
+    assert made.count("<!-- end of leaderboard -->") == 1
+
+
+# Links
+
+
+def links(file: Path) -> list[str]:
+    text = without_fences(file.read_text(encoding="utf-8"))
+    found = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
+    return [target for target in dict.fromkeys(found) if not target.startswith(("https://", "http://"))]
+
+
+def anchors(file: Path) -> set[str]:
+    """Anchors of a page's headings, as they are made from their text."""
+    headings = re.findall(r"^#+ (.*)$", without_fences(file.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize(("file", "target"), of_pages(links))
+def test_relative_links_and_images_resolve(file, target):
+    path, _, anchor = target.partition("#")
+    there = (file.parent / path).resolve() if path else file
+    if not there.exists() and there.is_relative_to(STUDY) and not STUDY.exists():
+        pytest.skip("results/ferrari_drive is not here: run 'make ferrari_drive'")
+    assert there.exists(), f"{file.name} links to {target}"
+    if anchor:
+        assert anchor in anchors(there), f"{file.name} links to {target}"
+
+
+# Examples of files
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch) -> Path:
+    """An empty folder with the configuration files that the pages show, each under the name in its first line."""
+    for file in PAGES:
+        for block in fences(file.read_text(encoding="utf-8"), "yaml"):
+            named = re.match(r"# ((?:conf|pipelines)/\S+?\.yaml)", block)
+            if named:
+                path = tmp_path / named[1]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(block, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VEHEST_DATA", str(tmp_path))
+    return tmp_path
+
+
+def test_example_files_are_valid(workplace):
+    shown = {file.relative_to(workplace).as_posix() for file in workplace.rglob("*.yaml")}
+    assert {"conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_study.yaml"} <= shown
+    for file in sorted((workplace / "conf" / "dataset").glob("*.yaml")):
+        open_source(compose_config("ingest", [f"dataset={file.stem}"])["dataset"])
+    for file in sorted((workplace / "conf" / "split").glob("*.yaml")):
+        split = split_from_config(compose_config("train", [f"split={file.stem}"])["split"])
+        assert set(split.datasets) <= set(choices("dataset"))
+    for file in sorted((workplace / "pipelines").glob("*.yaml")):
+        assert pipeline_configs(read_pipeline(str(file)), [])
+
+
+def test_python_examples_run(workplace, drive):
+    folder = workplace / "outputs" / "train" / "MODEL"
+    folder.mkdir(parents=True)
+    observer = estimator_class("luenberger").from_config({"rate_hz": 20})
+    observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
+    save_model(observer, folder)
+    columns = {"time": drive.time, **{name: drive[name] for name in observer.channels}}
+    rows = np.stack(list(columns.values()), axis=1)
+    np.savetxt(workplace / "lap.csv", rows, delimiter=",", header=",".join(columns), comments="")
+    blocks = [block for file in PAGES for block in fences(file.read_text(encoding="utf-8"), "python")]
+    assert len(blocks) >= 2
+    for block in blocks:
+        exec(compile(block, "example", "exec"), {})
+    assert (workplace / "out.parquet").is_file()
+
+
+# Commands
+
+
+@dataclass(frozen=True)
+class Given:
+    """A command line, taken apart."""
+
+    command: tuple[str, ...]
+    arguments: list[str]
+    overrides: list[str]
+
+
+def command_lines(file: Path) -> list[str]:
+    """Every line of a shell block that calls vehest, and every such call in running text."""
+    text = file.read_text(encoding="utf-8")
+    lines = [line.strip() for block in fences(text, "sh") for line in block.splitlines() if line.strip().startswith("vehest ")]
+    lines += re.findall(r"`(vehest [^`\n]+)`", without_fences(text))
+    return list(dict.fromkeys(lines))
+
+
+def taken_apart(line: str) -> Given | None:
+    """Command, arguments and overrides; none where only a command is named. Unknown commands and options fail."""
+    words = shlex.split(line, comments=True)[1:]
+    command: Any = typer.main.get_command(app)
+    options = {option: parameter for parameter in command.params for option in parameter.opts}
+    if words[0].startswith("-"):
+        assert words[0] in {*options, "-h", "--help"}, f"vehest has no option {words[0]}"
+        return None
+    path: list[str] = []
+    while hasattr(command, "commands"):
+        if not words:
+            return None
+        assert words[0] in command.commands, f"vehest has no command {words[0]}"
+        path.append(words[0])
+        command, words = command.commands[path[-1]], words[1:]
+    options = {option: parameter for parameter in command.params for option in parameter.opts if parameter.param_type_name == "option"}
+    fixed = [parameter for parameter in command.params if parameter.param_type_name == "argument" and parameter.nargs == 1]
+    positional: list[str] = []
+    waiting = iter(words)
+    for word in waiting:
+        if word.startswith("-") and word != "-":
+            assert word in {*options, "-h", "--help"}, f"vehest {' '.join(path)} has no option {word}"
+            if word in options and not options[word].is_flag:
+                next(waiting, None)
+        else:
+            positional.append(word)
+    if not positional:
+        return None
+    assert len(positional) >= len(fixed), f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in fixed)}"
+    takes_overrides = any(parameter.name == "overrides" for parameter in command.params)
+    assert takes_overrides or len(positional) == len(fixed), f"vehest {' '.join(path)} takes no overrides"
+    return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
+
+
+def overrides_of(given: Given) -> Iterator[tuple[str, list[str]]]:
+    """The root configuration and overrides that a command composes; nothing where placeholders stand."""
+    first = given.arguments[0] if given.arguments else ""
+    match given.command:
+        case ("ingest",) | ("downsample",):
+            yield given.command[0], [f"dataset={first}", *given.overrides]
+        case ("data", "show" | "check"):
+            if Path(first).suffix or PLACEHOLDER.search(first):
+                yield "estimate", given.overrides
+            else:
+                yield "ingest", [f"dataset={first}", *given.overrides]
+        case ("config",):
+            yield first, given.overrides
+        case ("train",) | ("eval",) | ("estimate",):
+            yield given.command[0], given.overrides
+
+
+def test_command_lines_are_found():
+    assert len(of_pages(command_lines)) > 60
+
+
+@pytest.mark.parametrize(("file", "line"), of_pages(command_lines))
+def test_command_line_is_one_that_vehest_takes(file, line, workplace):
+    given = taken_apart(line)
+    if given is None:
+        return
+    if given.command[0] in {"run", "report"}:
+        if not PLACEHOLDER.search(" ".join([*given.arguments, *given.overrides])):
+            assert pipeline_configs(read_pipeline(given.arguments[0]), given.overrides)
+        return
+    for root, overrides in overrides_of(given):
+        if not PLACEHOLDER.search(" ".join([root, *overrides])):
+            compose_config(root, overrides)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["vehest trian", "vehest train --fast", "vehest estimate MODEL", "vehest doctor now", "vehest data look", "vehest --quick"],
+)
+def test_wrong_command_lines_would_be_noticed(line):
+    with pytest.raises(AssertionError):
+        taken_apart(line)
+
+
+# What pages state
+
+
+def test_readme_names_the_patent_and_the_licence():
+    assert "PCT/IT2023/050058" in page("README.md")
+    assert "PCT/IT2023/050058" in page("docs/estimators.md")
+    assert "(LICENSE)" in page("README.md")
+
+
+def test_citation_names_four_papers():
+    citation = yaml.safe_load(page("CITATION.cff"))
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["version"] == vehest.__version__
+    papers = citation["references"]
+    assert len({paper["title"] for paper in papers}) == 4
+    assert all(paper["authors"] and paper["year"] for paper in papers)
+    assert {paper["doi"] for paper in papers if "doi" in paper} == {
+        "10.1109/TITS.2023.3303776",
+        "10.1109/ACCESS.2020.3012770",
+        "10.1109/TVT.2024.3389493",
+    }
+
+
+def test_pages_know_every_name():
+    data, estimators, cli = page("docs/data.md"), page("docs/estimators.md"), page("docs/cli.md")
+    for source in source_names():
+        assert f"### `{source}`" in data
+    keys = {key for source in source_names() for key in class_of(source).keys} | set(COMMON_KEYS)
+    named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated"}
+    for name in keys | set(TRANSFORMS) | named_checks:
+        assert f"`{name}`" in data, f"docs/data.md does not explain {name}"
+    for name in {*estimator_names(), *UNITS}:
+        assert f"`{name}`" in estimators, f"docs/estimators.md does not explain {name}"
+    assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(estimators.split())
+    for name in {*KEYS, *GROUPS}:
+        assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
+
+
+def class_of(source: str) -> Any:
+    return importlib.import_module(f"vehest.sources.{source}").SOURCE
+
+
+def test_exit_codes_are_those_of_the_errors():
+    table = dict(re.findall(r"^\| (\d+) \| ([^|]+) \|", page("docs/cli.md"), re.MULTILINE))
+    stated = {"configuration": ConfigurationError, "unusable data": DataError, "missing": MissingError, "some jobs": JobsFailedError}
+    for words, error in stated.items():
+        assert words in table[str(error.exit_code)]
+
+
+def test_stated_filter_is_the_one_that_resamples():
+    text = " ".join(page("docs/data.md").split())
+    assert f"β = {Resample.kaiser_beta:g}, {Resample.zero_crossings} zero crossings" in text
+    assert f"is at {Resample.cutoff:g} of the slower Nyquist frequency" in text
+    frequencies, response = signal.freqz(Resample(20.0)._taps(1, 5), worN=1 << 14, fs=100.0)
+    decibels = 20.0 * np.log10(np.abs(response) + 1e-12)
+    assert "flat within 0.1 dB up to 7.5 Hz, -3 dB at 8.3 Hz, and at least 71 dB down from 10 Hz on" in text
+    assert np.abs(decibels[frequencies <= 7.5]).max() < 0.1
+    assert round(float(frequencies[np.argmax(decibels < -3.0)]), 1) == 8.3
+    assert decibels[frequencies >= 10.0].max() < -71.0
+
+
+def test_stated_limits_of_checks_are_those_of_the_code():
+    text = " ".join(page("docs/data.md").split())
+    assert f"more than {100 * checks.SATURATED_FRACTION:g} % of the samples" in text
+    assert f"exactly the same for {checks.STUCK_SECONDS:g} s or more" in text
+    low, high = checks.KINEMATIC_BAND_HZ
+    assert f"correlation below {checks.SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
+
+
+@pytest.mark.parametrize("name", ["gru", "lstm"])
+def test_stated_parameter_counts_of_recurrent_networks(name):
+    counts = [estimator_class(name).from_config({"n_states": states}).n_parameters for states in range(2, 7)]
+    row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators.md"), re.MULTILINE)
+    assert row is not None
+    assert [int(cell) for cell in row[1].split("|")] == counts
+
+
+def test_stated_parameter_counts_of_the_ksnn():
+    rows = re.findall(r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)", page("docs/estimators.md"), re.MULTILINE)
+    assert len(rows) == 4
+    for overrides, count in rows:
+        (job,) = expand(["estimator=ksnn", *overrides.split()])
+        assert estimator_class("ksnn").from_config(compose_config("train", job)["estimator"]).n_parameters == int(count)

@@ -1,0 +1,157 @@
+"""From time stamps to a uniform clock, and from a file's columns to channels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.data.transforms import Resample
+from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config, uniform_clock
+
+RATES = [10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
+PROPERTY = settings(max_examples=120, deadline=None, derandomize=True, database=None)
+
+
+@PROPERTY
+@given(st.sampled_from(RATES), st.integers(2, 2000), st.sampled_from([0.0, 149.99, -12.5, 1_700_000_123.456]))
+def test_the_rate_that_was_meant_comes_back_at_any_start(rate: float, length: int, start: float) -> None:
+    clock = uniform_clock(start + np.arange(length) / rate, "'file'")
+    assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
+    assert (clock.start_time, clock.n_samples, clock.stamps) == (start, length, None)
+
+
+@pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0 / 3.0, 400.0])
+@pytest.mark.parametrize("digits", [3, 4, 6])
+def test_rounded_unix_time_stamps_can_be_resampled_to_20_hz(rate: float, digits: int) -> None:
+    stamps = np.round(1_700_000_000.0 + np.arange(500) / rate, digits)
+    policy = "strict" if np.abs(np.diff(stamps) * rate - 1).max() < 0.01 else "interpolate"
+    clock = uniform_clock(stamps, "'file'", policy)  # type: ignore[arg-type]
+    recording = Recording("lap", "car", clock.rate_hz, clock.start_time, {"ay": np.zeros(clock.n_samples)})
+    assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
+    assert Resample(20.0)(recording).rate_hz == 20.0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.24])  # from a quarter on, a long step cannot be told from a lost sample
+@pytest.mark.parametrize("rate", [20.0, 100.0, 125.0])
+def test_the_rate_survives_strong_jitter_and_gaps(rate: float, share: float) -> None:
+    generator = np.random.default_rng(5)
+    stamps = (np.arange(1000) + share * generator.uniform(-1, 1, 1000)) / rate
+    kept = np.delete(stamps, [*range(300, 350), 500, 777])
+    clock = uniform_clock(kept, "'file'", "interpolate")
+    assert clock.rate_hz == rate
+    assert clock.n_samples == pytest.approx(1000, abs=1)
+
+
+def test_a_clock_that_truly_runs_fast_keeps_its_rate() -> None:
+    stamps = np.arange(50_000) / 100.003
+    assert uniform_clock(stamps, "'file'").rate_hz == pytest.approx(100.003, rel=1e-9)
+
+
+@pytest.mark.parametrize(("amplitude", "strict_takes_it"), [(4e-5, True), (2e-3, False)])
+def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation(amplitude: float, strict_takes_it: bool) -> None:
+    stamps = np.arange(1000) / 100.0 + amplitude * np.random.default_rng(0).uniform(-1, 1, 1000)
+    if strict_takes_it:
+        assert uniform_clock(stamps, "'file'").rate_hz == 100.0
+    else:
+        with pytest.raises(DataError, match="set clock: interpolate"):
+            uniform_clock(stamps, "'file'")
+    assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
+
+
+def test_a_drifting_clock_needs_interpolation() -> None:
+    stamps = np.concatenate([[0.0], np.cumsum(np.linspace(0.00995, 0.01005, 5000))])
+    with pytest.raises(DataError, match=r"'file': the clock drifts.*set clock: interpolate"):
+        uniform_clock(stamps, "'file'")
+    assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
+
+
+@pytest.mark.parametrize("start", [0.0, 1_700_000_000.0])
+def test_interpolation_puts_a_line_onto_the_uniform_clock(start: float) -> None:
+    elapsed = np.sort(np.concatenate([[0.0, 10.0], np.random.default_rng(1).uniform(0, 10, 400), np.arange(1, 1000) / 100.0]))
+    clock = uniform_clock(start + elapsed, "'file'", "interpolate")
+    aligned = clock.align(3.0 - 2.0 * elapsed)
+    np.testing.assert_allclose(aligned, 3.0 - 2.0 * np.arange(clock.n_samples) / clock.rate_hz, atol=2e-6)
+    assert clock.n_samples == pytest.approx(10.0 * clock.rate_hz + 1, abs=1)
+
+
+def test_interpolation_bridges_a_gap_linearly() -> None:
+    stamps = np.delete(np.arange(300) / 100.0, np.s_[100:200])
+    with pytest.raises(DataError, match="cut the range out or set clock: interpolate"):
+        uniform_clock(stamps, "'file'")
+    clock = uniform_clock(stamps, "'file'", "interpolate")
+    assert (clock.rate_hz, clock.n_samples) == (100.0, 300)
+    np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * np.arange(300) / 100.0, atol=1e-12)
+
+
+def test_interpolation_keeps_every_measured_sample_of_a_slow_channel() -> None:
+    stamps = np.arange(200) / 100.0 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, 200)
+    slow = np.where(np.arange(200) % 5 == 0, np.arange(200.0), np.nan)
+    aligned = uniform_clock(stamps, "'file'", "interpolate").align(slow, gappy=True)
+    measured = ~np.isnan(aligned)
+    assert aligned[measured].tolist() == slow[::5].tolist()
+    assert np.abs(np.flatnonzero(measured) - aligned[measured]).max() <= 1
+
+
+@pytest.mark.parametrize("policy", ["strict", "interpolate"])
+@pytest.mark.parametrize(
+    ("stamps", "what"),
+    [
+        ([0.0, 0.01, 0.01, 0.02], "repeats 1 times, first at sample 2"),
+        ([0.0, 0.02, 0.01, 0.03], "goes backwards 1 times, first at sample 2"),
+        ([0.0, np.nan, 0.02], "sample 1 is not a number"),
+        ([0.0], "fewer than two"),
+        ([], "fewer than two"),
+    ],
+)
+def test_disordered_time_stamps_are_refused_whatever_the_policy(policy: str, stamps: list[float], what: str) -> None:
+    with pytest.raises(DataError) as error:
+        uniform_clock(np.array(stamps), "'lap.csv'", policy)  # type: ignore[arg-type]
+    assert what in str(error.value)
+    assert str(error.value).startswith("'lap.csv': ")
+    assert "repair, remove or sort the rows" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_units_and_signs_are_applied() -> None:
+    values = np.array([1.0, -2.0, 0.5])
+    np.testing.assert_allclose(Column("a", "g", -1).to_si(values, "m/s²"), -9.80665 * values)
+    np.testing.assert_allclose(Column("a", "deg/s").to_si(values, "rad/s"), np.deg2rad(values))
+    np.testing.assert_array_equal(Column("a", "m/s").to_si(values, "m/s"), values)
+
+
+def test_columns_named_like_channels_need_no_map() -> None:
+    assert identity_columns(["time", "ay", "steer", "spam"]) == {"ay": Column("ay", "m/s²"), "steer": Column("steer", "rad")}
+
+
+@pytest.mark.parametrize(
+    ("entries", "what"),
+    [
+        ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
+        ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
+        ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
+        ({"vx": {"column": "a"}}, "must say column, unit"),
+        ({"vx": "a"}, "must say column, unit"),
+        ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "must say column, unit"),
+        ({"vx": {"column": "a", "unit": "m/s", "sign": 2}}, "sign must be 1 or -1, not 2"),
+        (["vx"], "must map a channel to its column"),
+    ],
+)
+def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: object, what: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        columns_from_config(entries, "mine")  # type: ignore[arg-type]
+    assert what in str(error.value)
+    assert "data set 'mine'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_time_column_has_a_unit_of_time() -> None:
+    assert time_column_from_config({"column": "t", "unit": "ms"}, "mine") == Column("t", "ms")
+    with pytest.raises(ConfigurationError, match="data set 'mine': time: unit 'km/h' cannot be converted to 's'"):
+        time_column_from_config({"column": "t", "unit": "km/h"}, "mine")
+    with pytest.raises(ConfigurationError, match="data set 'mine': time must say column"):
+        time_column_from_config("t", "mine")
+    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here") == Column("3", "s", -1)
