@@ -335,3 +335,16 @@ def test_a_clock_that_speeds_up_slowly_drifts() -> None:
 @given(st.integers(2, 300), st.floats(1.0, 2000.0), st.floats(-1e6, 1e6))
 def test_no_uniform_clock_is_refused(length: int, rate: float, start: float) -> None:
     assert [found for found in checks_of_clock(start + np.arange(length) / rate) if found.level == "error"] == []
+
+
+def test_a_reference_in_kilometres_an_hour_is_found_by_its_scale() -> None:
+    finding = only_complaint(changed(clean_drive(), vy_ref=lambda samples: samples * 3.6))
+    assert (finding.level, finding.check, finding.channel) == ("warning", "unit", "vy_ref")
+    assert "times as large as ay - vx·yaw_rate" in finding.message
+
+
+def test_a_reference_sideslip_in_degrees_is_found_although_its_values_are_possible() -> None:
+    gentle = changed(clean_drive(), vy_ref=lambda samples: samples * 0.9, sideslip_ref=lambda samples: np.degrees(0.9 * samples))
+    assert np.abs(gentle["sideslip_ref"]).max() < np.pi
+    finding = only_complaint(gentle)
+    assert (finding.level, finding.check, finding.channel) == ("error", "unit", "sideslip_ref")

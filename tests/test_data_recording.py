@@ -54,6 +54,17 @@ def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
 
 
 @PROPERTY
+@given(st.integers(1, 200), RATES, STARTS, st.floats(-0.1, 1.1), st.floats(0.01, 0.99))
+def test_a_cut_between_samples_begins_with_the_next_one(
+    length: int, rate_hz: float, start_time: float, share: float, between: float
+) -> None:
+    recording = counting(length, rate_hz, start_time)
+    at = start_time + (np.floor(share * length) + between) / rate_hz
+    first, end = recording.index_range(at, math.inf)
+    assert (first, end) == (int((recording.time < at).sum()), length)
+
+
+@PROPERTY
 @given(st.integers(2, 200), RATES, STARTS, st.data())
 def test_cutting_twice_is_cutting_once(length: int, rate_hz: float, start_time: float, data: st.DataObject) -> None:
     recording = counting(length, rate_hz, start_time)

@@ -241,6 +241,12 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
             compose_config(root, overrides)
 
 
+def test_make_targets_exist():
+    targets = set(re.findall(r"^([\w-]+):", page("Makefile"), re.MULTILINE))
+    named = {target for file in PAGES for target in re.findall(r"(?:`|^)make ([a-z_-]+)", file.read_text(encoding="utf-8"), re.MULTILINE)}
+    assert {"run", "test", "ui"} <= named <= targets
+
+
 @pytest.mark.parametrize(
     "line",
     ["vehest trian", "vehest train --fast", "vehest estimate MODEL", "vehest doctor now", "vehest data look", "vehest --quick"],

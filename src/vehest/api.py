@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,18 +22,18 @@ from vehest.stages.estimate import estimate_recording, find_model, read_table, w
 __all__ = ["Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate"]
 
 
-def load_model(model: str | Path, output: str | Path = "outputs") -> Estimator:
+def load_model(model: str | Path, output: str | Path | None = None) -> Estimator:
     """Load a fitted estimator.
 
     Args:
         model: its folder, or the start of its name in the output root.
-        output: the output root.
+        output: the output root; by default VEHEST_OUTPUT, or ``outputs``.
 
     Raises:
         MissingError: there is no such model.
         DataError: its files are damaged.
     """
-    return _load_model(find_model(str(model), Path(output)))
+    return _load_model(find_model(str(model), Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))))
 
 
 def read_recording(path: str | Path, overrides: Sequence[str] = ()) -> Recording:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -269,7 +270,7 @@ def show_config(
     from vehest.stages.config import as_yaml
 
     config = _compose(command, overrides or [])
-    typer.echo(json.dumps(config, indent=1, ensure_ascii=False) if as_json else as_yaml(config).rstrip())
+    typer.echo(_json(config) if as_json else as_yaml(config).rstrip())
 
 
 @app.command()
@@ -279,7 +280,7 @@ def doctor(as_json: AsJson = False) -> None:
 
     items = examine()
     if as_json:
-        typer.echo(json.dumps([item.__dict__ for item in items], indent=1))
+        typer.echo(_json([item.__dict__ for item in items]))
     else:
         for item in items:
             mark = {"ok": "ok     ", "warning": "warning", "error": "error  "}[item.level]
@@ -295,7 +296,7 @@ def data_list(as_json: AsJson = False) -> None:
 
     rows = dataset_rows()
     if as_json:
-        typer.echo(json.dumps(rows, indent=1, ensure_ascii=False))
+        typer.echo(_json(rows))
     else:
         _table(["data set", "kind", "source", "here", "title", "licence"], [[str(value) for value in row.values()] for row in rows])
 
@@ -306,7 +307,7 @@ def data_channels(as_json: AsJson = False) -> None:
     from vehest.data.channels import CHANNELS
 
     if as_json:
-        typer.echo(json.dumps({name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}, indent=1, ensure_ascii=False))
+        typer.echo(_json({name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}))
     else:
         _table(["channel", "unit", "meaning"], [[c.name, c.unit, c.meaning] for c in CHANNELS.values()])
 
@@ -322,7 +323,7 @@ def data_show(
 
     shown = describe(source, overrides or [])
     if as_json:
-        typer.echo(json.dumps(shown, indent=1, ensure_ascii=False))
+        typer.echo(_json(shown))
         return
     for recording in shown["recordings"]:
         typer.echo(
@@ -344,7 +345,7 @@ def data_check(
 
     findings = check(source, overrides or [])
     if as_json:
-        typer.echo(json.dumps(findings, indent=1, ensure_ascii=False))
+        typer.echo(_json(findings))
     else:
         for row in findings:
             channel = f" {row['channel']}:" if row["channel"] else ""
@@ -398,17 +399,18 @@ def _run_pipeline(
     if as_json:
         rows = json.loads(outcome.leaderboard.to_json(orient="records"))
         published = str(outcome.published) if outcome.published else None
-        typer.echo(json.dumps({"report": str(page), "published": published, "leaderboard": rows}, indent=1, ensure_ascii=False))
+        typer.echo(_json({"report": str(page), "published": published, "leaderboard": rows}))
         return
     for test_set, rows in outcome.leaderboard.groupby("test_set", sort=False):
         typer.echo(f"\n{pipeline.title}: test set '{test_set}'")
         _table(
-            ["estimator", "parameters", "seed", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"],
+            ["estimator", "parameters", "seeds", "seed", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"],
             [
                 [
                     str(row["title"]),
                     f"{row['n_parameters']:.0f}",
-                    f"{row['seed']} of {row['n_seeds']}",
+                    str(row["n_seeds"]),
+                    str(row["seed"]),
                     f"{row['rmse_sideslip']:.3f}",
                     f"{row['rmse_sideslip_min']:.3f} … {row['rmse_sideslip_max']:.3f}" if row["n_seeds"] > 1 else "–",
                     f"{row['rmse_vy']:.3f}",
@@ -475,21 +477,35 @@ def _positive(value: Any, name: str) -> float:
 def _say(as_json: bool, outcome: dict[str, Any]) -> None:
     """Print an outcome: one JSON object, or a line a figure."""
     if as_json:
-        typer.echo(json.dumps(outcome, indent=1, ensure_ascii=False))
+        typer.echo(_json(outcome))
         return
     for key, value in outcome.items():
         typer.echo(f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}")
 
 
+def _json(outcome: Any) -> str:
+    """An outcome as JSON; what is not a finite number becomes null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(outcome), indent=1, ensure_ascii=False, allow_nan=False)
+
+
 def _table(header: list[str], rows: list[list[str]]) -> None:
     """Print a table on standard output, as wide as it needs to be where there is no terminal."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(*header, box=None, header_style="bold", pad_edge=False)
+    table = Table(*(escape(name) for name in header), box=None, header_style="bold", pad_edge=False)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(escape(cell) for cell in row))
     console.print(table)
 
 

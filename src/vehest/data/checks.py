@@ -28,6 +28,7 @@ STANDSTILL_SHAKING = 0.3  # m/s²
 MOST_DRIFT = 0.5  # intervals
 KINEMATIC_BAND_HZ = (0.1, 2.0)
 SIGN_CORRELATION = 0.3
+MAX_SCALE = 1.7  # between d(vy_ref)/dt and what it must equal; km/h for m/s makes 3.6 or 1/3.6
 DEGREES_PER_RADIAN = 180.0 / np.pi
 
 
@@ -207,6 +208,17 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
                 f"check units, delays and where the sensors sit",
             )
         ]
+    scale = float(derived.std() / predicted.std())
+    if correlation > 0.8 and not 1 / MAX_SCALE < scale < MAX_SCALE:
+        return [
+            Finding(
+                "warning",
+                "unit",
+                "vy_ref",
+                f"d(vy_ref)/dt is {scale:.3g} times as large as ay - vx·yaw_rate {where} "
+                f"(correlation {correlation:.2f}): check the unit of vy_ref",
+            )
+        ]
     residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording["vx"] * recording["yaw_rate"])
     residual = residual[moving]
     return [
@@ -217,6 +229,22 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
             f"d(vy_ref)/dt follows ay - vx·yaw_rate (correlation {correlation:.2f} {where}), mean bias {residual.mean():.3f} m/s²",
         )
     ]
+
+
+def _sideslip_unit(recording: Recording) -> list[Finding]:
+    """sideslip_ref must be atan2(vy_ref, vx) in radians; 57 times that is degrees."""
+    if not {"vx", "vy_ref", "sideslip_ref"} <= set(recording.channels):
+        return []
+    expected = np.arctan2(recording["vy_ref"], recording["vx"])
+    given = recording["sideslip_ref"]
+    known = np.isfinite(expected) & np.isfinite(given) & ~_standstill(recording)
+    if known.sum() < 100 or np.std(expected[known]) < 1e-3:
+        return []
+    slope = float((expected[known] * given[known]).sum() / np.square(expected[known]).sum())
+    if 0.4 < slope / DEGREES_PER_RADIAN < 2.5:
+        message = f"sideslip_ref is {slope:.3g} times atan2(vy_ref, vx): it is in degrees; set its unit to deg"
+        return [Finding("error", "unit", "sideslip_ref", message)]
+    return []
 
 
 def _not_measured(recording: Recording) -> list[Finding]:
@@ -310,6 +338,7 @@ _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     _impossible_values,
     _yaw_rate_unit,
     _kinematic_sign,
+    _sideslip_unit,
     _not_measured,
     _stuck,
     _saturated,

@@ -9,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 
+from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
@@ -56,6 +57,9 @@ def read_table(path: Path, overrides: Sequence[str] = ()) -> Recording:
     dataset = config["dataset"]
     if dataset.get("source") != "tabular":
         raise ConfigurationError(f"data set '{dataset.get('name')}' does not describe tables; use one with source: tabular")
+    if dataset.get("channels"):  # a new drive needs no reference channels, whatever the data set declares
+        measured = {name: entry for name, entry in dataset["channels"].items() if not name.endswith(REFERENCE_SUFFIX)}
+        dataset = {**dataset, "channels": measured}
     recording = TabularSource(dataset).read_file(path)
     accepted = set(dataset.get("accept") or [])
     for finding in checks_of_recording(recording):

@@ -120,6 +120,10 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
             composed[job] = compose_config("eval", job)
         return composed[job]
 
+    if any(key_of(override) == "split" for override in overrides):
+        raise ConfigurationError(
+            f"the split belongs to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change it there"
+        )
     used: set[str] = set()
     configs: list[Config] = []
     for sweep in pipeline.sweeps:
@@ -197,7 +201,7 @@ def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Worksh
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
     published = None
-    if pipeline.publish:
+    if pipeline.publish and not workshop.dry_run:
         published = Path("results") / pipeline.study
         if publish(report, published):
             workshop.messages.line("done", "publish", str(published))

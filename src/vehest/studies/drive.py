@@ -233,9 +233,8 @@ def _budget_sentence(artefacts: StudyArtefacts) -> str:
         for metric in ("epochs", "train_seconds")
     )
     if (epochs > 0).any():
-        words += (
-            f"; training took {fixed(float(epochs[epochs > 0].min()), 0)} to {fixed(float(epochs[epochs > 0].max()), 0)} epochs a network"
-        )
+        fewest, most = (fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max()))
+        words += f"; training took {fewest} epochs a network" if fewest == most else f"; training took {fewest} to {most} epochs a network"
     if np.isfinite(seconds).any():
         words += (
             f" and {_duration(float(np.nansum(seconds)))} together"
