@@ -176,18 +176,18 @@ def _read_columns(file: Path, names: list[str], dataset: Mapping[str, Any]) -> p
         raise _unreadable(file, error) from None
 
 
-def _read_csv(file: Path, names: list[str], dataset: Mapping[str, Any], kind: pa.DataType) -> pa.Table:
+def _read_csv(file: Path, names: list[str], dataset: Mapping[str, Any], kind: pa.DataType, *, threads: bool = True) -> pa.Table:
     convert = pc.ConvertOptions(
         include_columns=names,
         column_types=dict.fromkeys(names, kind),
         decimal_point=str(dataset.get("decimal", ".")),
         strings_can_be_null=True,
     )
-    return pc.read_csv(file, _read_options(dataset), _parse_options(dataset), convert)
+    return pc.read_csv(file, _read_options(dataset, threads=threads), _parse_options(dataset), convert)
 
 
-def _read_options(dataset: Mapping[str, Any]) -> pc.ReadOptions:
-    return pc.ReadOptions(encoding=str(dataset.get("encoding", "utf8")), skip_rows=int(dataset.get("skip_rows", 0)))
+def _read_options(dataset: Mapping[str, Any], *, threads: bool = True) -> pc.ReadOptions:
+    return pc.ReadOptions(use_threads=threads, encoding=str(dataset.get("encoding", "utf8")), skip_rows=int(dataset.get("skip_rows", 0)))
 
 
 def _parse_options(dataset: Mapping[str, Any]) -> pc.ParseOptions:
@@ -198,12 +198,12 @@ def _point_at_text(file: Path, names: list[str], dataset: Mapping[str, Any]) -> 
     """Say where text stands in a column of numbers.
 
     Raises:
-        DataError: where it is, if that is what is wrong with the file.
+        DataError: where it is, or in which row the file cannot be read at all.
     """
     try:
-        table = _read_csv(file, names, dataset, pa.string())
-    except (OSError, pa.ArrowException, UnicodeDecodeError):
-        return
+        table = _read_csv(file, names, dataset, pa.string(), threads=False)  # on one thread, errors name their row
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise _unreadable(file, error) from None
     for name in names:
         for row, text in enumerate(table.column(name).to_pylist(), start=1):
             try:
