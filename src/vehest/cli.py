@@ -178,6 +178,7 @@ def evaluate(
     from vehest.stages.estimate import find_model
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
     from vehest.stages.group import Evaluation
+    from vehest.stages.pipeline import plain_resampling
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
@@ -185,6 +186,8 @@ def evaluate(
         split, protocol = split_from_config(config["split"]), protocol_from_config(config["evaluation"])
         if model is not None:
             trained = read_artefact(find_model(model, workshop.output))
+            if trained.stage != "train":
+                raise ConfigurationError(f"'{trained.folder}' holds no model but what the stage '{trained.stage}' made")
             rate = float(trained.config["estimator"]["rate_hz"])
         else:
             plan = _train_job(config, workshop).plan
@@ -194,7 +197,7 @@ def evaluate(
 
                 raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides or [])}' first")
             trained = found
-        data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, config)
+        data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
         job = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
         artefact = workshop.ensure(job.plan, lambda folder: write_evaluation(job, folder))
         figures = test_figures(artefact)
@@ -223,6 +226,10 @@ def estimate(
         raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
     config = _compose("estimate", overrides or [])
     fitted = load_model(find_model(model, Path(config["output"])))
+    if out.is_dir():
+        raise ConfigurationError(f"'{out}' is a folder; name a file")
+    if out.exists() and recording.exists() and out.samefile(recording):
+        raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     result = estimate_recording(fitted, read_table(recording, overrides or []), config["downsample"])
     write_estimate_table(result, out)
     _say(as_json, {"out": str(out), **summary_of(result)})
@@ -378,6 +385,10 @@ def main() -> None:
             raise
         wrapped = writing_error(Path(error.filename), error)
         _fail(str(wrapped), wrapped.exit_code)
+    except Exception as error:
+        if os.environ.get("VEHEST_DEBUG"):
+            raise
+        _fail(f"this is a defect of vehest ({type(error).__name__}: {error}); VEHEST_DEBUG=1 shows where", 1)
 
 
 def _fail(message: str, exit_code: int) -> None:
@@ -388,13 +399,13 @@ def _fail(message: str, exit_code: int) -> None:
 def _run_pipeline(
     name: str, overrides: list[str], *, dry_run: bool, force: bool, as_json: bool, quiet: bool, jobs: int | None, only_report: bool
 ) -> None:
-    from vehest.stages.pipeline import pipeline_configs, read_pipeline, run_pipeline
+    from vehest.stages.pipeline import content_overrides, pipeline_configs, read_pipeline, run_pipeline
 
     pipeline = read_pipeline(name)
     configs = pipeline_configs(pipeline, overrides)
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
     with _workshop(configs[0], force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
-        outcome = run_pipeline(pipeline, configs, workshop, only_report=only_report)
+        outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
     page = outcome.report.folder / "report.html"
     if as_json:
         rows = json.loads(outcome.leaderboard.to_json(orient="records"))
@@ -449,6 +460,8 @@ def _workshop(
     from vehest.stages.tracking import Tracker
     from vehest.stages.workshop import NotThereYet, Workshop
 
+    if not isinstance(config["output"], str) or not config["output"]:
+        raise ConfigurationError(f"output must name a folder, not {config['output']!r}")
     messages, stop, output = Messages(quiet=quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn) if track else None
     workshop = Workshop(output, messages, stop, jobs or default_jobs(), frozenset(force), dry_run, tracker)

@@ -17,8 +17,12 @@ ASIDE_PREFIX = ".writing-"
 
 
 @contextmanager
-def written_aside(path: Path) -> Iterator[Path]:
+def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]:
     """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
+
+    Args:
+        path: file or folder to write.
+        replace_folder: whether a folder that is there already may go; a file may always be replaced.
 
     Raises:
         MissingError: the disk is full or the folder cannot be written to.
@@ -28,7 +32,7 @@ def written_aside(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield aside
         _flush(aside)
-        if path.is_dir() and not path.is_symlink():
+        if replace_folder and path.is_dir() and not path.is_symlink():
             replaced = path.with_name(_aside_name("replaced"))
             os.rename(path, replaced)
             os.rename(aside, path)

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
+
+VALIDATION = "validation"
+
+
+def check_name(name: str, what: str) -> None:
+    """See that a name can be part of a file's name.
+
+    Raises:
+        ConfigurationError: it holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot.
+    """
+    if not re.fullmatch(r"[\w-][\w.-]*", name):
+        raise ConfigurationError(f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names")
 
 
 @dataclass(frozen=True, order=True)
@@ -53,6 +66,15 @@ class Split:
             raise ConfigurationError(f"split '{self.name}' has nothing to train on")
         if not self.validation:
             raise ConfigurationError(f"split '{self.name}' has nothing to validate on")
+        check_name(self.name, "split")
+        for name, spans in self.tests.items():
+            check_name(name, f"split '{self.name}': test set")
+            if name == VALIDATION:
+                raise ConfigurationError(
+                    f"split '{self.name}': a test set cannot be called '{VALIDATION}'; seeds are chosen on the validation range"
+                )
+            if not spans:
+                raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
         roles = [("train", self.train), ("validation", self.validation)]
         roles += [(f"test '{name}'", spans) for name, spans in self.tests.items()]
         for position, (role, spans) in enumerate(roles):

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from scipy import signal
 
+from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray, Recording
 
@@ -129,7 +130,7 @@ class LowPass:
 
     Args:
         cutoff_hz: -3 dB frequency of one pass [Hz].
-        channels: which channels; all of them if empty.
+        channels: which channels; all measured ones if empty, never references.
         direction: ``causal`` or ``zero_phase``.
     """
 
@@ -175,7 +176,7 @@ class RemoveOutliers:
     Args:
         half_window: samples on either side that count as neighbours.
         threshold: how many scaled median absolute deviations make an outlier.
-        channels: which channels; all of them if empty.
+        channels: which channels; all measured ones if empty, never references.
 
     Source:
         Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
@@ -266,6 +267,8 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
     Raises:
         ConfigurationError: an unknown name or argument.
     """
+    if not isinstance(config, Mapping):
+        raise ConfigurationError(f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}")
     arguments = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items() if key != "name"}
     if isinstance(arguments.get("channels"), str):
         arguments["channels"] = (arguments["channels"],)
@@ -274,7 +277,7 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
         raise ConfigurationError(f"transform '{name}' is not one of: {', '.join(TRANSFORMS)}")
     try:
         transform: Transform = TRANSFORMS[name](**arguments)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ConfigurationError(f"transform '{name}': {error}") from None
     return transform
 
@@ -288,8 +291,9 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray) -> Flo
 
 
 def _with_changed(recording: Recording, names: tuple[str, ...], change: Callable[[FloatArray], FloatArray]) -> Recording:
-    _require_no_gaps(recording, names or tuple(recording.channels))
-    changed = {name: change(recording[name]) for name in names or tuple(recording.channels)}
+    chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
+    _require_no_gaps(recording, chosen)
+    changed = {name: change(recording[name]) for name in chosen}
     return replace(recording, channels={**recording.channels, **changed})
 
 

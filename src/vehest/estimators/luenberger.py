@@ -63,6 +63,12 @@ class Luenberger(Estimator):
         started = time.monotonic()
         first = members[0]
         step = 1.0 / first.settings.rate_hz
+        for recording in (*data.train, *data.validation):
+            for name in (*cls.channels, "vy_ref"):
+                if np.isnan(recording[name]).any():
+                    raise DataError(
+                        f"recording '{recording.id}': channel '{name}' has gaps, which estimator 'luenberger' cannot learn from"
+                    )
         pairs = [(r.stack(cls.channels), r["vy_ref"]) for r in data.train]
         largest = max(float(np.abs(measurements[:, 0]).max()) for measurements, _ in pairs)
 

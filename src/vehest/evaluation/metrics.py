@@ -81,6 +81,9 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     """
     start = max(span.start, reference.start_time) + protocol.skip_seconds
     scored = reference.cut(start, span.stop)
+    for name in ("vx", "vy_ref", "ay"):
+        if np.isnan(scored[name]).any():
+            raise DataError(f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without")
     vy = estimate.held_at(scored.time, "vy")
     missing = int(np.isnan(vy).sum())
     if missing:

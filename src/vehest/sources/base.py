@@ -13,6 +13,7 @@ from typing import Any
 import vehest.sources as package
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.recording import Recording
+from vehest.data.splits import check_name
 
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept"})
 
@@ -32,6 +33,7 @@ class Source(ABC):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
         self.name = str(dataset.get("name", "unnamed"))
+        check_name(self.name, "data set")
         unknown = sorted(set(dataset) - COMMON_KEYS - self.keys)
         if unknown:
             known = ", ".join(sorted(self.keys))

@@ -63,7 +63,7 @@ class RevsSource(Source):
             start_time=clock.start_time,
             channels=channels,
             kind="real",
-            provenance={"dataset": self.name, "source": "revs", "layout": "text", "citation": self.dataset.get("citation", "")},
+            provenance={"dataset": self.name, "source": "revs", "layout": "text"},
         )
 
     def _file(self, recording_id: str, column: str) -> Path:

@@ -109,7 +109,7 @@ class TabularSource(Source):
                 channels=channels,
                 kind=self.dataset.get("kind", "real"),
                 gappy=self.gappy,
-                provenance={"dataset": self.name, "source": "tabular", "file": file.name, "citation": self.dataset.get("citation", "")},
+                provenance={"dataset": self.name, "source": "tabular", "file": file.name},
             )
         except DataError as error:
             raise DataError(f"'{file}': {error}") from None

@@ -156,7 +156,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
     """
     started = time.monotonic()
     remove_leftovers(plan.folder.parent)
-    with written_aside(plan.folder) as aside:
+    with written_aside(plan.folder, replace_folder=True) as aside:
         aside.mkdir()
         status = write(aside) or "complete"
         files = sorted(file for file in aside.rglob("*") if file.is_file())

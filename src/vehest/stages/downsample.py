@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from vehest.data.errors import DataError
 from vehest.data.store import read_recording, write_recording
 from vehest.data.transforms import Resample, Transform, transform_from_config
 from vehest.stages.artefacts import Artefact, StagePlan
@@ -47,6 +48,10 @@ def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path
     transforms = transforms_of(config)
     for name in ingested.outputs:
         recording = read_recording(ingested.folder / name)
+        if config["rate_hz"] > recording.rate_hz * (1 + 1e-9):
+            raise DataError(
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz; {config['rate_hz']:g} Hz would be more than was measured"
+            )
         for transform in transforms:
             recording = transform(recording)
         write_recording(recording, folder / name)

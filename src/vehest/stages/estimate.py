@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from vehest.data.channels import REFERENCE_SUFFIX
@@ -93,7 +94,10 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
     transforms = [Resample(rate)] if downsample is None else transforms_of({"rate_hz": rate, **downsample})
     for transform in transforms:
         needed = transform(needed)
-    return model.estimate([needed])[0]
+    estimate = model.estimate([needed])[0]
+    if np.isnan(estimate["vy"]).all():
+        raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
+    return estimate
 
 
 def write_estimate_table(estimate: Estimate, path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.data.splits import Span, Split
+from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
@@ -25,7 +25,6 @@ from vehest.stages.train import file_digest, read_fit_metrics, recording_file
 
 STAGE = "evaluate"
 METRICS = "metrics.csv"
-VALIDATION = "validation"
 TIMED_STEPS = 200
 
 COLUMNS = (
@@ -75,7 +74,10 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     Raises:
         ConfigurationError: a value that makes no sense.
     """
-    protocol = Protocol(**{key: float(value) for key, value in config.items()})
+    try:
+        protocol = Protocol(**{key: float(value) for key, value in config.items()})
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"evaluation: {dict(config)} must be numbers") from None
     if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
         raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
     return protocol
@@ -94,8 +96,17 @@ def plan_evaluate(
 
     Raises:
         DataError: the split names a recording that the data set does not have.
+        ConfigurationError: a test range was used for training.
     """
     estimator = str(read_description(model.folder)["estimator"])
+    for name, spans in split.tests.items():
+        for span in spans:
+            for learnt in learnt_spans(model):
+                if span.overlaps(learnt):
+                    raise ConfigurationError(
+                        f"test set '{name}' shares samples with what {model.label} was trained or chosen on ({learnt.describe()}); "
+                        f"test it on something else"
+                    )
     inputs = {"model": model.digest}
     for span in scored_spans(split):
         inputs[f"{span.dataset}/{span.recording}"] = file_digest(data[span.dataset], span)
@@ -115,7 +126,8 @@ def plan_evaluate(
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     """Estimate and score every range; write estimates and metrics into ``folder``."""
     estimator = load_model(job.model.folder)
-    seed = int(read_description(job.model.folder)["about"]["seed"])
+    about = read_description(job.model.folder)["about"]
+    seed = int(about["seed"])
     fit = read_fit_metrics(job.model.folder)
     rows: list[tuple[Any, ...]] = []
     for name, spans in test_sets(job.split).items():
@@ -126,7 +138,7 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         if name != VALIDATION:
             figures |= {key: fit[key] for key in ("n_parameters", "epochs", "train_seconds")}
             figures["step_seconds"] = _step_seconds(estimator, _measured(job, spans[0]))
-        trained_on = "+".join(dict.fromkeys(span.dataset for span in job.split.train))
+        trained_on = "+".join(about["datasets"])
         datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
         kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
         mode = "causal" if estimator.causal else "offline"
@@ -136,6 +148,12 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(COLUMNS)
         writer.writerows(rows)
+
+
+def learnt_spans(model: Artefact) -> list[Span]:
+    """The ranges that a model was trained on and stopped on."""
+    entries = [*model.config["train"], *model.config["validation"]]
+    return [Span(entry["dataset"], entry["recording"], float(entry["start"]), float(entry["stop"])) for entry in entries]
 
 
 def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:

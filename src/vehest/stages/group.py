@@ -84,6 +84,9 @@ def is_finished(group: Group, member: Member) -> bool:
 def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
     """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted."""
     models = {member.job.plan.key: member.model for member in existing(group)}
+    if "train" in group.force:
+        for job in group.jobs:
+            drop_checkpoint(job.plan.checkpoint_folder)
     for jobs in _together([job for job in group.jobs if models[job.plan.key] is None]):
         if should_stop():
             break

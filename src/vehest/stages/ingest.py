@@ -17,6 +17,7 @@ from vehest.stages.code_version import code_version
 from vehest.stages.config import Config, missing_keys
 
 STAGE = "ingest"
+PROSE = frozenset({"path", "title", "licence", "citation"})  # of a data set's configuration; says nothing about its samples
 
 
 def plan_ingest(config: Config) -> StagePlan:
@@ -40,7 +41,7 @@ def plan_ingest(config: Config) -> StagePlan:
     return StagePlan(
         stage=STAGE,
         label=source.name,
-        config={key: value for key, value in dataset.items() if key != "path"},
+        config={key: value for key, value in dataset.items() if key not in PROSE},
         inputs=inputs,
         code=code_version([source_module(dataset), "vehest.data.store", "vehest.data.checks"], own=[__name__]),
         output=Path(config["output"]),

@@ -13,7 +13,7 @@ import pandas as pd
 import yaml
 
 from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
-from vehest.data.splits import split_from_config
+from vehest.data.splits import check_name, split_from_config
 from vehest.stages.artefacts import Artefact
 from vehest.stages.config import Config, compose_config, expand, has_key, key_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
@@ -21,7 +21,7 @@ from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.group import Evaluation, Group, existing, is_finished
 from vehest.stages.report import ReportJob, leaderboard_of, plan_report, publish, write_report
 from vehest.stages.tracking import Tracker
-from vehest.stages.train import TrainJob, plan_train
+from vehest.stages.train import TrainJob, new_estimator, plan_train
 from vehest.stages.workshop import Workshop
 
 KEYS = {"study", "title", "about", "report", "split", "sweeps", "evaluation", "publish"}
@@ -94,6 +94,7 @@ def read_pipeline(name: str) -> Pipeline:
         raise ConfigurationError(f"'{file}': sweeps must be a list of lists of overrides")
     if importlib.util.find_spec(f"vehest.studies.{content['report']}") is None:
         raise ConfigurationError(f"'{file}': there is no study module '{content['report']}' in vehest.studies")
+    check_name(str(content["study"]), f"'{file}': study")
     return Pipeline(
         study=str(content["study"]),
         title=str(content.get("title", content["study"])),
@@ -145,17 +146,25 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
     return configs
 
 
+def content_overrides(overrides: Sequence[str]) -> list[str]:
+    """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
+    return [override for override in overrides if key_of(override).split(".")[0] not in {"root", "output", "tracking"}]
+
+
 def compose_seed(override: str) -> Any:
     """The value of ``seed=…``."""
     return yaml.safe_load(override.split("=", 1)[1])
 
 
-def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Workshop, *, only_report: bool = False) -> PipelineOutcome:
-    """Run every stage of a pipeline; what is there is skipped.
+def run_pipeline(
+    pipeline: Pipeline, configs: Sequence[Config], overrides: Sequence[str], workshop: Workshop, *, only_report: bool = False
+) -> PipelineOutcome:
+    """Run every stage of a pipeline; what is there is skipped. What overrides changed is not published in results/.
 
     Args:
         pipeline: the study.
         configs: its jobs, from `pipeline_configs`.
+        overrides: what changed them, apart from where data come from, where results go and tracking.
         workshop: where stages run.
         only_report: draw the report from what is there, train and evaluate nothing.
 
@@ -192,7 +201,7 @@ def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Worksh
         study=pipeline.study,
         title=pipeline.title,
         about=pipeline.about,
-        command=f"vehest run pipelines/{pipeline.file.name}",
+        command=" ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides]),
         module=pipeline.report,
         members=members,
         evaluation=evaluation,
@@ -201,7 +210,7 @@ def run_pipeline(pipeline: Pipeline, configs: Sequence[Config], workshop: Worksh
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
     published = None
-    if pipeline.publish and not workshop.dry_run:
+    if pipeline.publish and not workshop.dry_run and not overrides:
         published = Path("results") / pipeline.study
         if publish(report, published):
             workshop.messages.line("done", "publish", str(published))
@@ -212,12 +221,22 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
     """Jobs that fit one batch, with the data they need, which is made on the way."""
     groups: dict[tuple[Any, ...], list[TrainJob]] = {}
     evaluations: dict[tuple[Any, ...], Evaluation] = {}
+    labels: dict[str, str] = {}
     for config in configs:
+        for key in ("split", "evaluation", "downsample"):
+            if config[key] != configs[0][key]:
+                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
         split = split_from_config(config["split"])
+        if not any(split.tests.values()):
+            raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
         protocol = protocol_from_config(config["evaluation"])
-        data = workshop.data_for(split, float(config["estimator"]["rate_hz"]), config)
-        references = workshop.data_for(split, protocol.rate_hz, config)
+        data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
+        references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
         job = plan_train(config, split, data)
+        if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
+            raise ConfigurationError(
+                f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
+            )
         groups.setdefault(job.group, []).append(job)
         evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
     return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
@@ -233,6 +252,11 @@ def _resampling_fact(configs: Sequence[Config]) -> str:
     }[options["method"]]
     first = f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
     return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
+
+
+def plain_resampling(config: Config) -> Config:
+    """The configuration for references: resampled like everything, but never filtered further."""
+    return {**config, "downsample": {**config["downsample"], "transforms": []}}
 
 
 def _training_facts(configs: Sequence[Config]) -> list[str]:

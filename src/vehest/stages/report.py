@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from vehest.data.errors import ConfigurationError
 from vehest.data.files import sha256_of, written_aside
 from vehest.estimators.registry import estimator_class
 from vehest.stages.artefacts import MANIFEST, Artefact, StagePlan, provenance
@@ -135,13 +136,16 @@ def publish(report: Artefact, folder: Path) -> bool:
 
     Raises:
         MissingError: it cannot be written.
+        ConfigurationError: the folder holds something else.
     """
     wanted = {name: digest for name, digest in report.outputs.items() if name not in {PAGE, MANIFEST}}
     if folder.is_dir():
         present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
         if present == wanted:
             return False
-    with written_aside(folder) as aside:
+        if present and PROVENANCE not in present:
+            raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
+    with written_aside(folder, replace_folder=True) as aside:
         for name in wanted:
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(report.folder / name, aside / name)

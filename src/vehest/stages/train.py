@@ -76,8 +76,8 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
     estimator = new_estimator(config["estimator"])
     settings_from_config(estimator.training_type, config["training"], "training")
     seed = config["seed"]
-    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
-        raise ConfigurationError(f"seed must be a whole number from 0, not {seed!r}")
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
+        raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {seed!r}")
     spans = [*split.train, *split.validation]
     inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in spans}
     plan = StagePlan(

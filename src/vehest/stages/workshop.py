@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -13,13 +14,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.data.splits import Split
+from vehest.data.splits import VALIDATION, Split
 from vehest.estimators.model_files import read_description
 from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
 from vehest.stages.config import Config, compose_config
 from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
-from vehest.stages.evaluate import METRICS, VALIDATION, read_scored
+from vehest.stages.evaluate import METRICS, read_scored
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished, run_group
 from vehest.stages.ingest import plan_ingest, write_ingest
 from vehest.stages.launcher import Failure, Task, launch
@@ -223,6 +224,6 @@ def _trace_figure(evaluation: Artefact, model: Artefact, how: Evaluation, test_s
 
 
 def _quoted(text: Any) -> str:
-    """A value as Hydra's grammar reads it back, whatever characters it has."""
-    escaped = str(text).replace("\\", "\\\\").replace("'", "\\'")
+    """A value as Hydra's grammar reads it back: only quotes, and backslashes before them, are escaped."""
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), str(text))
     return f"'{escaped}'"

@@ -13,6 +13,8 @@ from vehest.data.recording import FloatArray
 from vehest.training.context import FitContext, Progress
 from vehest.training.settings import DirectSearchSettings
 
+FIRST_STEP = 0.05
+
 
 @dataclass(frozen=True)
 class SearchRecord:
@@ -66,7 +68,14 @@ def nelder_mead_over_grid(
             np.array(start) / scale,
             method="Nelder-Mead",
             bounds=[(low / s, high / s) for (low, high), s in zip(box, scale, strict=True)],
-            options={"maxfev": settings.max_evaluations, "xatol": settings.tolerance, "fatol": 1e-12},
+            options={
+                "maxfev": settings.max_evaluations,
+                "xatol": settings.tolerance,
+                "fatol": 1e-12,
+                "initial_simplex": _simplex(
+                    np.array(start) / scale, [(low / s, high / s) for (low, high), s in zip(box, scale, strict=True)]
+                ),
+            },
         )
         evaluations += result.nfev
         rows.append(np.concatenate([start, result.x * scale, [result.fun]]))
@@ -75,3 +84,12 @@ def nelder_mead_over_grid(
     best = table[np.argmin(table[:, -1])]
     n = len(box)
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
+
+
+def _simplex(start: FloatArray, box: Sequence[tuple[float, float]]) -> FloatArray:
+    """A start and a step of 5 % of the box along each parameter, inwards where it would leave the box."""
+    vertices = np.tile(start, (len(start) + 1, 1))
+    for k, (low, high) in enumerate(box):
+        step = FIRST_STEP * (high - low)
+        vertices[k + 1, k] += step if start[k] + step <= high else -step
+    return vertices

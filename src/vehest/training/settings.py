@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, TypeVar
@@ -91,11 +92,11 @@ def _converted(name: str, value: Any, type_name: str) -> Any:
             raise ConfigurationError(f"{name} must be true or false, not {value!r}")
         return value
     if type_name == "int":
-        if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value != int(value):
             raise ConfigurationError(f"{name} must be a whole number, not {value!r}")
         return int(value)
     if type_name == "float":
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ConfigurationError(f"{name} must be a number, not {value!r}")
         return float(value)
     return value
