@@ -513,9 +513,16 @@ def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(pla
     assert not any(ASIDE_PREFIX in name for name in place.files())
     reached = _checkpoint_epoch(place)
     process = _start(place, "train", *LONG)
-    _wait_for(process, lambda: _checkpoint_epoch(place) > reached)
+    seen = [reached]
+
+    def went_on() -> bool:
+        seen.append(_checkpoint_epoch(place))
+        return seen[-1] > reached
+
+    _wait_for(process, went_on)
     process.kill()
     process.communicate()
+    assert min(seen) == reached, "it must go on from the checkpoint, not from the start"
 
 
 def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place):

@@ -17,7 +17,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model as _load_model
-from vehest.stages.estimate import estimate_recording, find_model, read_table, write_estimate_table
+from vehest.stages.estimate import estimate_recording, find_model, preparation_of, read_table, write_estimate_table
 
 __all__ = ["Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate"]
 
@@ -33,7 +33,10 @@ def load_model(model: str | Path, output: str | Path | None = None) -> Estimator
         MissingError: there is no such model.
         DataError: its files are damaged.
     """
-    return _load_model(find_model(str(model), Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))))
+    folder = find_model(str(model), Path(output or os.environ.get("VEHEST_OUTPUT", "outputs")))
+    estimator = _load_model(folder)
+    estimator.preparation = preparation_of(folder)
+    return estimator
 
 
 def read_recording(path: str | Path, overrides: Sequence[str] = ()) -> Recording:
@@ -51,7 +54,7 @@ def read_recording(path: str | Path, overrides: Sequence[str] = ()) -> Recording
 
 
 def estimate(model: Estimator, recording: Recording) -> Estimate:
-    """Run a model on a recording, resampled to the model's rate.
+    """Run a model on a recording, brought to the model's rate in the way it was trained with.
 
     Returns:
         ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet.
@@ -59,7 +62,7 @@ def estimate(model: Estimator, recording: Recording) -> Estimate:
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    return estimate_recording(model, recording)
+    return estimate_recording(model, recording, dict(model.preparation))
 
 
 def write_estimate(estimate: Estimate, path: str | Path) -> None:

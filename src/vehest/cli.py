@@ -175,7 +175,7 @@ def evaluate(
     """
     from vehest.data.splits import split_from_config
     from vehest.stages.artefacts import find, read_artefact
-    from vehest.stages.estimate import find_model
+    from vehest.stages.estimate import find_model, preparation_of
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
     from vehest.stages.group import Evaluation
     from vehest.stages.pipeline import plain_resampling
@@ -189,6 +189,8 @@ def evaluate(
             if trained.stage != "train":
                 raise ConfigurationError(f"'{trained.folder}' holds no model but what the stage '{trained.stage}' made")
             rate = float(trained.config["estimator"]["rate_hz"])
+            if not _names("downsample", overrides):
+                config["downsample"] = preparation_of(trained.folder)
         else:
             plan = _train_job(config, workshop).plan
             found, rate = find(plan), float(config["estimator"]["rate_hz"])
@@ -220,17 +222,27 @@ def estimate(
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
     from vehest.estimators.model_files import load_model
-    from vehest.stages.estimate import SUFFIXES, estimate_recording, find_model, read_table, summary_of, write_estimate_table
+    from vehest.stages.estimate import (
+        SUFFIXES,
+        estimate_recording,
+        find_model,
+        preparation_of,
+        read_table,
+        summary_of,
+        write_estimate_table,
+    )
 
     if out.suffix.lower() not in SUFFIXES:
         raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
     config = _compose("estimate", overrides or [])
-    fitted = load_model(find_model(model, Path(config["output"])))
+    folder = find_model(model, Path(config["output"]))
+    fitted = load_model(folder)
+    downsample = config["downsample"] if _names("downsample", overrides) else preparation_of(folder)
     if out.is_dir():
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and recording.exists() and out.samefile(recording):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
-    result = estimate_recording(fitted, read_table(recording, overrides or []), config["downsample"])
+    result = estimate_recording(fitted, read_table(recording, overrides or []), downsample)
     write_estimate_table(result, out)
     _say(as_json, {"out": str(out), **summary_of(result)})
 
@@ -439,6 +451,11 @@ def _compose(command: str, overrides: list[str]) -> Config:
     from vehest.stages.config import compose_config
 
     return compose_config(command, overrides)
+
+
+def _names(group: str, overrides: list[str] | None) -> bool:
+    """Whether any override is about a group."""
+    return any(override.lstrip("+~").startswith((f"{group}.", f"{group}=")) for override in overrides or [])
 
 
 def _train_job(config: Config, workshop: Workshop) -> Any:

@@ -82,6 +82,7 @@ class Estimator(ABC):
         settings_type: dataclass of its settings.
         training_type: dataclass of the settings of its fit.
         causal: whether an estimate uses measurements up to its own time only.
+        preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
 
     name: ClassVar[str]
@@ -93,6 +94,7 @@ class Estimator(ABC):
 
     def __init__(self, settings: EstimatorSettings) -> None:
         self.settings = settings
+        self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:

@@ -13,7 +13,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 
 def code_version(modules: Iterable[str], *, own: Iterable[str] = (), files: Iterable[str] = ()) -> str:
-    """Hash of modules and of every vehest module that they import, directly or not.
+    """Hash of modules and of every module of vehest (or of their own package) that they import, directly or not.
 
     Comments, docstrings and layout do not count: only what is executed does.
 
@@ -44,31 +44,41 @@ def _module(name: str) -> tuple[str, tuple[str, ...]]:
     if path is None:
         return "absent", ()
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    imported = _imports(tree)
+    imported = _imports(tree, name)
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node) is not None:
             node.body = node.body[1:]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest(), imported
 
 
-def _imports(tree: ast.AST) -> tuple[str, ...]:
+def _imports(tree: ast.AST, name: str) -> tuple[str, ...]:
+    """Modules of vehest, and of the package that the module itself belongs to."""
+    followed = {"vehest", name.split(".")[0]}
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names.update(alias.name for alias in node.names if alias.name.startswith("vehest."))
-        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "vehest":
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = (
+                ".".join([*name.split(".")[: -node.level or None], *([node.module] if node.module else [])])
+                if node.level
+                else str(node.module)
+            )
             for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                names.add(inner if _file_of(inner) else node.module)
-    return tuple(sorted(names - {"vehest"}))
+                inner = f"{base}.{alias.name}"
+                names.add(inner if base.split(".")[0] in followed and _file_of(inner) else base)
+    return tuple(sorted(found for found in names if found.split(".")[0] in followed and found != "vehest"))
 
 
 @cache
 def _file_of(name: str) -> Path | None:
     parts = name.split(".")
     if parts[0] != "vehest":  # an estimator from another package
-        spec = importlib.util.find_spec(name)
-        return Path(spec.origin) if spec and spec.origin else None
+        try:
+            spec = importlib.util.find_spec(name)
+        except (ImportError, AttributeError, ValueError):  # not a module but a name in one
+            return None
+        return Path(spec.origin) if spec and spec.origin and spec.origin.endswith(".py") else None
     base = _ROOT.joinpath(*parts[1:])
     for path in (base.with_suffix(".py"), base / "__init__.py"):
         if path.is_file():

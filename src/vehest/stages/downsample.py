@@ -50,7 +50,7 @@ def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path
         recording = read_recording(ingested.folder / name)
         if config["rate_hz"] > recording.rate_hz * (1 + 1e-9):
             raise DataError(
-                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz; {config['rate_hz']:g} Hz would be more than was measured"
+                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {config['rate_hz']:g} Hz asked for"
             )
         for transform in transforms:
             recording = transform(recording)

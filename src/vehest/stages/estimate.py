@@ -17,8 +17,8 @@ from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
-from vehest.data.transforms import Resample
 from vehest.estimators.base import Estimator
+from vehest.estimators.model_files import read_description
 from vehest.sources.tabular import TabularSource
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
@@ -69,13 +69,13 @@ def read_table(path: Path, overrides: Sequence[str] = ()) -> Recording:
     return recording
 
 
-def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any] | None = None) -> Estimate:
+def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any]) -> Estimate:
     """Bring a recording to the model's rate and run the model on it.
 
     Args:
         model: fitted.
         recording: with the channels that the model reads, at any rate from the model's upwards.
-        downsample: ``downsample`` of the configuration; anti-aliased resampling by default.
+        downsample: method and transforms, as in `preparation_of`.
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
@@ -91,8 +91,7 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
         raise DataError(
             f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate:g} Hz that '{model.name}' works at"
         )
-    transforms = [Resample(rate)] if downsample is None else transforms_of({"rate_hz": rate, **downsample})
-    for transform in transforms:
+    for transform in transforms_of({"rate_hz": rate, **downsample}):
         needed = transform(needed)
     estimate = model.estimate([needed])[0]
     if np.isnan(estimate["vy"]).all():
@@ -115,6 +114,12 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
     frame = pd.DataFrame({"time": estimate.time, **estimate.channels})
     with written_aside(path) as aside:
         frame.to_csv(aside, index=False, lineterminator="\n")
+
+
+def preparation_of(model_folder: Path) -> dict[str, Any]:
+    """How a model's recordings were brought to its rate when it was trained; a new one must be prepared the same way."""
+    about = read_description(model_folder).get("about") or {}
+    return dict(about.get("downsample") or {"method": "polyphase", "transforms": []})
 
 
 def summary_of(estimate: Estimate) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from vehest.stages.group import Evaluation, Group, existing, is_finished
 from vehest.stages.report import ReportJob, leaderboard_of, plan_report, publish, write_report
 from vehest.stages.tracking import Tracker
 from vehest.stages.train import TrainJob, new_estimator, plan_train
-from vehest.stages.workshop import Workshop
+from vehest.stages.workshop import NotThereYet, Workshop
 
 KEYS = {"study", "title", "about", "report", "split", "sweeps", "evaluation", "publish"}
 
@@ -177,7 +177,14 @@ def run_pipeline(
     first = configs[0]
     workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn)
     workshop.tags = {"vehest.study": pipeline.study}
-    groups = _groups(configs, workshop)
+    try:
+        groups = _groups(configs, workshop)
+    except NotThereYet:
+        for config in configs:
+            estimator = new_estimator(config["estimator"])
+            workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
+        workshop.messages.line("plan", "report", pipeline.study)
+        raise
     if only_report:
         for group in groups:
             for member in existing(group):

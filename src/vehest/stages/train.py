@@ -125,6 +125,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         "validated_on": [span.describe() for span in job.split.validation],
         "datasets": list(dict.fromkeys(span.dataset for span in job.split.train)),
         "n_parameters": estimator.n_parameters,
+        "downsample": _preparation(job),
         "interrupted": record.interrupted,
     }
     save_model(estimator, folder, about)
@@ -132,6 +133,12 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         _write_csv(folder / HISTORY, list(record.history), zip(*record.history.values(), strict=True))
     metrics = {**record.metrics, "n_parameters": estimator.n_parameters}
     _write_csv(folder / FIT_METRICS, ["metric", "value"], metrics.items())
+
+
+def _preparation(job: TrainJob) -> dict[str, Any]:
+    """How the recordings were brought to the estimator's rate, as ``downsample`` of the configuration says it."""
+    config = job.data[job.split.train[0].dataset].config
+    return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
 
 
 def read_fit_metrics(folder: Path) -> dict[str, float]:

@@ -121,8 +121,8 @@ class Workshop:
                 waiting.append(Group(missing, group.evaluation, group.force))
         if self.dry_run and waiting:
             for group in waiting:
-                stages = "train and evaluate" if group.evaluation else "train"
-                self.messages.line("plan", stages, group.name)
+                for job in group.jobs:
+                    self.messages.line("plan", "train", job.plan.label, "then evaluate" if group.evaluation else "")
             raise NotThereYet
         failures: list[tuple[str, Failure]] = []
         tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
