@@ -442,6 +442,133 @@ def test_truncated_artefact_is_made_again(place):
     assert weights.read_bytes() == whole
 
 
+# --- what must not happen by accident -----------------------------------------------------------------------------
+
+
+def test_only_the_study_as_it_is_written_is_published(place):
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True}))
+    results = place.folder / "results" / "small"
+    assert place("run", "small", "--jobs", "1", "tracking=none", "training.max_epochs=1")[0] == 0
+    assert not results.exists(), "overrides changed the outcome"
+    assert place("run", "small", "--jobs", "1", "tracking=none")[0] == 0
+    assert (results / "metrics.csv").is_file()
+    assert not (results / "report.html").exists()
+    text = (results / "report.md").read_text()
+    assert "`vehest run pipelines/small.yaml`" in text
+    assert str(place.folder) not in text + (results / "provenance.json").read_text()
+    (results / "metrics.csv").unlink()
+    (results / "provenance.json").unlink()
+    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 2
+    assert "holds files that vehest did not publish" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"study": "../elsewhere"}, "becomes part of file names"),
+        ({"study": ""}, "becomes part of file names"),
+        ({"sweeps": [["estimator=gru"], ["estimator=lstm", "evaluation.rate_hz=10"]]}, "must agree in 'evaluation'"),
+        ({"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]}, "two jobs are both called gru-states_5-seed0"),
+    ],
+)
+def test_pipelines_that_would_mix_or_lose_results_are_refused(place, change, message):
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, **change}))
+    code, line = place.refused("run", "small", "tracking=none")
+    assert code == 2
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("tests", "message"),
+    [
+        ({"validation": [{"recording": "three"}]}, "a test set cannot be called 'validation'"),
+        ({"../x": [{"recording": "three"}]}, "becomes part of file names"),
+        ({"t": []}, "test set 't' is empty"),
+    ],
+)
+def test_splits_that_would_mix_test_and_validation_are_refused(place, tests, message):
+    file = place.folder / "conf" / "split" / "mine.yaml"
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "tests": tests}))
+    code, line = place.refused("train", "split=mine", "tracking=none")
+    assert code == 2
+    assert message in line
+
+
+def test_a_model_is_not_tested_on_what_it_learnt_from(place):
+    model = json.loads(place("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
+    swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
+    code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
+    assert code == 2
+    assert "shares samples with what" in line
+
+
+def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
+    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    drive = planar_drive(10.0, 100.0).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    Path("parts.parquet").mkdir()
+    Path("parts.parquet/part").write_text("keep")
+    assert "is a folder" in place.refused("estimate", "luenberger", "lap.csv", "-o", "parts.parquet")[1]
+    assert Path("parts.parquet/part").read_text() == "keep"
+    assert "is the recording itself" in place.refused("estimate", "luenberger", "lap.csv", "-o", "lap.csv")[1]
+
+
+def test_a_model_remembers_how_its_recordings_were_prepared(place):
+    arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
+    filtered = (*arguments, "downsample.transforms=[{name: low_pass, cutoff_hz: 0.3}]")
+    model = json.loads(place("train", *filtered, "--json")[1])["model"]
+    by_overrides = json.loads(place("eval", *filtered, "--json")[1])
+    by_name = json.loads(place("eval", "--model", model, *arguments, "--json")[1])
+    assert by_name["folder"] == by_overrides["folder"]
+    unfiltered = json.loads(place("eval", "--model", model, *arguments, "downsample.transforms=[]", "--json")[1])
+    assert unfiltered["rmse_sideslip.test"] != by_name["rmse_sideslip.test"]
+    references = {json.dumps(read_artefact(Path(outcome["folder"])).inputs["reference of mine/three"]) for outcome in (by_name, unfiltered)}
+    assert len(references) == 1, "what is scored against is never filtered"
+
+
+def test_force_trains_from_the_start_again(place):
+    process = _start(place, "train", *LONG)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 5)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert _checkpoint_epoch(place) >= 5
+    process = _start(place, "train", *LONG, "--force")
+    seen: list[int] = []
+
+    def started_anew() -> bool:
+        seen.append(_checkpoint_epoch(place))
+        return seen[-1] in (1, 2)
+
+    _wait_for(process, started_anew)
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "output=null"),
+        ("train", "output=''"),
+        ("train", "seed=-1"),
+        ("train", "seed=1.5"),
+        ("train", "training.max_epochs=.inf"),
+        ("train", "estimator.rate_hz=abc"),
+        ("train", "estimator.rate_hz=200"),
+        ("train", "downsample.transforms=[1]"),
+        ("run", "small", "evaluation.rate_hz=abc"),
+        ("run", "small", "split=quickstart"),
+        ("downsample", "mine"),
+    ],
+)
+def test_odd_values_are_refused_in_one_line(place, arguments):
+    split = ("split=mine", "tracking=none") if arguments[0] == "train" else ()
+    code, line = place.refused(*arguments, *split)
+    assert code in (2, 3), line
+    assert "defect" not in line
+    assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
+
+
 # --- code versions ---------------------------------------------------------------------------------------------------
 
 
@@ -458,6 +585,23 @@ def test_code_version_ignores_comments_and_docstrings_and_sees_code(tmp_path, mo
     assert version('"""Other."""\n# comment\n\ndef f(x):\n    """Longer doc."""\n\n    return x + 1\n') == first
     assert version('"""Doc."""\n\ndef f(x):\n    return x + 2\n') != first
     code_version._module.cache_clear()
+
+
+def test_code_version_follows_the_package_of_a_plug_in(tmp_path, monkeypatch):
+    (tmp_path / "plug").mkdir()
+    (tmp_path / "plug" / "__init__.py").write_text("")
+    (tmp_path / "plug" / "own.py").write_text("from .core import f\nfrom plug import other\n")
+    (tmp_path / "plug" / "other.py").write_text("y = 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    versions = set()
+    for core in ("def f(): return 1\n", "def f(): return 2\n"):
+        (tmp_path / "plug" / "core.py").write_text(core)
+        code_version._module.cache_clear()
+        code_version._file_of.cache_clear()
+        versions.add(code_version.code_version(["plug.own"]))
+    assert len(versions) == 2
+    code_version._module.cache_clear()
+    code_version._file_of.cache_clear()
 
 
 def test_code_of_one_estimator_does_not_concern_another():
