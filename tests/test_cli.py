@@ -153,6 +153,8 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     assert place.files() == made
 
     (place.folder / "README.md").write_text("changed")
+    dataset = {**DATASET, "citation": "somebody else", "licence": "another"}
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
     _, _, err = place("run", "small", "tracking=none", "--dry-run")
     assert {status for status, _ in _statuses(err)} == {"skipped"}
 

@@ -53,12 +53,20 @@ def test_a_failure_keeps_the_old_file(tmp_path: Path) -> None:
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"file": "old"}
 
 
-def test_a_folder_is_replaced_as_a_whole(tmp_path: Path) -> None:
+def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path: Path) -> None:
     for content in ("one", "two"):
-        with written_aside(tmp_path / "folder") as aside:
+        with written_aside(tmp_path / "folder", replace_folder=True) as aside:
             aside.mkdir()
             (aside / content).write_text(content)
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/two"]
+
+
+def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "old").write_text("old")
+    with pytest.raises(MissingError, match="cannot write"), written_aside(tmp_path / "folder") as aside:
+        aside.write_text("new")
+    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 
 def test_a_failure_keeps_the_old_folder(tmp_path: Path) -> None:

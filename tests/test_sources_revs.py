@@ -61,7 +61,7 @@ def test_a_folder_of_text_files_is_a_recording(folder: Path) -> None:
     assert recording.start_time == 149.99
     np.testing.assert_array_equal(recording["vx"], [float(line) for line in (folder / "lap" / "vx.txt").read_text().split()])
     np.testing.assert_allclose(recording["ay"], -9.80665 * np.linspace(-1, 1, N))
-    assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text", "citation": "me"}
+    assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
 
 
 def test_inputs_are_the_files_that_are_read(folder: Path) -> None:
