@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -268,8 +268,16 @@ BAD_TABLES = {
 }
 
 
+@pytest.fixture(params=[1, 4])
+def processors(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = pa.cpu_count()
+    pa.set_cpu_count(request.param)
+    yield request.param
+    pa.set_cpu_count(before)
+
+
 @pytest.mark.parametrize("fault", BAD_TABLES)
-def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path: Path, fault: str) -> None:
+def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path: Path, fault: str, processors: int) -> None:
     content, said = BAD_TABLES[fault]
     file = written(tmp_path, content)
     columns = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ay", "unit": "m/s²"}}

@@ -161,7 +161,7 @@ def _column_names(file: Path, dataset: Mapping[str, Any]) -> list[str]:
     try:
         if _is_parquet(file):
             return list(pq.read_schema(file).names)
-        with pc.open_csv(file, read_options=_read_options(dataset), parse_options=_parse_options(dataset)) as reader:
+        with pc.open_csv(file, read_options=_read_options(dataset, threads=False), parse_options=_parse_options(dataset)) as reader:
             return list(reader.schema.names)
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise _unreadable(file, error) from None
