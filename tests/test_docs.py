@@ -282,10 +282,12 @@ def test_citation_names_four_papers():
 def test_pages_know_every_name():
     data, estimators, cli = page("docs/data.md"), page("docs/estimators.md"), page("docs/cli.md")
     for source in source_names():
-        assert f"### `{source}`" in data
-    keys = {key for source in source_names() for key in class_of(source).keys} | set(COMMON_KEYS)
+        own = page(f"docs/sources/{source}.md")
+        assert f"(sources/{source}.md)" in data
+        for name in class_of(source).keys:
+            assert f"`{name}`" in own, f"docs/sources/{source}.md does not explain {name}"
     named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated"}
-    for name in keys | set(TRANSFORMS) | named_checks:
+    for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
         assert f"`{name}`" in data, f"docs/data.md does not explain {name}"
     for name in {*estimator_names(), *UNITS}:
         assert f"`{name}`" in estimators, f"docs/estimators.md does not explain {name}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -349,3 +350,76 @@ def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path: Path, 
     message = refusal(lambda: source(tmp_path, **options), ConfigurationError)
     assert said in message
     assert "data set 'mine'" in message
+
+
+# --- several runs in a table -----------------------------------------------------------------------------------------------------------
+
+
+def runs_csv(tmp_path: Path, runs: list[object]) -> Path:
+    """A row a run number, 100 Hz, vx counting the rows."""
+    lines = [f"{row / 100:.2f},{row},{run}" for row, run in enumerate(runs)]
+    return written(tmp_path, "time,vx,run_id\n" + "\n".join(lines) + "\n")
+
+
+def source_of(file: Path, **options: Any) -> TabularSource:
+    return TabularSource({"name": "mine", "path": str(file.parent), "time": TIME, "runs": "run_id", **options})
+
+
+def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None:
+    source = source_of(runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10))
+    assert source.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
+    recordings = list(source.recordings())
+    assert [recording.start_time for recording in recordings] == [0.0, 0.2, 0.5]
+    np.testing.assert_array_equal(np.concatenate([recording["vx"] for recording in recordings]), np.arange(60))
+    assert recordings[1].provenance["run"] == 3
+
+
+def test_time_may_jump_between_runs_but_not_within_one(tmp_path: Path) -> None:
+    file = written(
+        tmp_path, "time,vx,run_id\n" + "".join(f"{t:.2f},1,{run}\n" for run, t0 in ((0, 5.0), (1, 0.0)) for t in t0 + np.arange(9) / 100)
+    )
+    assert [recording.start_time for recording in source_of(file).recordings()] == [5.0, 0.0]
+    gap = written(tmp_path, "time,vx,run_id\n" + "".join(f"{t:.2f},1,{run}\n" for run in (0, 1) for t in (0.0, 0.01, 0.02, 0.5, 0.51)))
+    message = refusal(lambda: source_of(gap).read("lap_run_1"))
+    assert f"'{gap}', run 1" in message
+    assert "1 gaps" in message
+
+
+@pytest.mark.parametrize(
+    ("runs", "said"),
+    [
+        ([1, 1, 2, 2, 1, 1], "run 1 begins again in data row 5"),
+        ([1, 1, 1.5, 1.5], "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers"),
+        ([1, 1, "", ""], "column 'run_id' holds nan in data row 3"),
+        ([1, 1, "two"], "column 'run_id' holds the text 'two' in data row 3"),
+    ],
+)
+def test_runs_that_cannot_be_told_apart_are_refused(tmp_path: Path, runs: list[object], said: str) -> None:
+    file = runs_csv(tmp_path, runs)
+    message = refusal(lambda: source_of(file).ids())
+    assert f"'{file}'" in message
+    assert said in message
+
+
+def test_a_table_without_the_column_of_runs_is_refused(tmp_path: Path) -> None:
+    message = refusal(lambda: source_of(runs_csv(tmp_path, [0, 0]), runs="lap").ids())
+    assert "no column 'lap' that counts its runs (it has time, vx, run_id)" in message
+
+
+def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
+    assert len(source_of(runs_csv(tmp_path, [4] * 9)).read_file(tmp_path / "lap.csv")) == 9
+    message = refusal(lambda: source_of(runs_csv(tmp_path, [4] * 9 + [5] * 9)).read_file(tmp_path / "lap.csv"))
+    assert "holds 2 runs (4, 5); keep the rows of one" in message
+
+
+def test_a_factor_brings_a_column_to_its_declared_unit(tmp_path: Path) -> None:
+    file = written(tmp_path, "time,rim\n" + "".join(f"{row / 100:.2f},{row}\n" for row in range(9)))
+    columns = {"motor_speed": {"column": "rim", "factor": 20.0, "unit": "rad/s"}}
+    np.testing.assert_array_equal(read(file, channels=columns)["motor_speed"], 20.0 * np.arange(9))
+
+
+@pytest.mark.parametrize("factor", [0, float("nan"), "two", True])
+def test_a_factor_is_a_number_other_than_nought(tmp_path: Path, factor: object) -> None:
+    columns = {"vx": {"column": "vx", "factor": factor, "unit": "m/s"}}
+    with pytest.raises(ConfigurationError, match="factor must be a number other than 0"):
+        TabularSource({"name": "mine", "path": str(tmp_path), "time": TIME, "channels": columns})

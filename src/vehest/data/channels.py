@@ -24,6 +24,7 @@ class Channel:
         meaning: what is measured, with its sign convention.
         low: smallest value that a road vehicle can produce [unit].
         high: largest value that a road vehicle can produce [unit].
+        rests: whether it may stay at exactly zero while the car moves, as the pressure of a brake does.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Channel:
     meaning: str
     low: float
     high: float
+    rests: bool = False
 
     @property
     def is_reference(self) -> bool:
@@ -51,13 +53,20 @@ def _table() -> dict[str, Channel]:
         Channel("ax", "m/s²", "measured longitudinal acceleration at the centre of gravity", -80.0, 80.0),
         Channel("ay", "m/s²", "measured lateral acceleration at the centre of gravity, positive to the left", -80.0, 80.0),
         Channel("steer", "rad", "mean road-wheel steering angle, positive to the left", -1.3, 1.3),
+        Channel("handwheel", "rad", "angle of the steering wheel, positive to the left", -25.0, 25.0),
+        Channel("roll", "rad", "measured roll angle, positive with the left side up", -1.6, 1.6),
+        Channel("pitch", "rad", "measured pitch angle, positive with the nose down", -1.6, 1.6),
         Channel("roll_rate", "rad/s", "measured roll rate", -8.0, 8.0),
         Channel("pitch_rate", "rad/s", "measured pitch rate", -8.0, 8.0),
         Channel("motor_speed", "rad/s", "speed of the drive motor, referred to the wheel", -3000.0, 3000.0),
-        Channel("motor_current", "A", "torque-producing motor current", -2000.0, 2000.0),
+        Channel("motor_current", "A", "torque-producing motor current", -2000.0, 2000.0, rests=True),
+        Channel("brake_pressure_front", "Pa", "brake pressure of the front axle", -1e6, 4e7, rests=True),
+        Channel("brake_pressure_rear", "Pa", "brake pressure of the rear axle", -1e6, 4e7, rests=True),
     ]
     for corner, place in corners.items():
         rows.append(Channel(f"wheel_speed_{corner}", "rad/s", f"rotational speed of the {place} wheel", -500.0, 1000.0))
+    for corner, place in corners.items():
+        rows.append(Channel(f"wheel_torque_{corner}", "N·m", f"driving torque at the {place} wheel", -2e4, 2e4, rests=True))
     for axis, direction in {"x": "longitudinal", "y": "lateral", "z": "vertical"}.items():
         for corner, place in corners.items():
             rows.append(Channel(f"f{axis}_{corner}", "N", f"{direction} tyre force, {place}", -2e5, 2e5))

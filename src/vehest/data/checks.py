@@ -27,6 +27,7 @@ STANDSTILL_YAW_RATE = 0.05  # rad/s
 STANDSTILL_SHAKING = 0.3  # m/s²
 MOST_DRIFT = 0.5  # intervals
 KINEMATIC_BAND_HZ = (0.1, 2.0)
+FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording
 SIGN_CORRELATION = 0.3
 MAX_SCALE = 1.7  # between d(vy_ref)/dt and what it must equal; km/h for m/s makes 3.6 or 1/3.6
 DEGREES_PER_RADIAN = 180.0 / np.pi
@@ -172,18 +173,22 @@ def _yaw_rate_unit(recording: Recording) -> list[Finding]:
 
 
 def _kinematic_sign(recording: Recording) -> list[Finding]:
-    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
-    if not {"vx", "yaw_rate", "ay", "vy_ref"} <= set(recording.channels):
+    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a); a reference's own vx_ref before one that wheels slip."""
+    speed = _speed_beside_reference(recording)
+    names = (speed, "yaw_rate", "ay", "vy_ref")
+    if not set(names) <= set(recording.channels):
         return []
-    names = ("vx", "yaw_rate", "ay", "vy_ref")
     if any(np.isnan(recording[name]).any() for name in names) or recording.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
         return []
     moving = ~_standstill(recording)
-    if moving.sum() < 10 * recording.rate_hz:
+    settled = moving.copy()
+    margin = round(FILTER_END_SECONDS * recording.rate_hz)
+    settled[:margin] = settled[len(settled) - margin :] = False
+    if settled.sum() < 10 * recording.rate_hz:
         return []
     band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=recording.rate_hz, output="sos")
-    predicted = signal.sosfiltfilt(band, recording["ay"] - recording["vx"] * recording["yaw_rate"])[moving]
-    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)[moving]
+    predicted = signal.sosfiltfilt(band, recording["ay"] - recording[speed] * recording["yaw_rate"])[settled]
+    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)[settled]
     if predicted.std() == 0.0 or derived.std() < 1e-3:
         return []
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
@@ -219,7 +224,7 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
                 f"(correlation {correlation:.2f}): check the unit of vy_ref",
             )
         ]
-    residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording["vx"] * recording["yaw_rate"])
+    residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording[speed] * recording["yaw_rate"])
     residual = residual[moving]
     return [
         Finding(
@@ -233,9 +238,10 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
 
 def _sideslip_unit(recording: Recording) -> list[Finding]:
     """sideslip_ref must be atan2(vy_ref, vx) in radians; 57 times that is degrees."""
-    if not {"vx", "vy_ref", "sideslip_ref"} <= set(recording.channels):
+    speed = _speed_beside_reference(recording)
+    if not {speed, "vy_ref", "sideslip_ref"} <= set(recording.channels):
         return []
-    expected = np.arctan2(recording["vy_ref"], recording["vx"])
+    expected = np.arctan2(recording["vy_ref"], recording[speed])
     given = recording["sideslip_ref"]
     known = np.isfinite(expected) & np.isfinite(given) & ~_standstill(recording)
     if known.sum() < 100 or np.std(expected[known]) < 1e-3:
@@ -245,6 +251,10 @@ def _sideslip_unit(recording: Recording) -> list[Finding]:
         message = f"sideslip_ref is {slope:.3g} times atan2(vy_ref, vx): it is in degrees; set its unit to deg"
         return [Finding("error", "unit", "sideslip_ref", message)]
     return []
+
+
+def _speed_beside_reference(recording: Recording) -> str:
+    return "vx_ref" if "vx_ref" in recording and not np.isnan(recording["vx_ref"]).any() else "vx"
 
 
 def _not_measured(recording: Recording) -> list[Finding]:
@@ -263,11 +273,15 @@ def _stuck(recording: Recording) -> list[Finding]:
     for name, samples in recording.channels.items():
         known = np.flatnonzero(~np.isnan(samples))
         unit = CHANNELS[name].unit
+        if CHANNELS[name].rests and not samples[known].any():
+            continue
         if len(known) > 1 and (samples[known] == samples[known[0]]).all():
             findings.append(Finding("warning", "stuck", name, f"never changes: {samples[known[0]]:.6g} {unit} throughout"))
             continue
         longest, first = 0, 0
         for start, length in _runs(samples[known], at_least=3):
+            if CHANNELS[name].rests and samples[known[start]] == 0.0:
+                continue
             stretch = slice(known[start], known[start + length - 1] + 1)
             held = int(moving[stretch].sum())
             if held > longest:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -28,15 +29,17 @@ class Column:
         column: the column's name in the file.
         unit: the unit its values have there.
         sign: 1, or -1 where the file counts the other way round than ISO 8855.
+        factor: what the file's values must be multiplied with to be in ``unit``, such as 1 / wheel radius.
     """
 
     column: str
     unit: str
     sign: int = 1
+    factor: float = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
         """Values in SI units and ISO 8855 signs."""
-        factor = self.sign * factor_to_si(self.unit, si_unit)
+        factor = self.sign * self.factor * factor_to_si(self.unit, si_unit)
         return values if factor == 1.0 else values * factor
 
 
@@ -67,11 +70,14 @@ def column_from_config(entry: Any, where: str) -> Column:
     Raises:
         ConfigurationError: it does not say column and unit, or says something else too.
     """
-    if not isinstance(entry, Mapping) or not {"column", "unit"} <= set(entry) or set(entry) - {"column", "unit", "sign"}:
-        raise ConfigurationError(f"{where} must say column, unit and, if need be, sign, not {entry}")
+    if not isinstance(entry, Mapping) or not {"column", "unit"} <= set(entry) or set(entry) - {"column", "unit", "sign", "factor"}:
+        raise ConfigurationError(f"{where} must say column, unit and, if need be, sign and factor, not {entry}")
     if entry.get("sign", 1) not in (1, -1):
         raise ConfigurationError(f"{where}: sign must be 1 or -1, not {entry['sign']}")
-    return Column(str(entry["column"]), str(entry["unit"]), int(entry.get("sign", 1)))
+    factor = entry.get("factor", 1.0)
+    if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor) or factor == 0:
+        raise ConfigurationError(f"{where}: factor must be a number other than 0, not {factor}")
+    return Column(str(entry["column"]), str(entry["unit"]), int(entry.get("sign", 1)), float(factor))
 
 
 def time_column_from_config(entry: Any, dataset: str) -> Column:

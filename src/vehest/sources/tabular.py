@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,15 @@ from vehest.sources.columns import Clock, Column, columns_from_config, identity_
 
 
 class TabularSource(Source):
-    """Tables, a recording each.
+    """Tables, a recording each, or one for each uninterrupted run that a column of them counts.
 
-    Options: ``path`` and ``files`` (glob), ``time`` or ``rate_hz``, ``clock``, ``channels``, ``gappy``, and for CSV
+    Options: ``path`` and ``files`` (glob), ``runs`` (column), ``time`` or ``rate_hz``, ``clock``, ``channels``, ``gappy``, and for CSV
     ``delimiter``, ``decimal``, ``encoding``, ``skip_rows``.
     """
 
-    keys = frozenset({"path", "files", "time", "rate_hz", "clock", "channels", "gappy", "delimiter", "decimal", "encoding", "skip_rows"})
+    keys = frozenset(
+        {"path", "files", "runs", "time", "rate_hz", "clock", "channels", "gappy", "delimiter", "decimal", "encoding", "skip_rows"}
+    )
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
@@ -43,31 +46,45 @@ class TabularSource(Source):
             raise ConfigurationError(f"data set '{self.name}': without a time column, rate_hz must be given")
         if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
             raise ConfigurationError(f"data set '{self.name}': rate_hz must be a positive number, not {rate}")
+        self.runs = None if dataset.get("runs") is None else str(dataset["runs"])
         self.gappy = self._gappy_channels(dataset.get("gappy") or [])
+        self._known_runs: dict[Path, dict[int, slice]] = {}
         _require_options(dataset, self.name)
 
     def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order."""
-        return [file.stem for file in self._files()]
+        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file.
+
+        Raises:
+            MissingError: no file is there, or one is empty.
+            DataError: the column of runs cannot be read.
+        """
+        return list(self._found())
 
     def inputs(self) -> dict[str, str | Path]:
         """The tables."""
         return {file.name: file for file in self._files()}
 
     def read(self, recording_id: str) -> Recording:
-        """Read one table by its stem."""
-        for file in self._files():
-            if file.stem == recording_id:
-                return self.read_file(file)
-        raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(self.ids())})")
+        """Read one recording by its name."""
+        found = self._found()
+        if recording_id not in found:
+            raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {_listed(list(found))})")
+        return self._read(*found[recording_id])
 
     def read_file(self, file: Path) -> Recording:
         """Read a table wherever it is.
 
         Raises:
             MissingError: it is not there or empty.
-            DataError: it cannot be read, lacks a column, or holds text where numbers belong.
+            DataError: it cannot be read, lacks a column, holds text where numbers belong, or holds several runs.
         """
+        require_files([file], self.name)
+        runs = list(self._runs_of(file)) if self.runs is not None and not is_stored_recording(file) else [None]
+        if len(runs) > 1:
+            raise DataError(f"'{file}' holds {len(runs)} runs ({_listed([str(run) for run in runs])}); keep the rows of one")
+        return self._read(file, runs[0])
+
+    def _read(self, file: Path, run: int | None) -> Recording:
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)
@@ -78,6 +95,8 @@ class TabularSource(Source):
                 f"'{file}' has no column that is named like a channel (it has {_listed(names)}); declare the columns in conf/dataset"
             )
         wanted = [column.column for column in columns.values()] + ([self.time.column] if self.time else [])
+        if run is not None:
+            wanted.append(str(self.runs))
         for name in wanted:
             if names.count(name) > 1:
                 raise DataError(f"'{file}' has {names.count(name)} columns called '{name}'; rename or remove all but one")
@@ -86,14 +105,19 @@ class TabularSource(Source):
                     f"'{file}' has no column '{name}' (it has {_listed(names)}); correct the map in conf/dataset/{self.name}.yaml"
                 )
         table = _read_columns(file, list(dict.fromkeys(wanted)), self.dataset)
-        return self._recording(file, columns, {name: _numbers(table, name, file) for name in table.column_names})
+        values = {name: _numbers(table, name, file) for name in table.column_names}
+        if run is not None:
+            rows = self._runs_of(file)[run]
+            values = {name: samples[rows] for name, samples in values.items()}
+        return self._recording(file, run, columns, values)
 
-    def _recording(self, file: Path, columns: Mapping[str, Column], values: Mapping[str, FloatArray]) -> Recording:
+    def _recording(self, file: Path, run: int | None, columns: Mapping[str, Column], values: Mapping[str, FloatArray]) -> Recording:
         n_rows = len(next(iter(values.values())))
         if n_rows == 0:
             raise DataError(f"'{file}' has a header and no rows")
         if self.time is not None:
-            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), f"'{file}'", self.dataset.get("clock", "strict"))
+            where = f"'{file}'" if run is None else f"'{file}', run {run}"
+            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.dataset.get("clock", "strict"))
         else:
             clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
         channels = {
@@ -102,14 +126,14 @@ class TabularSource(Source):
         }
         try:
             return Recording(
-                id=file.stem,
+                id=_name_of(file, run),
                 vehicle=str(self.dataset.get("vehicle", "unknown")),
                 rate_hz=clock.rate_hz,
                 start_time=clock.start_time,
                 channels=channels,
                 kind=self.dataset.get("kind", "real"),
                 gappy=self.gappy,
-                provenance={"dataset": self.name, "source": "tabular", "file": file.name},
+                provenance={"dataset": self.name, "source": "tabular", "file": file.name} | ({} if run is None else {"run": run}),
             )
         except DataError as error:
             raise DataError(f"'{file}': {error}") from None
@@ -121,6 +145,41 @@ class TabularSource(Source):
             if name not in (CHANNELS if self.columns is None else self.columns):
                 raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
         return frozenset(names)
+
+    def _found(self) -> dict[str, tuple[Path, int | None]]:
+        """Names of the recordings: where each stands."""
+        if self.runs is None:
+            return {_name_of(file, None): (file, None) for file in self._files()}
+        require_files(self._files(), self.name)
+        return {_name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
+
+    def _runs_of(self, file: Path) -> dict[int, slice]:
+        """Number of each run in a table: its rows."""
+        if file not in self._known_runs:
+            self._known_runs[file] = self._read_runs(file, str(self.runs))
+        return self._known_runs[file]
+
+    def _read_runs(self, file: Path, column: str) -> dict[int, slice]:
+        names = _column_names(file, self.dataset)
+        if names.count(column) != 1:
+            raise DataError(
+                f"'{file}' has no column '{column}' that counts its runs (it has {_listed(names)}); correct runs in the data set"
+            )
+        numbers = _numbers(_read_columns(file, [column], self.dataset), column, file)
+        if not len(numbers):
+            raise DataError(f"'{file}' has a header and no rows")
+        odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
+        if len(odd):
+            where = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
+            raise DataError(f"'{file}': {where}; runs are counted in whole numbers")
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(numbers)) + 1, [len(numbers)]]).tolist()
+        runs: dict[int, slice] = {}
+        for start, stop in pairwise(edges):
+            run = int(numbers[start])
+            if run in runs:
+                raise DataError(f"'{file}': run {run} begins again in data row {start + 1}; a run is uninterrupted, sort the rows")
+            runs[run] = slice(start, stop)
+        return runs
 
     def _files(self) -> list[Path]:
         folder = existing_folder(self.dataset.get("path"), self.name)
@@ -151,6 +210,10 @@ def _require_options(dataset: Mapping[str, Any], name: str) -> None:
     pattern = str(dataset.get("files", "*.csv"))
     if not pattern or Path(pattern).is_absolute():
         raise ConfigurationError(f"data set '{name}': files must be a pattern inside path, such as '*.csv', not '{pattern}'")
+
+
+def _name_of(file: Path, run: int | None) -> str:
+    return file.stem if run is None else f"{file.stem}_run_{run}"
 
 
 def _is_parquet(file: Path) -> bool:
