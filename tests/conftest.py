@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 import torch
 
 from vehest.data.recording import Recording
+
+if TYPE_CHECKING:
+    from place import Place
 
 torch.set_num_threads(1)
 
@@ -45,3 +49,15 @@ def planar_drive(seconds: float = 60.0, rate_hz: float = 20.0, seed: int = 0, no
 def drive() -> Recording:
     """One minute at 20 Hz without noise."""
     return planar_drive()
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
+    """A fresh place to work in, without a data root or a tracking server from outside."""
+    from place import Place
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    return Place(tmp_path, capsys)

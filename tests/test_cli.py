@@ -18,122 +18,11 @@ import yaml
 
 import vehest
 from conftest import planar_drive
-from vehest.cli import main
+from place import DATASET, PIPELINE, Place, write_csv
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
 from vehest.stages import code_version
 from vehest.stages.artefacts import read_artefact
-
-PIPELINE = {
-    "study": "small",
-    "title": "A small study",
-    "report": "drive",
-    "split": "mine",
-    "sweeps": [
-        ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],
-        ["estimator=ksnn", "estimator.n_hidden=0", "seed=0,1", "training.max_epochs=2"],
-        ["estimator=gru", "estimator.n_states=2", "training.max_epochs=2"],
-    ],
-}
-
-
-def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
-    """A drive at 100 Hz as a table with columns of its own names and units."""
-    drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
-    table = pd.DataFrame(
-        {
-            "Time": drive.time,
-            "Speed": drive["vx"] * 3.6,
-            "Yaw": np.degrees(drive["yaw_rate"]),
-            "LatAcc": -drive["ay"],
-            "LongAcc": drive["ax"],
-            "Vy": drive["vy_ref"],
-        }
-    )
-    table.to_csv(path, index=False)
-    return table
-
-
-DATASET = {
-    "name": "mine",
-    "title": "My car",
-    "kind": "simulated",
-    "vehicle": "my car",
-    "licence": "none",
-    "citation": "none",
-    "source": "tabular",
-    "path": "${root}",
-    "files": "*.csv",
-    "time": {"column": "Time", "unit": "s"},
-    "channels": {
-        "vx": {"column": "Speed", "unit": "km/h"},
-        "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
-        "ay": {"column": "LatAcc", "unit": "m/s²", "sign": -1},
-        "ax": {"column": "LongAcc", "unit": "m/s²"},
-        "vy_ref": {"column": "Vy", "unit": "m/s"},
-    },
-}
-
-
-class Place:
-    """A working folder with data, configuration and a pipeline of its own."""
-
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        self.folder, self._capsys = folder, capsys
-        for name, seed in (("one", 1), ("two", 2), ("three", 3)):
-            (folder / "raw").mkdir(exist_ok=True)
-            write_csv(folder / "raw" / f"{name}.csv", seed)
-        split = {
-            "name": "mine",
-            "dataset": "mine",
-            "train": [{"recording": "one"}],
-            "validation": [{"recording": "two"}],
-            "tests": {"test": [{"recording": "three"}]},
-        }
-        for group, content in (("dataset", DATASET), ("split", split)):
-            (folder / "conf" / group).mkdir(parents=True, exist_ok=True)
-            (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
-        (folder / "pipelines").mkdir()
-        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
-
-    def __call__(self, *arguments: str) -> tuple[int, str, str]:
-        """Exit code, standard output and standard error of a command."""
-        former, code = sys.argv, 0
-        sys.argv = ["vehest", *arguments]
-        try:
-            main()
-        except SystemExit as leave:
-            code = int(leave.code or 0)
-        finally:
-            sys.argv = former
-        out, err = self._capsys.readouterr()
-        return code, out, err
-
-    def refused(self, *arguments: str) -> tuple[int, str]:
-        """Exit code and the one line of a command that must fail and leave nothing behind."""
-        before = self.files()
-        code, _, err = self(*arguments)
-        assert code != 0
-        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
-        assert len(lines) == 1, err
-        assert lines[0].startswith("error: ")
-        assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
-        assert not any(ASIDE_PREFIX in name for name in self.files())
-        return code, lines[0]
-
-    def files(self) -> set[str]:
-        """Every file in the output root."""
-        return {str(file) for file in (self.folder / "outputs").rglob("*") if file.is_file()}
-
-
-@pytest.fixture
-def place(tmp_path, monkeypatch, capsys) -> Place:
-    """A fresh place to work in, without tracking noise and without a data root from outside."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
-    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    return Place(tmp_path, capsys)
 
 
 def _statuses(err: str) -> list[tuple[str, str]]:
@@ -262,6 +151,8 @@ def test_data_commands_list_show_and_check(place):
     rows = json.loads(place("data", "list", "--json")[1])
     assert {"mine", "ferrari_250lm", "sim_quickstart"} <= {row["dataset"] for row in rows}
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
+    assert all(row["licence"] and row["citation"] for row in rows)
+    assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
     shown = json.loads(place("data", "show", "mine", "--json")[1])
     assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
     assert shown["recordings"][0]["rate_hz"] == 100.0
@@ -304,33 +195,6 @@ def test_help_shows_choices_and_answers_quickly(place):
     code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
-
-
-def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
-    code, _, err = place("run", "small", "--jobs", "1")
-    assert code == 0, err
-    from mlflow import MlflowClient
-
-    client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
-    experiment = client.get_experiment_by_name("vehest")
-    runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
-    assert len(runs) == 8
-    trained = runs["ksnn-linear_no_bias_p2-seed0"]
-    assert trained.data.params["estimator.n_local"] == "2"
-    assert trained.data.params["training.learning_rate"] == "0.001"
-    assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
-    kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
-    assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
-    evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
-    assert evaluated.data.metrics["rmse_sideslip.test"] > 0
-    assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
-
-
-def test_training_goes_on_when_the_tracking_server_is_away(place):
-    code, _, err = place("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
-    assert code == 0
-    assert err.count("does not answer") == 1
-    assert "going on without tracking" in err
 
 
 # --- input that cannot be used -------------------------------------------------------------------------------------

@@ -310,14 +310,18 @@ def doctor(as_json: AsJson = False) -> None:
 
 @data_app.command("list")
 def data_list(as_json: AsJson = False) -> None:
-    """List the data sets that conf/dataset offers."""
+    """List the data sets that conf/dataset offers, with their licences and what to cite."""
     from vehest.stages.inspect_data import dataset_rows
 
     rows = dataset_rows()
     if as_json:
         typer.echo(_json(rows))
     else:
-        _table(["data set", "kind", "source", "here", "title", "licence"], [[str(value) for value in row.values()] for row in rows])
+        shown = ("dataset", "kind", "source", "here", "title")
+        _table(["data set", *shown[1:]], [[row[key] for key in shown] for row in rows])
+        typer.echo("\nlicences and citations")
+        for row in rows:
+            typer.echo(f"{row['dataset']}: {row['licence']}\n  cite: {row['citation']}")
 
 
 @data_app.command("channels")

@@ -20,7 +20,7 @@ from vehest.stages.config_files import choices
 
 
 def dataset_rows() -> list[dict[str, str]]:
-    """A row a data set: name, kind, source, whether its files are here, title, licence."""
+    """A row a data set: name, kind, source, whether its files are here, title, licence, citation."""
     rows = []
     for name in choices("dataset"):
         dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
@@ -32,6 +32,7 @@ def dataset_rows() -> list[dict[str, str]]:
                 "here": _is_here(dataset),
                 "title": str(dataset.get("title", "")),
                 "licence": " ".join(str(dataset.get("licence", "")).split()),
+                "citation": " ".join(str(dataset.get("citation", "")).split()),
             }
         )
     return rows

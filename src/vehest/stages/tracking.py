@@ -11,7 +11,8 @@ from typing import Any
 
 from vehest.stages.artefacts import MANIFEST, Artefact
 
-BATCH = 1000
+BATCH = 1000  # figures a request, which is what a server takes
+PARAMETERS = 100
 SQLITE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 
@@ -83,7 +84,9 @@ class Tracker:
         points += [Metric(key, value, stamp, step) for key, value, step in _over_epochs(history)]
         parameters = [Param(key, str(value)[:500]) for key, value in _flattened(artefact.config).items()]
         run_tags = [RunTag(f"vehest.{key}", str(value)) for key, value in artefact.provenance.items() if not isinstance(value, dict)]
-        client.log_batch(run.info.run_id, params=parameters[:100], tags=run_tags)
+        client.log_batch(run.info.run_id, tags=run_tags)
+        for start in range(0, len(parameters), PARAMETERS):
+            client.log_batch(run.info.run_id, params=parameters[start : start + PARAMETERS])
         for start in range(0, len(points), BATCH):
             client.log_batch(run.info.run_id, metrics=points[start : start + BATCH])
         for file in [*artefact.outputs, MANIFEST]:

@@ -1,0 +1,116 @@
+"""A small data set with a configuration and a pipeline of its own, and the command line run on it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from conftest import planar_drive
+from vehest.cli import main
+from vehest.data.files import ASIDE_PREFIX
+
+PIPELINE = {
+    "study": "small",
+    "title": "A small study",
+    "report": "drive",
+    "split": "mine",
+    "sweeps": [
+        ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],
+        ["estimator=ksnn", "estimator.n_hidden=0", "seed=0,1", "training.max_epochs=2"],
+        ["estimator=gru", "estimator.n_states=2", "training.max_epochs=2"],
+    ],
+}
+
+
+def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
+    """A drive at 100 Hz as a table with columns of its own names and units."""
+    drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
+    table = pd.DataFrame(
+        {
+            "Time": drive.time,
+            "Speed": drive["vx"] * 3.6,
+            "Yaw": np.degrees(drive["yaw_rate"]),
+            "LatAcc": -drive["ay"],
+            "LongAcc": drive["ax"],
+            "Vy": drive["vy_ref"],
+        }
+    )
+    table.to_csv(path, index=False)
+    return table
+
+
+DATASET = {
+    "name": "mine",
+    "title": "My car",
+    "kind": "simulated",
+    "vehicle": "my car",
+    "licence": "none",
+    "citation": "none",
+    "source": "tabular",
+    "path": "${root}",
+    "files": "*.csv",
+    "time": {"column": "Time", "unit": "s"},
+    "channels": {
+        "vx": {"column": "Speed", "unit": "km/h"},
+        "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
+        "ay": {"column": "LatAcc", "unit": "m/s²", "sign": -1},
+        "ax": {"column": "LongAcc", "unit": "m/s²"},
+        "vy_ref": {"column": "Vy", "unit": "m/s"},
+    },
+}
+
+
+class Place:
+    """A working folder with data, configuration and a pipeline of its own."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        self.folder, self._capsys = folder, capsys
+        for name, seed in (("one", 1), ("two", 2), ("three", 3)):
+            (folder / "raw").mkdir(exist_ok=True)
+            write_csv(folder / "raw" / f"{name}.csv", seed)
+        split = {
+            "name": "mine",
+            "dataset": "mine",
+            "train": [{"recording": "one"}],
+            "validation": [{"recording": "two"}],
+            "tests": {"test": [{"recording": "three"}]},
+        }
+        for group, content in (("dataset", DATASET), ("split", split)):
+            (folder / "conf" / group).mkdir(parents=True, exist_ok=True)
+            (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+        (folder / "pipelines").mkdir()
+        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
+
+    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+        """Exit code, standard output and standard error of a command."""
+        former, code = sys.argv, 0
+        sys.argv = ["vehest", *arguments]
+        try:
+            main()
+        except SystemExit as leave:
+            code = int(leave.code or 0)
+        finally:
+            sys.argv = former
+        out, err = self._capsys.readouterr()
+        return code, out, err
+
+    def refused(self, *arguments: str) -> tuple[int, str]:
+        """Exit code and the one line of a command that must fail and leave nothing behind."""
+        before = self.files()
+        code, _, err = self(*arguments)
+        assert code != 0
+        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
+        assert len(lines) == 1, err
+        assert lines[0].startswith("error: ")
+        assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
+        assert not any(ASIDE_PREFIX in name for name in self.files())
+        return code, lines[0]
+
+    def files(self) -> set[str]:
+        """Every file in the output root."""
+        return {str(file) for file in (self.folder / "outputs").rglob("*") if file.is_file()}
