@@ -270,6 +270,7 @@ def _stuck(recording: Recording) -> list[Finding]:
     """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
     findings = []
     moving = ~_standstill(recording)
+    moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
         known = np.flatnonzero(~np.isnan(samples))
         unit = CHANNELS[name].unit
@@ -278,14 +279,16 @@ def _stuck(recording: Recording) -> list[Finding]:
         if len(known) > 1 and (samples[known] == samples[known[0]]).all():
             findings.append(Finding("warning", "stuck", name, f"never changes: {samples[known[0]]:.6g} {unit} throughout"))
             continue
-        longest, first = 0, 0
-        for start, length in _runs(samples[known], at_least=3):
-            if CHANNELS[name].rests and samples[known[start]] == 0.0:
-                continue
-            stretch = slice(known[start], known[start + length - 1] + 1)
-            held = int(moving[stretch].sum())
-            if held > longest:
-                longest, first = held, int(known[start] + np.argmax(moving[stretch]))
+        starts, lengths = _long_runs(samples[known], at_least=3)
+        if CHANNELS[name].rests:
+            starts, lengths = starts[samples[known[starts]] != 0.0], lengths[samples[known[starts]] != 0.0]
+        if not len(starts):
+            continue
+        begins, ends = known[starts], known[starts + lengths - 1] + 1
+        held = moved[ends] - moved[begins]
+        longest = int(held.max())
+        begin, end = begins[np.argmax(held)], ends[np.argmax(held)]
+        first = int(begin + np.argmax(moving[begin:end]))
         if longest >= STUCK_SECONDS * recording.rate_hz:
             seconds, time = longest / recording.rate_hz, recording.time[first]
             message = f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s"
@@ -301,12 +304,16 @@ def _saturated(recording: Recording) -> list[Finding]:
         known = samples[np.isfinite(samples) & moving]
         if len(known) < 100:
             continue
-        levels, counts = np.unique(known, return_counts=True)
-        if len(levels) < 3:
+        lowest, highest = known.min(), known.max()
+        between = known[(known > lowest) & (known < highest)]
+        if not len(between):
             continue
-        largest = np.abs(levels[[0, -1]]).max()
-        for side, extreme, at, beside in (("highest", levels[-1], counts[-1], counts[-2]), ("lowest", levels[0], counts[0], counts[1])):
-            if at <= SATURATED_FRACTION * len(known) or at < SATURATED_EXCESS * beside or abs(extreme) < 0.1 * largest:
+        largest = max(abs(lowest), abs(highest))
+        for side, extreme, beside in (("highest", highest, between.max()), ("lowest", lowest, between.min())):
+            at = int(np.count_nonzero(known == extreme))
+            if at <= SATURATED_FRACTION * len(known) or abs(extreme) < 0.1 * largest:
+                continue
+            if at < SATURATED_EXCESS * np.count_nonzero(known == beside):
                 continue
             if np.count_nonzero(np.diff(np.concatenate([[0], known == extreme])) == 1) < 2:
                 continue
@@ -338,14 +345,17 @@ def _spread(samples: FloatArray) -> float:
     return float(known.std()) if len(known) else 0.0
 
 
-def _runs(samples: NDArray[Any], at_least: int = 1) -> list[tuple[int, int]]:
-    """Start and length of every run of equal values that is long enough."""
-    if len(samples) == 0:
-        return []
-    edges = np.concatenate([[0], np.flatnonzero(samples[1:] != samples[:-1]) + 1, [len(samples)]])
+def _runs(samples: NDArray[Any]) -> list[tuple[int, int]]:
+    """Start and length of every run of equal values."""
+    starts, lengths = _long_runs(samples, at_least=1)
+    return list(zip(starts.tolist(), lengths.tolist(), strict=True))
+
+
+def _long_runs(samples: NDArray[Any], at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Starts and lengths of the runs of equal values that are long enough."""
+    edges = np.flatnonzero(np.concatenate([[True], samples[1:] != samples[:-1], [True]])) if len(samples) else np.zeros(1, dtype=np.int64)
     lengths = np.diff(edges)
-    long = lengths >= at_least
-    return list(zip(edges[:-1][long].tolist(), lengths[long].tolist(), strict=True))
+    return edges[:-1][lengths >= at_least], lengths[lengths >= at_least]
 
 
 _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
