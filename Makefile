@@ -10,7 +10,7 @@ TORCH ?= 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 JOBS ?= 2
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive bench-training
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive bench-training bench-ingest
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -58,6 +58,9 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 
 bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
 	$(BIN)/python benchmarks/training.py
+
+bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 columns against a bare pyarrow.csv.read_csv
+	$(BIN)/python benchmarks/ingest.py
 
 clean: ## remove what can be made again (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

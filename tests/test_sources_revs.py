@@ -126,7 +126,7 @@ def test_nan_and_disordered_time_are_refused(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"layout": "csv"}, "layout 'csv' is not one of: text"),
+        ({"layout": "xlsx"}, "layout 'xlsx' is not one of: csv, mat, text"),
         ({"time": None}, "time must say column"),
         ({"time": {"column": "t", "unit": "m/s"}}, "cannot be converted to 's'"),
         ({"channels": {"vx": {"column": "vx", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),

@@ -1,99 +1,191 @@
 """Revs Vehicle Dynamics Database (Kegelman & Gerdes, Stanford Digital Repository).
 
-Layouts: ``text``, a folder a recording and a text file a channel, as re-laid by Leanza, Reina & Blanco-Claraco 2021.
+Layouts: ``csv`` and ``mat``, the official ones, a file a recording; ``text``, a folder a recording and a text file a channel, as re-laid
+by Leanza, Reina & Blanco-Claraco 2021.
 """
 
 from __future__ import annotations
 
-import warnings
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vehest.data.channels import channel
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.sources.base import Source, existing_folder, require_files
 from vehest.sources.columns import columns_from_config, time_column_from_config, uniform_clock
+from vehest.sources.revs_csv import read_csv_columns, read_csv_head
+from vehest.sources.revs_mat import read_mat_columns
+from vehest.sources.revs_parameters import read_vehicle_parameters
+from vehest.sources.revs_text import read_text_columns, text_file
+from vehest.sources.unit_spellings import require_unit
 
-LAYOUTS = ("text",)
+SUFFIXES = {"csv": ".csv", "mat": ".mat", "text": ""}
+PREAMBLE_LINES = 10
 
 
 class RevsSource(Source):
     """Recordings of the Revs database.
 
-    Options: ``path`` (folder), ``layout``, ``recordings`` (folders in path), ``time`` and ``channels`` (columns, units, signs).
+    Options: ``path`` (folder), ``layout``, ``recordings`` or ``files`` (glob), ``vehicle_parameters`` (file), ``time``, ``channels`` and
+    ``extra_channels`` (columns, units, signs), ``clock``, ``gappy``, ``preamble_lines`` and ``units_row`` (csv), ``rate_hz`` (mat).
     """
 
-    keys = frozenset({"path", "layout", "recordings", "time", "channels"})
+    keys = frozenset(
+        {"path", "layout", "recordings", "files", "vehicle_parameters", "time", "channels", "extra_channels"}
+        | {"clock", "gappy", "preamble_lines", "units_row", "rate_hz"}
+    )
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        if dataset.get("layout") not in LAYOUTS:
-            raise ConfigurationError(f"data set '{self.name}': layout '{dataset.get('layout')}' is not one of: {', '.join(LAYOUTS)}")
+        self.layout = str(dataset.get("layout"))
+        if self.layout not in SUFFIXES:
+            raise ConfigurationError(f"data set '{self.name}': layout '{self.layout}' is not one of: {', '.join(SUFFIXES)}")
+        extra = dataset.get("extra_channels") or {}
+        if not isinstance(extra, Mapping) or set(extra) - set(SUFFIXES):
+            raise ConfigurationError(f"data set '{self.name}': extra_channels must map a layout to channels, not {extra}")
         self.columns = columns_from_config(dataset.get("channels") or {}, self.name)
+        self.columns |= columns_from_config(extra.get(self.layout) or {}, self.name)
+        if not self.columns:
+            raise ConfigurationError(f"data set '{self.name}': channels must map a channel to its column and unit")
         self.time = time_column_from_config(dataset.get("time"), self.name)
+        self._require_options()
+        self.gappy = frozenset(dataset.get("gappy") or [])
 
     def ids(self) -> list[str]:
-        """The recordings that the data set names."""
-        return [str(name) for name in self.dataset.get("recordings") or []]
+        """The recordings that the data set names, or else those whose files match ``files``, in alphabetical order.
+
+        Raises:
+            MissingError: it names none and no file is there.
+        """
+        suffix = SUFFIXES[self.layout]
+        named = self.dataset.get("recordings")
+        if named is not None:
+            return [str(name).removesuffix(suffix) for name in named]
+        pattern = f"{self.dataset.get('files') or '*'}{suffix}"
+        found = [path for path in sorted(self._folder().glob(pattern)) if (path.is_file() if suffix else path.is_dir())]
+        names = [path.name.removesuffix(suffix) for path in found if path.name != self.dataset.get("vehicle_parameters")]
+        if not names:
+            raise MissingError(f"data set '{self.name}': nothing in '{self._folder()}' matches '{pattern}'")
+        return names
 
     def inputs(self) -> dict[str, str | Path]:
-        """Every text file that is read."""
-        return {f"{name}/{file.name}": file for name in self.ids() for file in self._files(name)}
+        """Every file that is read."""
+        folder = self._folder()
+        files = {file.relative_to(folder).as_posix(): file for name in self.ids() for file in self._files(name)}
+        parameters = self._parameters_file()
+        return dict(files) if parameters is None else {**files, parameters.name: parameters}
+
+    def file_names(self) -> list[str]:
+        """Files of the named recordings in the official layouts, and the table of vehicle parameters."""
+        suffix = SUFFIXES[self.layout]
+        if not suffix or self.dataset.get("recordings") is None:
+            return []
+        parameters = self.dataset.get("vehicle_parameters")
+        return [f"{name}{suffix}" for name in self.ids()] + ([str(parameters)] if parameters else [])
 
     def read(self, recording_id: str) -> Recording:
-        """Read the text files of one recording."""
+        """Read one recording by its name."""
         self._files(recording_id)
-        stamps = self.time.to_si(_read_numbers(self._file(recording_id, self.time.column)), "s")
-        clock = uniform_clock(stamps, f"'{self._file(recording_id, self.time.column)}'")
-        channels = {}
-        for name, column in self.columns.items():
-            file = self._file(recording_id, column.column)
-            samples = _read_numbers(file)
-            if len(samples) != len(stamps):
-                raise DataError(f"'{file}' holds {len(samples)} samples, the time file {len(stamps)}; the copy is incomplete")
-            channels[name] = column.to_si(samples, channel(name).unit)
-        return Recording(
-            id=recording_id,
-            vehicle=str(self.dataset.get("vehicle", "unknown")),
-            rate_hz=clock.rate_hz,
-            start_time=clock.start_time,
-            channels=channels,
-            kind="real",
-            provenance={"dataset": self.name, "source": "revs", "layout": "text"},
-        )
+        reading = {"csv": self._read_csv, "mat": self._read_mat, "text": self._read_text}
+        start_time, rate_hz, values, origin = reading[self.layout](recording_id)
+        channels = {name: column.to_si(values[column.column], channel(name).unit) for name, column in self.columns.items()}
+        del values
+        provenance = {"dataset": self.name, "source": "revs", "layout": self.layout, **origin}
+        parameters = self._parameters_file()
+        if parameters is not None:
+            provenance["vehicle_parameters"] = read_vehicle_parameters(parameters)
+        try:
+            return Recording(
+                id=recording_id,
+                vehicle=str(self.dataset.get("vehicle", "unknown")),
+                rate_hz=rate_hz,
+                start_time=start_time,
+                channels=channels,
+                kind=self.dataset.get("kind", "real"),
+                gappy=self.gappy,
+                provenance=provenance,
+            )
+        except DataError as error:
+            raise DataError(f"'{self._path(recording_id)}': {error}") from None
 
-    def _file(self, recording_id: str, column: str) -> Path:
-        return existing_folder(self.dataset.get("path"), self.name) / recording_id / f"{column}.txt"
+    def _read_csv(self, recording_id: str) -> tuple[float, float, dict[str, FloatArray], dict[str, Any]]:
+        file, columns = self._path(recording_id), self._column_names()
+        head = read_csv_head(file, [self.time.column, *columns], int(self.dataset.get("preamble_lines", PREAMBLE_LINES)))
+        if self.dataset.get("units_row", "check") == "check":
+            for name, column in self.columns.items():
+                where = f"'{file}': column '{column.column}'"
+                require_unit(head.unit_of(column.column), column, channel(name).unit, where, "set units_row: ignore")
+        values, dropped = read_csv_columns(file, head, self.time.column, columns, self._gappy_columns())
+        clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), f"'{file}'", self.dataset.get("clock", "strict"))
+        aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
+        origin = {"file": file.name, "preamble": list(head.preamble), "rows_dropped_at_the_head": dropped}
+        return clock.start_time, clock.rate_hz, aligned, origin
+
+    def _read_mat(self, recording_id: str) -> tuple[float, float, dict[str, FloatArray], dict[str, Any]]:
+        file = self._path(recording_id)
+        policy, rate = self.dataset.get("clock", "strict"), self.dataset.get("rate_hz")
+        aligned = read_mat_columns(file, self._column_names(), self.time, rate, policy, self._gappy_columns())
+        return aligned.start_time, aligned.rate_hz, aligned.values, {"file": file.name, "native_rates_hz": aligned.native_rates_hz}
+
+    def _read_text(self, recording_id: str) -> tuple[float, float, dict[str, FloatArray], dict[str, Any]]:
+        folder, columns = self._path(recording_id), self._column_names()
+        values = read_text_columns(folder, columns, self.time.column)
+        where = f"'{text_file(folder, self.time.column)}'"
+        clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.dataset.get("clock", "strict"))
+        aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
+        return clock.start_time, clock.rate_hz, aligned, {}
+
+    def _column_names(self) -> list[str]:
+        return list(dict.fromkeys(column.column for column in self.columns.values()))
+
+    def _gappy_columns(self) -> set[str]:
+        """Columns that gappy channels alone are made of."""
+        strict = {column.column for name, column in self.columns.items() if name not in self.gappy}
+        return {self.columns[name].column for name in self.gappy} - strict
+
+    def _folder(self) -> Path:
+        return existing_folder(self.dataset.get("path"), self.name)
+
+    def _path(self, recording_id: str) -> Path:
+        return self._folder() / f"{recording_id}{SUFFIXES[self.layout]}"
 
     def _files(self, recording_id: str) -> list[Path]:
-        folder = existing_folder(self.dataset.get("path"), self.name) / recording_id
-        existing_folder(folder, self.name)
-        files = [folder / f"{column}.txt" for column in sorted({self.time.column, *(c.column for c in self.columns.values())})]
+        path = self._path(recording_id)
+        if self.layout == "text":
+            existing_folder(path, self.name)
+            files = [text_file(path, column) for column in sorted({self.time.column, *self._column_names()})]
+        else:
+            files = [path]
         require_files(files, self.name)
         return files
 
+    def _parameters_file(self) -> Path | None:
+        """The table of vehicle parameters, if one is declared and there."""
+        name = self.dataset.get("vehicle_parameters")
+        file = self._folder() / str(name)
+        return file if name and file.is_file() else None
 
-def _read_numbers(file: Path) -> FloatArray:
-    """One number a line."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there are no numbers is said below
-            values = np.loadtxt(file, dtype=np.float64, ndmin=1, encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
-    except ValueError as error:
-        raise DataError(
-            f"'{file}' holds something that is not a number ({str(error).splitlines()[0]}); repair or remove the line"
-        ) from None
-    if values.size == 0:
-        raise DataError(f"'{file}' holds no numbers; the copy is incomplete")
-    if values.ndim != 1:
-        raise DataError(f"'{file}' holds {values.shape[1]} numbers a line; one is expected")
-    return values
+    def _require_options(self) -> None:
+        where = f"data set '{self.name}'"
+        for option in ("recordings", "gappy"):
+            if not isinstance(self.dataset.get(option) or [], list | tuple):
+                raise ConfigurationError(f"{where}: {option} must be a list, for example [{self.dataset[option]}]")
+        for option, choices in (("clock", ("strict", "interpolate")), ("units_row", ("check", "ignore"))):
+            if self.dataset.get(option, choices[0]) not in choices:
+                raise ConfigurationError(f"{where}: {option} '{self.dataset[option]}' is not one of: {', '.join(choices)}")
+        unknown = sorted(set(self.dataset.get("gappy") or []) - set(self.columns))
+        if unknown:
+            raise ConfigurationError(f"{where}: gappy names '{unknown[0]}', which is not one of its channels")
+        rate, lines = self.dataset.get("rate_hz"), self.dataset.get("preamble_lines", PREAMBLE_LINES)
+        if rate is not None and self.layout != "mat":
+            raise ConfigurationError(f"{where}: rate_hz is an option of layout mat; 'vehest downsample' brings others to another rate")
+        if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+            raise ConfigurationError(f"{where}: rate_hz must be a positive number, not {rate}")
+        if not isinstance(lines, int) or not 0 <= lines <= 100:
+            raise ConfigurationError(f"{where}: preamble_lines must be a whole number up to 100, not {lines}")
 
 
 SOURCE = RevsSource

@@ -1,0 +1,227 @@
+"""Writes files in the official layouts of the Revs database, from signals that the caller knows; for tests and benchmarks.
+
+Names of columns, structs and parameters are those that public programs read from the real files; values are made here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+from numpy.typing import NDArray
+from scipy.io import savemat
+
+from vehest.data.recording import Recording
+
+FloatArray = NDArray[np.float64]
+
+CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
+PREAMBLE = (
+    "Event: 2014 Targa 66",
+    "Venue: Palm Beach International Raceway",
+    "Date: 2014-02-22",
+    "Time (UTC): 14:29:02",
+    "Driver: Participant 3",
+    "Vehicle: 1965 Ferrari 250 LM Berlinetta GT",
+    "Run: 01",
+    "Outing: 01",
+    "Remark: made for tests, 25 °C",
+    "",
+)
+PARAMETERS: dict[str, tuple[str, Sequence[float]]] = {
+    "mass": ("kg", [982.0]),
+    "wheelbase": ("m", [2.4]),
+    "diffRatio": ("-", [4.2]),
+    "rollingCircumferenceRL": ("m", [2.01]),
+    "handwheelAngle": ("°", [-90.0, 0.0, 90.0]),
+    "roadWheelAngleFL": ("°", [-6.7, 0.0, 6.9]),
+    "roadWheelAngleFR": ("°", [-6.9, 0.0, 6.7]),
+}
+
+_DRIVER = "driverData"
+_INS = "insData"
+_TYRE = "tireData"
+
+
+def _columns() -> dict[str, tuple[str, int, str]]:
+    """The 55 columns in order: name -> (unit, rate of its sensor [Hz], struct of the MAT file)."""
+    columns = {"time": ("s", CSV_RATE_HZ, "")}
+    for name, unit in {"handwheelAngle": "°", "throttle": "%", "brake": "%", "clutch": "%", "engineSpeed": "rpm", "PPS": "-"}.items():
+        columns[name] = (unit, CSV_RATE_HZ, _DRIVER)
+    for name, unit in {"gpsTime": "s", "latitude": "°", "longitude": "°", "altitude": "m"}.items():
+        columns[name] = (unit, GPS_RATE_HZ, _INS)
+    ins = dict.fromkeys(("vNorth", "vEast", "vUp", "horizontalSpeed", "vxCG", "vyCG", "vzCG"), "m/s")
+    ins |= dict.fromkeys(("axCG", "ayCG", "azCG"), "m/s²") | dict.fromkeys(("yawAngle", "pitchAngle", "rollAngle"), "°")
+    ins |= dict.fromkeys(("rollRate", "pitchRate", "yawRate"), "°/s") | {"sideSlip": "°", "distance": "m"}
+    for name, unit in ins.items():
+        columns[name] = (unit, INS_RATE_HZ, _INS)
+    for name in ("numSVsTracked", "gpsPosMode", "gpsVelMode", "gpsOrientMode", "HDOP", "PDOP"):
+        columns[name] = ("-", GPS_RATE_HZ, _INS)
+    for what, unit, axes in (("pos", "m", "north east down"), ("vel", "m/s", "north east down"), ("orient", "°", "heading pitch roll")):
+        for axis in axes.split():
+            columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ, _INS)
+    for what, unit, corners in (
+        ("chassisAccel", "g", "FL FR RL RR"),
+        ("deflection", "mm", "FL FR RR"),
+        ("wheelAccel", "g", "FL FR RL RR"),
+    ):
+        for corner in corners.split():
+            columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ, _TYRE)
+    return columns
+
+
+COLUMNS = _columns()
+assert len(COLUMNS) == 55
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the sensors delivered, in the units of the official files.
+
+    Args:
+        seconds: a whole number of tenths.
+        signals: column -> samples at the rate of its sensor (COLUMNS; roadWheelAngle… at 1 kHz).
+        start_time: of the first sample [s].
+    """
+
+    seconds: float
+    signals: Mapping[str, FloatArray]
+    start_time: float = 0.0
+
+    def rows(self) -> int:
+        """Rows of the CSV file."""
+        return round(self.seconds * CSV_RATE_HZ)
+
+
+def smooth_drive(seconds: float, start_time: float = 0.0, decimals: int | None = None) -> tuple[Drive, dict[str, FloatArray]]:
+    """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with nothing held.
+
+    Args:
+        seconds: a whole number of tenths.
+        start_time: of the first sample [s].
+        decimals: of the file's values; None keeps every digit.
+    """
+    time = np.arange(round(seconds * CSV_RATE_HZ)) / CSV_RATE_HZ
+    yaw_rate = 0.35 * np.sin(0.5 * time + 0.3) + 0.15 * np.sin(1.3 * time + 1.1)
+    yaw_rate_dot = 0.175 * np.cos(0.5 * time + 0.3) + 0.195 * np.cos(1.3 * time + 1.1)
+    vx, vx_dot = 30.0 + 8.0 * np.sin(0.2 * time), 1.6 * np.cos(0.2 * time)
+    vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + 2.0)
+    vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + 2.0)
+    roll, pitch = 0.03 * np.sin(0.5 * time + 0.4), 0.01 * np.cos(0.9 * time)
+    truth = {
+        "vx": vx,
+        "yaw_rate": yaw_rate,
+        "ax": vx_dot - vy * yaw_rate,
+        "ay": vy_dot + vx * yaw_rate,
+        "handwheel": 1.2 * np.sin(0.5 * time + 0.5) + 0.01 * np.sin(40.0 * time),
+        "roll": roll,
+        "pitch": pitch,
+        "roll_rate": 0.015 * np.cos(0.5 * time + 0.4),
+        "pitch_rate": -0.009 * np.sin(0.9 * time),
+        "vx_ref": vx,
+        "vy_ref": vy,
+        "sideslip_ref": np.arctan2(vy, vx),
+    }
+    truth["steer"] = truth["handwheel"] / 13.3
+    signals = {
+        "handwheelAngle": np.rad2deg(truth["handwheel"]),
+        "roadWheelAngle": np.rad2deg(truth["steer"]),
+        "roadWheelAngleFL": np.rad2deg(truth["steer"]) * 1.01,
+        "roadWheelAngleFR": np.rad2deg(truth["steer"]) * 0.99,
+        **_ins_signals({name: samples[:: CSV_RATE_HZ // INS_RATE_HZ] for name, samples in truth.items()}),
+    }
+    if decimals is not None:
+        signals = {name: np.round(samples, decimals) for name, samples in signals.items()}
+    return Drive(seconds, signals, start_time), truth
+
+
+def drive_of(recording: Recording) -> Drive:
+    """A recording at 100 Hz as the sensors of Revs would have delivered it; its road-wheel angle is held at 1 kHz."""
+    assert recording.rate_hz == INS_RATE_HZ
+    signals = _ins_signals(recording.channels)
+    if "steer" in recording:
+        signals["roadWheelAngle"] = np.repeat(np.rad2deg(recording["steer"]), CSV_RATE_HZ // INS_RATE_HZ)
+    return Drive(len(recording) / INS_RATE_HZ, signals, recording.start_time)
+
+
+def write_csv(
+    path: Path,
+    drive: Drive,
+    *,
+    blank_rows: Mapping[str, int] | int = 37,
+    preamble: Sequence[str] = PREAMBLE,
+    encoding: str = "latin-1",
+    newline: str = "\r\n",
+) -> None:
+    """One official CSV file: lines about the drive, names, units, a row a millisecond; slower sensors' values are held.
+
+    Args:
+        path: of the file.
+        drive: what to write; columns that it lacks are filled with something.
+        blank_rows: blank rows at the head of every column slower than 1 kHz, or of the columns named.
+        preamble: lines above the names.
+        encoding: of preamble and units.
+        newline: of preamble, names and units.
+    """
+    arrays = []
+    for name, (_, rate, _) in COLUMNS.items():
+        values = _held(drive, name, rate)
+        blank = blank_rows.get(name, 0) if isinstance(blank_rows, Mapping) else (blank_rows if rate < CSV_RATE_HZ else 0)
+        arrays.append(pa.array(values, mask=np.arange(drive.rows()) < blank if blank else None))
+    with open(path, "wb") as stream:
+        header = [*preamble, ",".join(COLUMNS), ",".join(unit for unit, _, _ in COLUMNS.values())]
+        stream.write("".join(line + newline for line in header).encode(encoding))
+        options = pc.WriteOptions(include_header=False, quoting_style="none")
+        pc.write_csv(pa.table(arrays, names=list(COLUMNS)), stream, options)
+
+
+def write_mat(path: Path, drive: Drive, *, compressed: bool = True, late: Mapping[str, int] | None = None) -> None:
+    """One official MAT file: structs of channels, each a struct of value and time.
+
+    Args:
+        path: of the file.
+        drive: what to write; columns that it lacks are left out.
+        compressed: as MATLAB's -v7 does.
+        late: samples that a channel lacks at its head.
+    """
+    structs: dict[str, dict[str, dict[str, FloatArray]]] = {_INS: {}, _TYRE: {}, _DRIVER: {}}
+    for name, values in drive.signals.items():
+        _, rate, struct = COLUMNS.get(name, ("°", CSV_RATE_HZ, _TYRE))
+        first = (late or {}).get(name, 0)
+        stamps = drive.start_time + np.arange(len(values)) / rate
+        structs[struct][name] = {"value": values[first:, None], "time": stamps[first:, None]}
+    parameters = {name: {"value": np.asarray(values)[:, None], "units": unit} for name, (unit, values) in PARAMETERS.items()}
+    savemat(path, {**structs, "params": parameters}, do_compression=compressed, oned_as="column")
+
+
+def write_vehicle_parameters(path: Path, parameters: Mapping[str, tuple[str, Sequence[float]]] = PARAMETERS) -> None:
+    """One table of vehicle parameters: names, units, values; short columns end in blanks."""
+    longest = max(len(values) for _, values in parameters.values())
+    lines = [",".join(parameters), ",".join(unit for unit, _ in parameters.values())]
+    for row in range(longest):
+        lines.append(",".join(str(values[row]) if row < len(values) else "" for _, values in parameters.values()))
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
+
+
+def _ins_signals(channels: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Columns of the INS from channels in SI units."""
+    plain = {"vx": "vxCG", "ax": "axCG", "ay": "ayCG", "vy_ref": "vyCG"}
+    angular = {"yaw_rate": "yawRate", "roll": "rollAngle", "pitch": "pitchAngle", "roll_rate": "rollRate"}
+    angular |= {"pitch_rate": "pitchRate", "sideslip_ref": "sideSlip"}
+    signals = {column: np.asarray(channels[name]) for name, column in plain.items() if name in channels}
+    return signals | {column: np.rad2deg(channels[name]) for name, column in angular.items() if name in channels}
+
+
+def _held(drive: Drive, name: str, rate: int) -> FloatArray:
+    """A column of the CSV file, held between the samples of its sensor."""
+    if name == "time":
+        return np.round(drive.start_time + np.arange(drive.rows()) / CSV_RATE_HZ, 3)
+    values = drive.signals.get(name)
+    if values is None:
+        phase = list(COLUMNS).index(name)
+        values = np.round(10.0 * np.sin(0.37 * np.arange(-(-drive.rows() * rate // CSV_RATE_HZ)) * 10 / rate + phase), 5)
+    return np.repeat(values, CSV_RATE_HZ // rate)[: drive.rows()]
