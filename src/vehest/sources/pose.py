@@ -1,0 +1,94 @@
+"""Velocities in a car's own axes from where a motion capture system saw it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import signal
+
+from vehest.data.errors import DataError
+from vehest.data.recording import FloatArray
+
+UpAxis = Literal["y", "z"]
+
+
+@dataclass(frozen=True)
+class PlanarMotion:
+    """What a car does in the plane, in ISO 8855 axes.
+
+    Args:
+        vx: forward velocity of the reference point [m/s], shape (T,).
+        vy: leftward velocity of the reference point [m/s], shape (T,).
+        yaw_rate: yaw rate [rad/s], shape (T,).
+    """
+
+    vx: FloatArray
+    vy: FloatArray
+    yaw_rate: FloatArray
+
+
+def planar_motion(
+    positions: FloatArray,
+    yaw: FloatArray,
+    interval: float,
+    *,
+    window: int,
+    order: int,
+    mounting_yaw: float = 0.0,
+    lever: tuple[float, float] = (0.0, 0.0),
+) -> PlanarMotion:
+    """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+
+    Args:
+        positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
+        yaw: of the rigid body, unwrapped [rad], shape (T,).
+        interval: between two samples [s].
+        window: samples of the filter, odd.
+        order: of its polynomial.
+        mounting_yaw: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+        lever: from the rigid body's origin to the reference point, forward and left in the car's axes [m].
+
+    Source:
+        Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Analytical Chemistry 36 (8), 1964.
+    """
+    velocity_x, velocity_y = (signal.savgol_filter(positions[:, axis], window, order, deriv=1, delta=interval) for axis in (0, 1))
+    yaw_rate = signal.savgol_filter(yaw, window, order, deriv=1, delta=interval)
+    heading = signal.savgol_filter(yaw, window, order) + mounting_yaw
+    cosine, sine = np.cos(heading), np.sin(heading)
+    return PlanarMotion(
+        vx=cosine * velocity_x + sine * velocity_y - yaw_rate * lever[1],
+        vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * lever[0],
+        yaw_rate=yaw_rate,
+    )
+
+
+def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:
+    """Positions in the ground plane and unwrapped yaw, from poses in space.
+
+    Args:
+        positions: x, y, z in the world [m], shape (T, 3).
+        orientations: quaternions x, y, z, w from the rigid body's axes to the world's, shape (T, 4).
+        up: the world's and the rigid body's upward axis; ``y`` is the custom of motion capture, ``z`` of ROS.
+        where: file and topic, for messages.
+
+    Returns:
+        positions, shape (T, 2), and yaw [rad], shape (T,), both with z up.
+
+    Raises:
+        DataError: a quaternion is not of unit length.
+    """
+    length = np.linalg.norm(orientations, axis=1)
+    off = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
+    if len(off):
+        raise DataError(
+            f"{where}: {len(off)} orientations are no unit quaternions, the first in message {off[0] + 1} (length {length[off[0]]:.4g}); "
+            f"was the body out of sight? cut the range out"
+        )
+    x, y, z, w = (orientations / length[:, None]).T
+    plane = positions[:, :2]
+    if up == "y":  # turned about x by 90°: y becomes z, z becomes -y
+        plane = np.stack([positions[:, 0], -positions[:, 2]], axis=1)
+        y, z = -z, y
+    return plane, np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
