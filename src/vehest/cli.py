@@ -95,6 +95,9 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 def ingest(
     dataset: Dataset,
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    download: Annotated[
+        bool, typer.Option("--download", help="First fetch files that are missing, and compare checksums; goes on where a break left it.")
+    ] = False,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -103,6 +106,10 @@ def ingest(
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
     with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet) as workshop:
+        if download:
+            from vehest.stages.download import download_files
+
+            download_files(config, workshop)
         artefact = workshop.ingest(config)
     _say(
         as_json, {"folder": str(artefact.folder), "recordings": sorted(Path(n).stem for n in artefact.outputs), "skipped": artefact.skipped}

@@ -15,7 +15,7 @@ from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.splits import check_name
 
-COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept"})
+COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
 
 
 class Source(ABC):
@@ -63,6 +63,10 @@ class Source(ABC):
         Raises:
             DataError: its files cannot be used as they are.
         """
+
+    def file_names(self) -> list[str]:
+        """Files that the recordings are made of, as far as the configuration alone tells: what ``download`` fetches if it lists none."""
+        return []
 
     def recordings(self) -> Iterator[Recording]:
         """All recordings, one after another."""

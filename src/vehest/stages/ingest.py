@@ -17,7 +17,7 @@ from vehest.stages.code_version import code_version
 from vehest.stages.config import Config, missing_keys
 
 STAGE = "ingest"
-PROSE = frozenset({"path", "title", "licence", "citation"})  # of a data set's configuration; says nothing about its samples
+PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; says nothing about its samples
 
 
 def plan_ingest(config: Config) -> StagePlan:
