@@ -12,7 +12,7 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from vehest.data.errors import DataError
-from vehest.sources.mat_files import read_mat_file
+from vehest.sources.revs.mat_files import read_mat_file
 
 STAMPS = np.arange(50) / 100
 

@@ -25,9 +25,9 @@ from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
-from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag import RosbagSource
-from vehest.sources.stamps import uniform_times
+from vehest.sources.rosbag.pose import ground_plane, planar_motion
+from vehest.sources.rosbag.stamps import uniform_times
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.sources.base import Source, existing_folder, require_files
 from vehest.sources.columns import Column, columns_from_config, uniform_clock
-from vehest.sources.mdf_files import Signal, Wanted, read_measurement
+from vehest.sources.mdf.files import Signal, Wanted, read_measurement
 from vehest.sources.unit_spellings import require_unit
 
 OWN_KEYS = frozenset({"group", "interpolation", "max_gap"})  # of a channel, beside those of every column

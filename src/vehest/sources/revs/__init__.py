@@ -16,10 +16,10 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.sources.base import Source, existing_folder, require_files
 from vehest.sources.columns import columns_from_config, time_column_from_config, uniform_clock
-from vehest.sources.revs_csv import read_csv_columns, read_csv_head
-from vehest.sources.revs_mat import read_mat_columns
-from vehest.sources.revs_parameters import read_vehicle_parameters
-from vehest.sources.revs_text import read_text_columns, text_file
+from vehest.sources.revs.csv_layout import read_csv_columns, read_csv_head
+from vehest.sources.revs.mat_layout import read_mat_columns
+from vehest.sources.revs.parameters import read_vehicle_parameters
+from vehest.sources.revs.text_layout import read_text_columns, text_file
 from vehest.sources.unit_spellings import require_unit
 
 SUFFIXES = {"csv": ".csv", "mat": ".mat", "text": ""}

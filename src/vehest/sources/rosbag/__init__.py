@@ -16,11 +16,11 @@ import numpy as np
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.sources.archive import MOST_BYTES
-from vehest.sources.bag_declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
-from vehest.sources.bag_topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
 from vehest.sources.base import Source, existing_folder
-from vehest.sources.pose import ground_plane, planar_motion
-from vehest.sources.stamps import SampleTimes, stamped_times, uniform_times
+from vehest.sources.rosbag.declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
+from vehest.sources.rosbag.pose import ground_plane, planar_motion
+from vehest.sources.rosbag.stamps import SampleTimes, stamped_times, uniform_times
+from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval

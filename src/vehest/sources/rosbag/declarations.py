@@ -12,7 +12,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column, column_from_config
-from vehest.sources.pose import UpAxis
+from vehest.sources.rosbag.pose import UpAxis
 
 POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
 
@@ -69,7 +69,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Pose:
-    """How the reference is made of poses; see `vehest.sources.pose.planar_motion`.
+    """How the reference is made of poses; see `vehest.sources.rosbag.pose.planar_motion`.
 
     Args:
         topic: the topic's name in the data set.

@@ -12,7 +12,7 @@ import numpy as np
 from vehest.data.errors import DataError
 from vehest.data.recording import FloatArray
 from vehest.sources.columns import ClockPolicy, Column, uniform_clock
-from vehest.sources.mat_files import MatArray, read_mat_file
+from vehest.sources.revs.mat_files import MatArray, read_mat_file
 
 _VALUE = "value"
 _SLACK = 1e-2  # of an interval: as far as stamps may jitter
