@@ -386,6 +386,72 @@ def data_check(
         raise typer.Exit(3)
 
 
+@data_app.command("align")
+def data_align(
+    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
+    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    estimate: Annotated[
+        str,
+        typer.Option(
+            "--estimate", "-e", help="What to estimate, separated by commas: lever_arm, mounting, delay, offsets, steering_ratio."
+        ),
+    ] = "",
+    recording: Annotated[str | None, typer.Option("--recording", "-r", help="Which recording of the data set.")] = None,
+    wheelbase: Annotated[float | None, typer.Option("--wheelbase", help="For the steering ratio [m].")] = None,
+    steering_channel: Annotated[
+        str | None, typer.Option("--steering-channel", help="What to find the steering ratio of; by default handwheel, or else steer.")
+    ] = None,
+    cutoff: Annotated[float, typer.Option("--cutoff", help="Low-pass that both sides go through [Hz].")] = 2.0,
+    max_delay: Annotated[float, typer.Option("--max-delay", help="Largest delay to look for, either way [s].")] = 0.5,
+    tilt: Annotated[
+        float, typer.Option("--tilt", help="Roll and pitch of the body beyond what follows the accelerations [rad]; 0: free of gravity.")
+    ] = 0.001,
+    max_ay: Annotated[
+        float, typer.Option("--max-ay", help="For the steering ratio: lateral acceleration up to which it is used [m/s²].")
+    ] = 3.0,
+    min_speed: Annotated[float, typer.Option("--min-speed", help="For the steering ratio: speed from which it is used [m/s].")] = 5.0,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table, transforms and figure.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.
+
+    Prints what was found with its uncertainty, and the transforms that would correct it. Applies nothing.
+    """
+    from vehest.data.alignment import AlignmentSettings
+    from vehest.stages.align import (
+        PARAMETER_HEADER,
+        RESIDUAL_HEADER,
+        align_recording,
+        as_plain,
+        override_of,
+        parameter_rows,
+        refuse_other_files,
+        residual_rows,
+        write_alignment,
+    )
+
+    asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
+    settings = AlignmentSettings(asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed)
+    if out is not None:
+        refuse_other_files(out)
+    found = align_recording(source, overrides or [], recording, settings)
+    if out is not None:
+        write_alignment(found, out)
+    if as_json:
+        typer.echo(_json({**as_plain(found), "out": None if out is None else str(out)}))
+        return
+    typer.echo(f"{found.recording_id}: {found.kind}, {found.duration:.6g} s at {found.rate_hz:g} Hz; nothing is applied")
+    _table([*PARAMETER_HEADER], parameter_rows(found))
+    if found.residuals:
+        typer.echo("")
+        _table([*RESIDUAL_HEADER], residual_rows(found))
+    for note in found.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"to correct it: '{override_of(found)}'")
+    if out is not None:
+        typer.echo(f"written: {out}")
+
+
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
     from vehest.stages.signals import Stopped

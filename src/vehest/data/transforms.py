@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -253,11 +253,142 @@ class MountingCorrection:
         return replace(recording, channels={**recording.channels, "ax": rotated_x, "ay": rotated_y})
 
 
+@dataclass(frozen=True)
+class DelayCorrection:
+    """Bring channels that are late onto the clock of the others: each sample becomes what the sensor will show ``delay`` later.
+
+    Between samples a band-limited interpolation (sinc under a Kaiser window) is used; it is within 0.1 % up to 0.8 of the Nyquist
+    frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
+    interpolation, 16 samples, and by the delay at one of them.
+
+    Args:
+        delay: by how much the channels are late, negative if they are early [s].
+        channels: which channels; all measured ones if empty, never references.
+
+    Source:
+        Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing Magazine 13 (1), 1996.
+    """
+
+    delay: float
+    channels: tuple[str, ...] = ()
+    mode: ClassVar[Mode] = "offline"
+    reach: ClassVar[int] = 16
+    kaiser_beta: ClassVar[float] = 7.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.delay):
+            raise ConfigurationError(f"a delay must be a number of seconds, not {self.delay}")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Shift the channels, and cut the recording to the samples that then exist.
+
+        Raises:
+            DataError: a channel is missing or has gaps, or the recording is too short.
+        """
+        position = self.delay * recording.rate_hz
+        whole = round(position)
+        fraction = position - whole
+        if abs(fraction) < 1e-9:
+            taps, reach = np.ones(1), 0
+        else:
+            taps, reach = self._taps(fraction), self.reach
+        first, last = max(reach - whole, 0), len(recording) - max(reach + whole, 0)
+        if first >= last:
+            raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s")
+
+        def apply(samples: FloatArray) -> FloatArray:
+            # Output sample k is the sum of taps over the samples around k + whole.
+            neighbours = np.lib.stride_tricks.sliding_window_view(samples, len(taps))
+            shifted = np.full(len(samples), np.nan)
+            shifted[first:last] = neighbours[first + whole - reach : last + whole - reach] @ taps
+            return shifted[first:last]
+
+        chosen = self.channels or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
+        _require_no_gaps(recording, chosen)
+        channels = {name: samples[first:last] for name, samples in recording.channels.items()}
+        channels |= {name: apply(recording[name]) for name in chosen}
+        return replace(recording, start_time=recording.start_time + first / recording.rate_hz, channels=channels)
+
+    def _taps(self, fraction: float) -> FloatArray:
+        distance = np.arange(-self.reach, self.reach + 1) - fraction
+        inside = np.clip(1.0 - np.square(distance / (self.reach + 1)), 0.0, None)
+        taps = np.sinc(distance) * np.i0(self.kaiser_beta * np.sqrt(inside)) / np.i0(self.kaiser_beta)
+        return np.asarray(taps / taps.sum(), dtype=np.float64)  # a constant stays that constant
+
+
+@dataclass(frozen=True)
+class OffsetCorrection:
+    """Take constant offsets off channels.
+
+    Args:
+        offsets: channel -> what its sensor shows too much, in the channel's unit.
+    """
+
+    offsets: Mapping[str, float] = field(hash=False)
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.offsets, Mapping) or not self.offsets:
+            raise ConfigurationError(f"offsets are a mapping from channels to values, such as {{ax: 0.1}}, not {self.offsets!r}")
+        for name, value in self.offsets.items():
+            if name not in CHANNELS:
+                raise ConfigurationError(f"offset of '{name}': there is no such channel; 'vehest data channels' lists them")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise ConfigurationError(f"offset of '{name}' must be a number, not {value!r}")
+        object.__setattr__(self, "offsets", dict(self.offsets))
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Subtract the offsets.
+
+        Raises:
+            DataError: a channel is missing.
+        """
+        changed = {name: recording[name] - value for name, value in self.offsets.items()}
+        return replace(recording, channels={**recording.channels, **changed})
+
+
+@dataclass(frozen=True)
+class SteeringRatio:
+    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio.
+
+    Args:
+        ratio: how far the angle turns for a unit of ``steer``; negative if it counts the other way.
+        offset: what it shows going straight ahead [rad].
+        channel: the angle; ``steer`` itself may be it.
+    """
+
+    ratio: float
+    offset: float = 0.0
+    channel: str = "handwheel"
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.ratio) and self.ratio != 0.0 and math.isfinite(self.offset)):
+            raise ConfigurationError(
+                f"a steering ratio must be a number other than zero and its offset a number, not {self.ratio} and {self.offset}"
+            )
+        if self.channel not in CHANNELS:
+            raise ConfigurationError(f"steering ratio of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``steer``; it has gaps where the angle has them.
+
+        Raises:
+            DataError: the channel is missing.
+        """
+        steer = (recording[self.channel] - self.offset) / self.ratio
+        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
+        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
+
+
 TRANSFORMS: dict[str, type] = {
     "resample": Resample,
     "low_pass": LowPass,
     "remove_outliers": RemoveOutliers,
     "mounting_correction": MountingCorrection,
+    "delay_correction": DelayCorrection,
+    "offset_correction": OffsetCorrection,
+    "steering_ratio": SteeringRatio,
 }
 
 
