@@ -222,7 +222,9 @@ def test_transforms_are_built_from_plain_values() -> None:
     assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}) == LowPass(5, ("ax", "ay"))
     assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
-    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction"}
+    # Those of an alignment are built from plain values in test_alignment.py.
+    of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
+    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction"} | of_an_alignment
 
 
 @pytest.mark.parametrize(
