@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import vehest.sources as package
 from vehest.data.errors import ConfigurationError, MissingError
@@ -28,7 +28,8 @@ class Source(ABC):
         ConfigurationError: a key that this source does not know, or one that is missing.
     """
 
-    keys: frozenset[str] = frozenset()
+    keys: ClassVar[frozenset[str]] = frozenset()
+    slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)

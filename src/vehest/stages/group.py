@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from vehest.data.splits import Split
 from vehest.evaluation.metrics import Protocol
 from vehest.stages.artefacts import Artefact, Status, find, make
@@ -82,7 +84,11 @@ def is_finished(group: Group, member: Member) -> bool:
 
 
 def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
-    """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted."""
+    """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+
+    On one thread: recursions over small states gain nothing from more, and groups run side by side.
+    """
+    torch.set_num_threads(1)
     models = {member.job.plan.key: member.model for member in existing(group)}
     if "train" in group.force:
         for job in group.jobs:

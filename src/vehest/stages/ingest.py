@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.files import sha256_of
+from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
 from vehest.sources.base import Source, open_source, source_module
 from vehest.stages.artefacts import StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.config import Config, missing_keys
+from vehest.stages.launcher import Failure, Task, launch
+from vehest.stages.signals import StopSignals
+from vehest.training.context import Progress
 
 STAGE = "ingest"
+PARTS_PREFIX = ".parts-"
+Report = Callable[[int, int, str], None]
 PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; says nothing about its samples
 
 
@@ -48,25 +56,86 @@ def plan_ingest(config: Config) -> StagePlan:
     )
 
 
-def write_ingest(config: Config, folder: Path, report: Any = None) -> None:
+def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
     """Read every recording, check it, and write it into ``folder``.
+
+    Where recordings take long to make, they are made side by side, and those that are done are kept beside the artefacts until all
+    are: a run that was interrupted goes on with the missing ones.
 
     Args:
         config: as composed for ``ingest``.
+        plan: of this ingest.
         folder: empty.
-        report: called with (recordings done, recordings in all, name of the next) before each.
+        jobs: processes.
+        stop: when a signal came, no other recording is begun.
+        report: called with (recordings done, recordings in all, name of one that was begun).
 
     Raises:
         DataError: a recording cannot be used as it is.
+        Stopped: a signal came.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
+    if source.slow:
+        _make_side_by_side(config["dataset"], ids, plan, folder, jobs, stop, report)
+        return
     for position, recording_id in enumerate(ids):
-        if report is not None:
-            report(position, len(ids), recording_id)
-        recording = source.read(recording_id)
-        refuse_unusable(recording, source)
-        write_recording(recording, folder / f"{_file_name(recording_id)}.parquet")
+        report(position, len(ids), recording_id)
+        _make(source, recording_id, folder)
+
+
+def _make_side_by_side(
+    dataset: Mapping[str, Any], ids: Sequence[str], plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report
+) -> None:
+    parts = _parts_of(plan)
+    parts.mkdir(parents=True, exist_ok=True)
+    remove_leftovers(parts)
+    missing = [recording_id for recording_id in ids if not (parts / _file_name(recording_id)).is_file()]
+    tasks = [Task(recording_id, partial(_make_part, dict(dataset), recording_id, parts)) for recording_id in missing]
+    made, failures = [recording_id for recording_id in ids if recording_id not in missing], []
+    for end in launch(tasks, jobs, stop, lambda at, _: report(len(made), len(ids), tasks[at].name)):
+        if isinstance(end.outcome, Failure):
+            failures.append(end.outcome)
+        else:
+            made.append(end.outcome)
+            report(len(made), len(ids), "")
+    stop.raise_if_requested()
+    if failures:
+        error = DataError(failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""))
+        error.exit_code = failures[0].exit_code
+        raise error
+    for recording_id in ids:
+        name = _file_name(recording_id)
+        _link(parts / name, folder / name)
+
+
+def drop_parts(plan: StagePlan) -> None:
+    """Remove what was kept for an ingest that is finished."""
+    remove(_parts_of(plan))
+
+
+def _parts_of(plan: StagePlan) -> Path:
+    return plan.folder.with_name(f"{PARTS_PREFIX}{plan.folder.name}")
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # not every file system has links
+        shutil.copyfile(source, target)
+
+
+def _make_part(
+    dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
+) -> str:
+    _make(open_source(dataset), recording_id, parts)
+    return recording_id
+
+
+def _make(source: Source, recording_id: str, folder: Path) -> None:
+    recording = source.read(recording_id)
+    refuse_unusable(recording, source)
+    write_recording(recording, folder / _file_name(recording_id))
 
 
 def refuse_unusable(recording: Recording, source: Source) -> None:
@@ -87,4 +156,4 @@ def refuse_unusable(recording: Recording, source: Source) -> None:
 def _file_name(recording_id: str) -> str:
     if not recording_id or recording_id.startswith(".") or any(character in recording_id for character in "/\\\0"):
         raise DataError(f"a recording cannot be called '{recording_id}': its name is a file's name in the store")
-    return recording_id
+    return f"{recording_id}.parquet"

@@ -79,7 +79,6 @@ def default_jobs() -> int:
 
 
 def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
-    use_one_thread()
     for position, task in enumerate(tasks):
         if stop.requested():
             return
@@ -117,11 +116,10 @@ _worker: dict[str, Any] = {}
 
 
 def _start_worker(stopping: Any, messages: Any, parent: int) -> None:
-    """Leave signals to the parent, end with it, and use one thread."""
+    """Leave signals to the parent, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    use_one_thread()
     _worker.update(stopping=stopping, messages=messages)
 
 
@@ -156,10 +154,3 @@ def _guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: 
         import traceback
 
         return Failure(f"{type(error).__name__}: {error}", detail=traceback.format_exc())
-
-
-def use_one_thread() -> None:
-    """Recursions over small states gain nothing from more threads, and jobs run side by side."""
-    import torch
-
-    torch.set_num_threads(1)

@@ -1,0 +1,84 @@
+"""Recordings that take long to make are kept as soon as they are done; an ingest that was interrupted goes on with the rest."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from place import Place
+from vehest.data.errors import DataError
+from vehest.data.store import read_recording
+from vehest.sources.tabular import TabularSource
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Tables that count as slow; the names that were read."""
+    read, names = TabularSource.read, []
+
+    def counted(self: TabularSource, recording_id: str):
+        names.append(recording_id)
+        return read(self, recording_id)
+
+    monkeypatch.setattr(TabularSource, "slow", True)
+    monkeypatch.setattr(TabularSource, "read", counted)
+    return names
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
+    read = TabularSource.read
+
+    def fails(self: TabularSource, recording_id: str):
+        if recording_id == name:
+            raise error
+        return read(self, recording_id)
+
+    monkeypatch.setattr(TabularSource, "read", fails)
+
+
+def ingested(place: Place) -> Path:
+    code, out, err = place("ingest", "mine", "--jobs", "1", "--json")
+    assert code == 0, err
+    return Path(json.loads(out)["folder"])
+
+
+def test_what_was_finished_before_a_failure_is_not_made_again(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        failing(broken, "three", DataError("'three.csv' is unwell"))
+        code, _, err = place("ingest", "mine", "--jobs", "1")
+        assert code == 3
+        assert err.strip() == "error: 'three.csv' is unwell"
+        assert [folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")] == []
+    assert slow == ["one", "two"]
+    folder = ingested(place)
+    assert slow == ["one", "two", "three"]
+    assert sorted(file.stem for file in folder.glob("*.parquet")) == ["one", "three", "two"]
+    assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [folder.name], "nothing is left beside it"
+
+
+def test_an_interruption_keeps_what_is_done(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        failing(broken, "three", KeyboardInterrupt())
+        assert place("ingest", "mine", "--jobs", "1")[0] == 130
+    ingested(place)
+    assert slow == ["one", "three", "two"], "each is read once"
+
+
+def test_side_by_side_makes_the_same_samples(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = {file.name: read_recording(file) for file in ingested(place).glob("*.parquet")}
+    monkeypatch.setattr(TabularSource, "slow", True)
+    code, out, err = place("ingest", "mine", "--force", "--jobs", "2", "--json")
+    assert code == 0, err
+    for file in Path(json.loads(out)["folder"]).glob("*.parquet"):
+        again = read_recording(file)
+        assert all((again[name] == plain[file.name][name]).all() for name in again.channels)
+
+
+def test_a_part_of_other_settings_is_not_used(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as broken:
+        failing(broken, "three", DataError("unwell"))
+        assert place("ingest", "mine", "--jobs", "1")[0] == 3
+    assert place("ingest", "mine", "--jobs", "1", "dataset.vehicle=another")[0] == 0
+    assert slow == ["one", "two", "one", "three", "two"]
