@@ -1,4 +1,4 @@
-"""Courses: closed roads made of straights and corners whose curvature is piecewise linear in arc length."""
+"""Courses: closed roads made of straights and corners, with bank, grade and friction along them."""
 
 from __future__ import annotations
 
@@ -9,45 +9,15 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from vehest.data.errors import ConfigurationError
+from vehest.simulation.segments import Compound, Corner, Segment, Straight
+from vehest.simulation.tracks import LAYOUTS, Layout
+
+__all__ = ["Compound", "Corner", "Course", "Layout", "Straight", "build_course", "course_by_name"]
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Straight:
-    """A straight; its length [m] is nominal, see build_course."""
-
-    length: float
-
-
-@dataclass(frozen=True)
-class Corner:
-    """A corner: clothoid, circular arc, clothoid.
-
-    Args:
-        radius: of the arc [m].
-        angle: change of heading, positive to the left [rad].
-        transition: length of each clothoid [m].
-    """
-
-    radius: float
-    angle: float
-    transition: float
-
-    @property
-    def curvature(self) -> float:
-        """Of the arc, positive to the left [1/m]."""
-        return math.copysign(1.0 / self.radius, self.angle)
-
-    @property
-    def arc(self) -> float:
-        """Length of the circular part [m]; each clothoid turns by half its length times the arc's curvature."""
-        return abs(self.angle) * self.radius - self.transition
-
-
-Segment = Straight | Corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +30,9 @@ class Course:
         x, y: (N,) [m].
         heading: (N,), not wrapped [rad].
         curvature: (N,), positive to the left [1/m].
+        bank: (N,), positive with the left side higher [rad].
+        grade: (N,), positive downhill [rad].
+        friction: (N,), scale of the tyres' friction on the dry road.
     """
 
     name: str
@@ -68,6 +41,9 @@ class Course:
     y: FloatArray
     heading: FloatArray
     curvature: FloatArray
+    bank: FloatArray
+    grade: FloatArray
+    friction: FloatArray
 
     @property
     def length(self) -> float:
@@ -85,7 +61,7 @@ class Course:
         return float(self.heading[-1] - self.heading[0])
 
 
-def build_course(name: str, segments: Sequence[Segment], spacing: float = 1.0) -> Course:
+def build_course(name: str, segments: Sequence[Segment] | Layout, spacing: float = 1.0) -> Course:
     """A closed course from its segments, starting at the origin along the x axis.
 
     The corners are kept as they are and must turn by a full circle in total; the course is closed by the smallest
@@ -95,13 +71,14 @@ def build_course(name: str, segments: Sequence[Segment], spacing: float = 1.0) -
         ConfigurationError: the corners do not add up to a circle, a corner is too short for its clothoids, or a
             straight would have to become negative.
     """
-    for segment in segments:
-        if isinstance(segment, Corner) and segment.arc < 0:
+    layout = segments if isinstance(segments, Layout) else Layout(tuple(segments))
+    for segment in layout.segments:
+        if isinstance(segment, Corner | Compound) and segment.arc < 0:
             raise ConfigurationError(f"course '{name}': {segment} is too short for its transitions")
-    turning = sum(segment.angle for segment in segments if isinstance(segment, Corner))
+    turning = sum(segment.angle for segment in layout.segments)
     if abs(abs(turning) - 2.0 * math.pi) > 1e-9:
         raise ConfigurationError(f"course '{name}': its corners turn by {math.degrees(turning):.6g}°, not by ±360°")
-    return _trace(name, _close(name, segments), spacing)
+    return _trace(name, Layout(tuple(_close(name, layout.segments)), layout.crossfall, layout.heights, layout.friction), spacing)
 
 
 def course_by_name(name: str) -> Course:
@@ -122,7 +99,7 @@ def _build_by_name(name: str) -> Course:
 
 def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
     """The segments with the straights' lengths changed so that the end meets the start."""
-    traced = _trace(name, segments, spacing=1.0)
+    traced = _trace(name, Layout(tuple(segments)), spacing=1.0)
     headings = _headings_of_straights(segments)
     directions = np.stack([np.cos(headings), np.sin(headings)])
     change = -np.linalg.pinv(directions) @ np.array([traced.x[-1], traced.y[-1]])
@@ -140,35 +117,52 @@ def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
 def _headings_of_straights(segments: Sequence[Segment]) -> FloatArray:
     headings, heading = [], 0.0
     for segment in segments:
-        if isinstance(segment, Corner):
-            heading += segment.angle
-        else:
+        heading += segment.angle
+        if isinstance(segment, Straight):
             headings.append(heading)
     return np.array(headings)
 
 
-def _trace(name: str, segments: Sequence[Segment], spacing: float) -> Course:
-    nodes, curvatures = _curvature_nodes(segments)
+def _trace(name: str, layout: Layout, spacing: float) -> Course:
+    nodes, curvatures, banks = _nodes(layout.segments)
     n_cells = math.ceil(nodes[-1] / spacing)
     arc_length = np.linspace(0.0, nodes[-1], n_cells + 1)
     heading_at = _HeadingProfile(nodes, curvatures)
     x, y = _integrate_position(np.union1d(arc_length, nodes), heading_at, arc_length)
-    return Course(name, arc_length, x, y, heading_at(arc_length), np.interp(arc_length, nodes, curvatures))
+    return Course(
+        name=name,
+        arc_length=arc_length,
+        x=x,
+        y=y,
+        heading=heading_at(arc_length),
+        curvature=np.interp(arc_length, nodes, curvatures),
+        bank=layout.crossfall + np.interp(arc_length, nodes, banks),
+        grade=_grade(layout.heights, arc_length),
+        friction=_friction(layout.friction, arc_length),
+    )
 
 
-def _curvature_nodes(segments: Sequence[Segment]) -> tuple[FloatArray, FloatArray]:
-    """Arc lengths (M,) and curvatures (M,) between which the curvature is linear."""
-    nodes, curvatures = [0.0], [0.0]
-    for segment in segments:
-        if isinstance(segment, Straight):
-            pieces = [(segment.length, 0.0)]
-        else:
-            at_arc = segment.curvature
-            pieces = [(segment.transition, at_arc), (segment.arc, at_arc), (segment.transition, 0.0)]
-        for length, curvature in pieces:
-            nodes.append(nodes[-1] + length)
-            curvatures.append(curvature)
-    return np.array(nodes), np.array(curvatures)
+def _nodes(segments: Sequence[Segment]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arc lengths (M,), with the curvatures (M,) and banks (M,) between which both are linear."""
+    pieces = np.array([(0.0, 0.0, 0.0), *(piece for segment in segments for piece in segment.pieces())])
+    return np.cumsum(pieces[:, 0]), pieces[:, 1], pieces[:, 2]
+
+
+def _grade(heights: Sequence[tuple[float, float]], arc_length: FloatArray) -> FloatArray:
+    """Downward slope [rad] of a periodic cubic spline through heights [m] at shares of the lap."""
+    if not heights:
+        return np.zeros_like(arc_length)
+    places = np.array([*(place for place, _ in heights), heights[0][0] + 1.0]) * arc_length[-1]
+    spline = CubicSpline(places, [*(height for _, height in heights), heights[0][1]], bc_type="periodic")
+    return np.asarray(-np.arctan(spline(arc_length, 1)))
+
+
+def _friction(patches: Sequence[tuple[float, float, float]], arc_length: FloatArray) -> FloatArray:
+    friction = np.ones_like(arc_length)
+    for begin, end, scale in patches:
+        place = arc_length / arc_length[-1]
+        friction[(place >= begin) & (place < end)] = scale
+    return friction
 
 
 class _HeadingProfile:
@@ -195,39 +189,3 @@ def _integrate_position(cells: FloatArray, heading_at: _HeadingProfile, arc_leng
     x = np.concatenate([[0.0], np.cumsum(half * (np.cos(headings) @ weights))])
     y = np.concatenate([[0.0], np.cumsum(half * (np.sin(headings) @ weights))])
     return x[keep], y[keep]
-
-
-def _left(radius: float, degrees: float, transition: float) -> Corner:
-    return Corner(radius, math.radians(degrees), transition)
-
-
-def _right(radius: float, degrees: float, transition: float) -> Corner:
-    return Corner(radius, -math.radians(degrees), transition)
-
-
-LAYOUTS: dict[str, tuple[Segment, ...]] = {
-    "handling": (
-        Straight(443.0),
-        _left(60.0, 110.0, 30.0),
-        Straight(56.0),
-        _right(45.0, 80.0, 25.0),
-        Straight(77.0),
-        _left(32.0, 150.0, 20.0),
-        Straight(137.0),
-        _right(110.0, 60.0, 40.0),
-        Straight(23.0),
-        _left(80.0, 100.0, 35.0),
-        Straight(77.0),
-        _right(26.0, 120.0, 18.0),
-        Straight(69.0),
-        _left(38.0, 130.0, 22.0),
-        Straight(50.0),
-        _left(150.0, 60.0, 50.0),
-        Straight(54.0),
-        _right(70.0, 50.0, 30.0),
-        Straight(54.0),
-        _left(50.0, 120.0, 25.0),
-        Straight(83.0),
-    ),
-}
-"""Segments of the courses by name; all values are assumed, chosen for a wide range of radii in both directions."""

@@ -1,4 +1,4 @@
-"""One simulated drive: a driver takes a vehicle around a course, sensors make a recording of it."""
+"""One simulated drive: a driver takes a vehicle through a manoeuvre, sensors make a recording of it."""
 
 from __future__ import annotations
 
@@ -12,23 +12,55 @@ from numpy.typing import NDArray
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.simulation import plant as multi_body
+from vehest.simulation.car import Car, car_of
 from vehest.simulation.compiled import LIBRARY, LIBRARY_VERSION
-from vehest.simulation.course import Course
-from vehest.simulation.driver import Command, Driver, DrivingStyle, Observation, command, draw_style, plan_drive
+from vehest.simulation.driver import DRIVER_RATE_HZ, Command, Observation
 from vehest.simulation.errors import SimulationError
+from vehest.simulation.manoeuvre import SETTLING_TIME, Controller, Manoeuvre
 from vehest.simulation.motion import Motion
 from vehest.simulation.parameters import Vehicle
-from vehest.simulation.plant import MultiBodyPlant
+from vehest.simulation.plant import MultiBodyPlant, PlantState, road_gravity
+from vehest.simulation.regimes import GRAVITY, STEER, VX, VY, YAW, YAW_RATE, X, Y
 from vehest.simulation.sensors import SensorLevels, measure
+from vehest.simulation.stability import StabilityControl, StabilityState
+from vehest.simulation.stability import stability_control as make_stability_control
+from vehest.simulation.surface import SURFACES, Surface
 
 FloatArray = NDArray[np.float64]
 
-DRIVER_RATE_HZ = 100.0
-SETTLING_TIME = 2.0
-"""Driven before the first sample, because the plant's initial state is not quite its equilibrium [s]."""
-LOST = 10.0
-"""Distance from the line at which a drive has failed [m]."""
+AFTER_STAND = 1.0
+"""Recorded after the car has come to its stand [s]."""
+LONGEST_STOP = 60.0
+"""Within which a car stands that spun or left the road [s]."""
+STOPPING_SHARE = 0.7
+"""Share of the grip with which a driver brakes after a spin or beside the road; assumed."""
+
+
+@dataclass(frozen=True)
+class Flags:
+    """How a drive went.
+
+    Args:
+        spun: the car slid beyond what its equations of rolling hold for.
+        left_road: it was further beside its line than the manoeuvre's half_width.
+        stood: it stands at the end.
+        completed: the manoeuvre came to its own end, and was not cut off because it took too long.
+        gave_up_at: when the driver began to stop because of a spin or beside the road [s]; none if never.
+        largest_lateral_error: distance from the line [m]; none where there is no line.
+        largest_sideslip: above 1 m/s, either sign [rad].
+        largest_ay: either sign [m/s²].
+        stability_share: of the recorded time in which stability control intervened; none where it is off.
+    """
+
+    spun: bool
+    left_road: bool
+    stood: bool
+    completed: bool
+    gave_up_at: float | None
+    largest_lateral_error: float | None
+    largest_sideslip: float
+    largest_ay: float
+    stability_share: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,53 +69,54 @@ class Trip:
 
     Args:
         motion: true motion, first sample after the settling time.
-        lateral_error: the car's place left of its line [m], (T,).
-        style: how the driver drove.
+        lateral_error: the car's place left of its line [m], (T,); NaN where there is no line.
+        flags: how it went.
+        drawn: what the seed decided.
     """
 
     motion: Motion
     lateral_error: FloatArray
-    style: DrivingStyle
+    flags: Flags
+    drawn: dict[str, Any]
 
 
 def simulate_drive(
     *,
     id: str,
     vehicle: Vehicle,
-    course: Course,
-    duration: float,
+    manoeuvre: Manoeuvre,
     seed: int,
     rate_hz: float = 100.0,
-    driver: Driver | None = None,
-    style: DrivingStyle | None = None,
     sensors: SensorLevels | None = None,
+    stability_control: bool = False,
+    surface: Surface | None = None,
     step: float = 1e-3,
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
+    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; provenance says so under ``flags``.
+
     Args:
         id: name of the recording.
         vehicle: the car.
-        course: where it drives, from the start of the course.
-        duration: of the recording [s].
-        seed: of the driver's style and the sensors' errors, zero or positive.
+        manoeuvre: what it does.
+        seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        driver: how the driver drives; by default Driver().
-        style: how this drive differs from others; by default drawn by the seed.
         sensors: levels of the sensors' errors; by default SensorLevels().
+        stability_control: whether the car has it switched on.
+        surface: of the road; by default dry.
         step: of the plant [s].
 
     Raises:
-        ConfigurationError: a value that makes no sense.
-        SimulationError: the car rolled over, spun, stalled or lost its course.
+        ConfigurationError: a value that makes no sense, or a car that cannot do the manoeuvre.
+        SimulationError: the car rolled over, or a state is not finite.
     """
     if seed < 0:
         raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
-    driver, sensors = driver or Driver(), sensors or SensorLevels()
-    style = style or draw_style(seed)
+    sensors, surface = sensors or SensorLevels(), surface or SURFACES["dry"]
     plant = MultiBodyPlant(vehicle, step)
     try:
-        trip = drive_course(plant=plant, course=course, driver=driver, style=style, duration=duration, rate_hz=rate_hz)
+        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control)
     except SimulationError as error:
         raise SimulationError(f"drive '{id}' with seed {seed}: {error}") from error
     return Recording(
@@ -100,53 +133,169 @@ def simulate_drive(
                 "parameter_set": vehicle.parameter_set,
                 "overrides": vehicle.overrides,
                 "plant_step": step,
-                "course": course.name,
-                "course_length": course.length,
+                "manoeuvre": manoeuvre.description(),
+                "drawn": trip.drawn,
+                "surface": asdict(surface),
+                "stability_control": stability_control,
                 "seed": seed,
-                "driver": asdict(driver),
-                "style": asdict(trip.style),
                 "sensors": asdict(sensors),
-                "largest_lateral_error": float(np.max(np.abs(trip.lateral_error))),
+                "flags": asdict(trip.flags),
             }
         ),
     )
 
 
-def drive_course(*, plant: MultiBodyPlant, course: Course, driver: Driver, style: DrivingStyle, duration: float, rate_hz: float) -> Trip:
-    """Drive a car around a course and keep its true motion.
+def drive(
+    plant: MultiBodyPlant,
+    manoeuvre: Manoeuvre,
+    seed: int,
+    *,
+    rate_hz: float = 100.0,
+    surface: Surface | None = None,
+    stability_control: bool = False,
+) -> Trip:
+    """Drive a car through a manoeuvre and keep its true motion.
 
     Raises:
-        ConfigurationError: duration, rate or step make no sense.
-        SimulationError: the car rolled over, spun, stalled or lost its course.
+        ConfigurationError: rate or step make no sense, or the car cannot do the manoeuvre.
+        SimulationError: the car rolled over, or a state is not finite.
     """
-    n_samples = round(duration * rate_hz) if math.isfinite(duration * rate_hz) else 0
-    if n_samples < 1:
-        raise ConfigurationError(f"a drive of {duration} s at {rate_hz} Hz has no samples")
     per_command = _whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = _whole_steps(rate_hz, plant.step, "sampling")
-    stride = math.gcd(per_command, per_sample)
-    first_sample = math.ceil(SETTLING_TIME / (plant.step * stride)) * stride
+    car, surface = car_of(plant), surface or SURFACES["dry"]
+    controller = manoeuvre.controller(car, surface, seed)
+    half_width = float(getattr(manoeuvre, "half_width", math.inf))
+    log = _Log(rate_hz)
+    control = make_stability_control(plant) if stability_control else None
+    ride = _Ride(plant, car, controller, control, half_width, manoeuvre.longest)
 
-    plan = plan_drive(course, driver, style, distance=driver.top_speed * (duration + SETTLING_TIME))
-    states = np.empty((n_samples, multi_body.N_STATES))
-    derivatives = np.empty_like(states)
-    lateral_error = np.empty(n_samples)
-    state = plant.initial_state(plan.x[0], plan.y[0], plan.heading[0], plan.speed[0])
-    inputs, decision = np.zeros(2), Command(0.0, 0.0, progress=0.0, lateral_error=0.0)
-    for now in range(0, first_sample + (n_samples - 1) * per_sample + 1, stride):
-        if now % per_command == 0:
-            decision = command(plan, driver, plant.wheelbase, decision.progress, _observe(state))
-            inputs = np.array([decision.steering_velocity, decision.acceleration])
-        sample, remainder = divmod(now - first_sample, per_sample)
-        if remainder == 0 and sample >= 0:
-            states[sample], derivatives[sample] = state, plant.derivative(state, inputs)
-            lateral_error[sample] = decision.lateral_error
+    stride = math.gcd(per_command, per_sample)
+    first_sample = math.ceil(SETTLING_TIME / (plant.step * per_command)) * per_command
+    now = 0
+    while True:
+        time = (now - first_sample) * plant.step
+        if now % per_command == 0 and not ride.decide(time):
+            break
+        if now >= first_sample and (now - first_sample) % per_sample == 0:
+            log.keep(ride)
         try:
-            state = plant.advance(state, inputs, stride)
-            _require_on_course(decision)
+            ride.state = plant.advance(ride.state, ride.inputs, stride, ride.decision.friction)
         except SimulationError as error:
-            raise SimulationError(f"course '{course.name}', {now * plant.step:.2f} s after the start: {error}") from error
-    return Trip(plant.motion(states, derivatives, rate_hz), lateral_error, style)
+            raise SimulationError(f"manoeuvre '{manoeuvre.name}', {time:.2f} s after the first sample: {error}") from error
+        now += stride
+    if not log.states:
+        raise ConfigurationError(f"manoeuvre '{manoeuvre.name}' is over before the first sample at {rate_hz} Hz")
+    return log.trip(plant, ride, controller.drawn)
+
+
+class _Ride:
+    """A car, its driver, and how it goes at the moment."""
+
+    def __init__(
+        self,
+        plant: MultiBodyPlant,
+        car: Car,
+        controller: Controller,
+        stability_control: StabilityControl | None,
+        half_width: float,
+        longest: float,
+    ) -> None:
+        self._car, self._controller, self._half_width, self._longest = car, controller, half_width, longest
+        self.stability_control, self.stability = stability_control, StabilityState()
+        self.state = plant.initial_state(*controller.start)
+        self.inputs = np.zeros(5)
+        self.decision = Command(0.0, 0.0)
+        self.bank = self.grade = 0.0
+        self.left_road = self.completed = False
+        self.gave_up_at: float | None = None
+        self._stands_since: float | None = None
+
+    def decide(self, time: float) -> bool:
+        """The driver's next command [s]; false if the drive is over."""
+        seen = _observe(self.state)
+        self.decision = decision = self._controller.command(time, seen)
+        self._judge(time, decision)
+        if self._is_over(time, decision):
+            return False
+        steering_velocity, acceleration = decision.steering_velocity, decision.acceleration
+        if self.gave_up_at is not None:
+            steering_velocity = max(-0.5, min(0.5, -seen.steer / 0.3)) * self._car.steering_rate
+            acceleration = -STOPPING_SHARE * self._car.grip * decision.friction
+        along, across = self._slope(seen.yaw)
+        drag = self._car.drag * seen.speed
+        if self.stability_control is not None:
+            self.stability = self.stability_control.step(
+                self.stability, 1.0 / DRIVER_RATE_HZ, steer=seen.steer, vx=seen.vx, yaw_rate=seen.yaw_rate, friction=decision.friction
+            )
+        moment = self.stability.moment
+        self.inputs = np.array([steering_velocity, acceleration, moment, along - drag * seen.vx, across - drag * seen.vy])
+        return True
+
+    def _judge(self, time: float, decision: Command) -> None:
+        if self.gave_up_at is None and abs(decision.lateral_error) > self._half_width:
+            self.left_road = True
+        if self.gave_up_at is None and (self.left_road or self.state.spun):
+            self.gave_up_at = time
+        if not self.state.stands:
+            self._stands_since = None
+        elif self._stands_since is None:
+            self._stands_since = time
+
+    def _is_over(self, time: float, decision: Command) -> bool:
+        if self._stands_since is not None and time >= self._stands_since + AFTER_STAND - 1e-9:
+            self.completed = self.gave_up_at is None
+            return True
+        if self.gave_up_at is not None:
+            return time > self.gave_up_at + LONGEST_STOP
+        self.completed = self._stands_since is None and decision.finished
+        return self.completed or (self._stands_since is None and time >= self._longest - 1e-9)
+
+    def _slope(self, yaw: float) -> tuple[float, float]:
+        """Gravity along and across the car [m/s²]; keeps bank and grade as the car has them."""
+        decision = self.decision
+        if decision.bank == 0.0 and decision.grade == 0.0:
+            self.bank = self.grade = 0.0
+            return 0.0, 0.0
+        along_road, across_road = road_gravity(decision.bank, decision.grade)
+        sine, cosine = math.sin(yaw - decision.heading), math.cos(yaw - decision.heading)
+        along, across = along_road * cosine + across_road * sine, across_road * cosine - along_road * sine
+        self.bank, self.grade = math.asin(-across / GRAVITY), math.asin(along / GRAVITY)
+        return along, across
+
+
+class _Log:
+    """Samples of a ride."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self.states: list[PlantState] = []
+        self._inputs: list[FloatArray] = []
+        self._road: list[tuple[float, float, float, float]] = []
+        self._interventions = 0
+
+    def keep(self, ride: _Ride) -> None:
+        self.states.append(ride.state)
+        self._inputs.append(ride.inputs)
+        self._interventions += ride.stability.active
+        self._road.append((ride.decision.friction, ride.bank, ride.grade, ride.decision.lateral_error))
+
+    def trip(self, plant: MultiBodyPlant, ride: _Ride, drawn: dict[str, Any]) -> Trip:
+        friction, bank, grade, lateral_error = np.array(self._road).T
+        motion = plant.motion(self.states, np.array(self._inputs), self._rate_hz, friction=friction, bank=bank, grade=grade)
+        moving = np.hypot(motion.vx, motion.vy) > 1.0
+        on_line = np.abs(lateral_error[np.isfinite(lateral_error)])
+        flags = Flags(
+            spun=ride.state.spun,
+            left_road=ride.left_road,
+            stood=ride.state.stands,
+            completed=ride.completed,
+            gave_up_at=ride.gave_up_at,
+            largest_lateral_error=float(on_line.max()) if len(on_line) else None,
+            largest_sideslip=float(np.abs(motion.sideslip[moving]).max(initial=0.0)),
+            largest_ay=float(np.abs(motion.ay).max()),
+            stability_share=self._interventions / len(motion) if ride.stability_control is not None else None,
+        )
+        return Trip(motion, lateral_error.copy(), flags, drawn)
 
 
 def _as_json(values: dict[str, Any]) -> dict[str, Any]:
@@ -164,18 +313,6 @@ def _whole_steps(rate_hz: float, step: float, what: str) -> int:
     return n_steps
 
 
-def _observe(state: FloatArray) -> Observation:
-    vx, vy = float(state[multi_body.VX]), float(state[multi_body.VY])
-    return Observation(
-        x=float(state[multi_body.POSITION_X]),
-        y=float(state[multi_body.POSITION_Y]),
-        travel_direction=float(state[multi_body.YAW]) + math.atan2(vy, vx),
-        speed=math.hypot(vx, vy),
-        yaw_rate=float(state[multi_body.YAW_RATE]),
-        steer=float(state[multi_body.STEER]),
-    )
-
-
-def _require_on_course(decision: Command) -> None:
-    if abs(decision.lateral_error) > LOST:
-        raise SimulationError(f"the car is {abs(decision.lateral_error):.1f} m beside its line; lower the grip fraction of the style")
+def _observe(state: PlantState) -> Observation:
+    values = state.values.tolist()
+    return Observation(values[X], values[Y], values[YAW], values[VX], values[VY], values[YAW_RATE], values[STEER])

@@ -1,25 +1,30 @@
 """The driver: a racing line, a speed profile at a fraction of the grip, and path following with preview.
 
-Steering follows the optimal-preview idea of Sharp, Casanova and Symonds 2000 in its simplest form: curvature
-feed-forward, the lateral error expected at one preview point, and damping of the yaw rate. The speed profile is the
-usual quasi-steady pass forwards and backwards through the friction circle (e.g. Heilmeier et al. 2020).
+Steering follows the optimal-preview idea of Sharp, Casanova and Symonds 2000 in its simplest form: the steering of the steady turn ahead,
+the lateral error expected at one preview point, damping of the yaw rate, and countersteering once the rear slides. The speed profile is
+the usual quasi-steady pass forwards and backwards through the friction circle (e.g. Heilmeier et al. 2020).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.data.errors import ConfigurationError
+from vehest.simulation.car import Car
 from vehest.simulation.course import Course
+from vehest.simulation.regimes import GRAVITY
 
 FloatArray = NDArray[np.float64]
 
-GRIP = 9.3
-"""Lateral acceleration that counts as all of the grip [m/s²]: what the lowered BMW 320i corners at in steady state."""
+DRIVER_RATE_HZ = 100.0
+"""How often a driver decides what to do [Hz]."""
 
 WAVELENGTHS = (310.0, 470.0, 1130.0)
 """Of the variations along a drive [m]; assumed, and none divides a lap."""
@@ -27,33 +32,30 @@ WAVELENGTHS = (310.0, 470.0, 1130.0)
 
 @dataclass(frozen=True)
 class Driver:
-    """How a driver drives; all values are assumed, chosen so that the shipped cars follow the shipped courses.
+    """How a person drives; all values are assumed, chosen so that the shipped cars follow the shipped courses.
 
     Args:
         preview_time: how far ahead the driver looks for lateral errors [s].
-        feedforward_time: how far ahead the driver takes the road's curvature, to make up for the car's lag [s].
         steering_lag: time constant from the wanted to the actual steering angle [s].
-        steering_rate: largest steering velocity of the road wheels [rad/s].
-        understeer: understeer gradient that the driver reckons with [rad s²/m].
+        response: by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the
+            one of steering.
         yaw_damping: steering angle per error of the yaw rate [s].
+        countersteer: steering angle per sideslip beyond what the turn wants.
+        slide: sideslip beyond what the turn wants from which on the driver countersteers and lifts [rad].
         speed_gain: wanted acceleration per speed error [1/s].
         braking_share: share of the grip that is used for braking straight ahead.
-        driving_share: share of the grip that is used for accelerating straight ahead; only one axle drives.
-        drive_power: engine power per mass that is used [W/kg].
-        top_speed: [m/s].
+        saturation: share of the grip up to which the driver asks for more lateral acceleration when off the line.
     """
 
     preview_time: float = 0.7
-    feedforward_time: float = 0.15
     steering_lag: float = 0.1
-    steering_rate: float = 0.4
-    understeer: float = 3.5e-4
-    yaw_damping: float = 0.12
+    response: float = 3.5e-3
+    yaw_damping: float = 0.16
+    countersteer: float = 0.7
+    slide: float = 0.035
     speed_gain: float = 1.5
     braking_share: float = 0.75
-    driving_share: float = 0.4
-    drive_power: float = 75.0
-    top_speed: float = 45.0
+    saturation: float = 1.1
 
 
 @dataclass(frozen=True)
@@ -83,21 +85,23 @@ class DrivingStyle:
 
     def __post_init__(self) -> None:
         low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
-        if not (low > 0.0 and high <= 1.0):
+        if not (low > 0.0 and high <= 1.0 + 1e-9):
             raise ConfigurationError(f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1")
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What the driver means to do, over the distance along the course's centre line; all arrays have shape (N,).
+    """What the driver means to do, over the distance along the way; all arrays have shape (N,).
 
     Args:
-        distance: [m], uniform from 0, over as many laps as the drive may take.
+        distance: [m], uniform from 0.
         x, y: the line [m].
         heading: of the line, not wrapped [rad].
         curvature: of the line, positive to the left [1/m].
         speed: [m/s].
-        acceleration: along the line [m/s²].
+        friction: scale of the tyres' friction.
+        bank: positive with the left side higher [rad].
+        grade: positive downhill [rad].
     """
 
     distance: FloatArray
@@ -106,148 +110,275 @@ class Plan:
     heading: FloatArray
     curvature: FloatArray
     speed: FloatArray
-    acceleration: FloatArray
+    friction: FloatArray
+    bank: FloatArray
+    grade: FloatArray
+
+    @cached_property
+    def acceleration(self) -> FloatArray:
+        """Along the line [m/s²], shape (N,)."""
+        return self.speed * np.gradient(self.speed, self.distance)
+
+    @property
+    def length(self) -> float:
+        """From the start to the end [m]."""
+        return float(self.distance[-1])
 
 
-@dataclass(frozen=True)
-class Observation:
-    """What the driver sees and feels of the car: place [m], direction of travel [rad], speed [m/s] and so on."""
+class Observation(NamedTuple):
+    """What the driver sees and feels of the car: place [m], heading [rad], velocity [m/s], yaw rate [rad/s], steering angle [rad]."""
 
     x: float
     y: float
-    travel_direction: float
-    speed: float
+    yaw: float
+    vx: float
+    vy: float
     yaw_rate: float
     steer: float
 
+    @property
+    def speed(self) -> float:
+        """Of the car over the ground [m/s]."""
+        return math.hypot(self.vx, self.vy)
 
-@dataclass(frozen=True)
-class Command:
-    """Steering velocity [rad/s], longitudinal acceleration [m/s²], and the car's place on the plan.
+    @property
+    def sideslip(self) -> float:
+        """atan2(vy, vx), zero below 1 m/s where it says nothing [rad]."""
+        return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
+
+
+class Command(NamedTuple):
+    """What the driver does now, and the road at the car.
 
     Args:
-        steering_velocity: of the road wheels.
-        acceleration: wanted.
-        progress: distance along the plan [m].
-        lateral_error: the car's place left of the line [m].
+        steering_velocity: of the road wheels [rad/s].
+        acceleration: wanted [m/s²].
+        progress: distance along the way [m].
+        lateral_error: the car's place left of its line [m]; NaN where there is no line.
+        friction: scale of the tyres' friction at the car.
+        bank: of the road, positive with its left side higher [rad].
+        grade: of the road, positive downhill [rad].
+        heading: of the road, along which bank and grade are meant [rad].
+        finished: the manoeuvre is over.
     """
 
     steering_velocity: float
     acceleration: float
-    progress: float
-    lateral_error: float
+    progress: float = 0.0
+    lateral_error: float = math.nan
+    friction: float = 1.0
+    bank: float = 0.0
+    grade: float = 0.0
+    heading: float = 0.0
+    finished: bool = False
 
 
-def draw_style(seed: int, grip_range: tuple[float, float] = (0.65, 0.9)) -> DrivingStyle:
+def draw_style(seed: int, grip_range: tuple[float, float] = (0.65, 0.9), ripple: float = 0.05, line_offset: float = 0.5) -> DrivingStyle:
     """The style that belongs to a seed: grip fraction uniform in ``grip_range`` (assumed), phases around the circle."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
-    return DrivingStyle(grip_fraction, grip_phases=tuple(phases[0]), line_phases=tuple(phases[1]))
+    return DrivingStyle(grip_fraction, ripple, line_offset, grip_phases=tuple(phases[0]), line_phases=tuple(phases[1]))
 
 
-def plan_drive(course: Course, driver: Driver, style: DrivingStyle, distance: float) -> Plan:
-    """Line and speed profile for at least ``distance`` metres from the start of the course."""
-    n_laps = math.ceil(distance / course.length) + 1
-    unrolled = _unroll(course, n_laps)
-    offset, offset_slope, offset_bend = _sines(unrolled.arc_length, style.wavelengths, style.line_phases, style.line_offset)
-    stretch = 1.0 - unrolled.curvature * offset  # length of the line per length of the centre line
-    curvature = unrolled.curvature / stretch + offset_bend
-    ripple, _, _ = _sines(unrolled.arc_length, style.wavelengths, style.grip_phases, style.grip_ripple)
-    lateral_limit = GRIP * (style.grip_fraction + ripple)
-    speed = speed_profile(curvature, lateral_limit, unrolled.arc_length[1], driver)
+def plan_laps(
+    course: Course, car: Car, driver: Driver, style: DrivingStyle, n_laps: int, *, friction: FloatArray, highest_speed: FloatArray | float
+) -> Plan:
+    """Line and speed profile over whole laps.
+
+    Args:
+        course: where.
+        car: whose limits are kept.
+        driver: who drives.
+        style: how.
+        n_laps: at least one.
+        friction: of one lap, on the course's samples, shape (N,).
+        highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
+    """
+    distance = _repeat(course.arc_length, n_laps, course.length)
+    heading = _repeat(course.heading, n_laps, course.turning)
+    bend, bank, grade = (_repeat(values, n_laps) for values in (course.curvature, course.bank, course.grade))
+    scale = _repeat(friction, n_laps)
+    offset, offset_slope, offset_bend = _sines(distance, style.wavelengths, style.line_phases, style.line_offset)
+    stretch = 1.0 - bend * offset  # length of the line per length of the centre line
+    curvature = bend / stretch + offset_bend
+    ripple, _, _ = _sines(distance, style.wavelengths, style.grip_phases, style.grip_ripple)
+    used = car.grip * scale * (style.grip_fraction + ripple)
     return Plan(
-        distance=unrolled.arc_length,
-        x=unrolled.x - offset * np.sin(unrolled.heading),
-        y=unrolled.y + offset * np.cos(unrolled.heading),
-        heading=unrolled.heading + np.arctan2(offset_slope, stretch),
+        distance=distance,
+        x=_repeat(course.x, n_laps) - offset * np.sin(heading),
+        y=_repeat(course.y, n_laps) + offset * np.cos(heading),
+        heading=heading + np.arctan2(offset_slope, stretch),
         curvature=curvature,
-        speed=speed,
-        acceleration=speed * np.gradient(speed, unrolled.arc_length),
+        speed=speed_profile(curvature, used, float(distance[1]), car, driver, highest_speed, bank, grade),
+        friction=scale,
+        bank=bank,
+        grade=grade,
     )
 
 
-def speed_profile(curvature: FloatArray, lateral_limit: FloatArray, spacing: float, driver: Driver) -> FloatArray:
+def speed_profile(
+    curvature: FloatArray,
+    used: FloatArray,
+    spacing: float,
+    car: Car,
+    driver: Driver,
+    highest_speed: FloatArray | float = math.inf,
+    bank: FloatArray | float = 0.0,
+    grade: FloatArray | float = 0.0,
+) -> FloatArray:
     """Highest speeds [m/s] within friction circle, engine power and top speed; (N,).
 
     Args:
         curvature: (N,) [1/m].
-        lateral_limit: (N,), largest lateral acceleration [m/s²]; braking gets ``driver.braking_share`` of it.
+        used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
         spacing: distance between samples [m].
-        driver: whose power, braking and top speed are used.
+        car: whose power and top speed are used.
+        driver: who brakes.
+        highest_speed: that the driver wants [m/s].
+        bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
+        grade: of the road, positive downhill [rad].
     """
-    cornering = np.sqrt(lateral_limit / np.maximum(np.abs(curvature), 1e-9))
-    speed = np.minimum(cornering, driver.top_speed).tolist()
-    bend, limit = np.abs(curvature).tolist(), lateral_limit.tolist()
+    lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
+    cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))
+    speed = np.minimum(cornering, np.minimum(highest_speed, car.top_speed)).tolist()
+    bend, limit, most = np.abs(curvature).tolist(), lateral.tolist(), used.tolist()
+    downhill = (GRAVITY * np.sin(grade) + np.zeros_like(used)).tolist()
 
     def spare(i: int) -> float:
         """Longitudinal share of the friction circle at sample i."""
         return math.sqrt(max(1.0 - (speed[i] ** 2 * bend[i] / limit[i]) ** 2, 0.0))
 
     for i in range(len(speed) - 2, -1, -1):
-        braking = driver.braking_share * limit[i + 1] * spare(i + 1)
-        speed[i] = min(speed[i], math.sqrt(speed[i + 1] ** 2 + 2.0 * braking * spacing))
+        braking = driver.braking_share * most[i + 1] * spare(i + 1) - downhill[i + 1] + car.drag * speed[i + 1] ** 2
+        speed[i] = min(speed[i], math.sqrt(speed[i + 1] ** 2 + 2.0 * max(braking, 0.0) * spacing))
     for i in range(len(speed) - 1):
-        driving = min(driver.drive_power / speed[i], driver.driving_share * limit[i] * spare(i))
-        speed[i + 1] = min(speed[i + 1], math.sqrt(speed[i] ** 2 + 2.0 * driving * spacing))
+        driving = min(car.power_per_mass / speed[i], car.driving_share * most[i] * spare(i)) + downhill[i] - car.drag * speed[i] ** 2
+        speed[i + 1] = min(speed[i + 1], math.sqrt(max(speed[i] ** 2 + 2.0 * driving * spacing, 0.01)))
     return np.array(speed)
 
 
-def command(plan: Plan, driver: Driver, wheelbase: float, progress: float, seen: Observation) -> Command:
-    """What the driver does now, given the place on the plan a moment ago."""
-    progress, lateral_error, heading_error = _locate(plan, progress, seen)
-    speed = seen.speed
-    road_ahead = _at(plan, plan.curvature, progress + speed * driver.feedforward_time)
-    preview = speed * driver.preview_time
-    error_ahead = lateral_error + preview * math.sin(heading_error)
-    wanted_curvature = road_ahead - 2.0 * error_ahead / preview**2
-    steer = wanted_curvature * (wheelbase + driver.understeer * speed**2)
-    steer -= driver.yaw_damping * (seen.yaw_rate - speed * wanted_curvature)
-    steering_velocity = (steer - seen.steer) / driver.steering_lag
-    limited = max(-driver.steering_rate, min(driver.steering_rate, steering_velocity))
+class Follower:
+    """Drives a car along a plan.
 
-    target = _at(plan, plan.speed, progress)
-    feedforward = _at(plan, plan.acceleration, progress + speed * driver.feedforward_time)
-    acceleration = feedforward + driver.speed_gain * (target - speed)
-    spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / GRIP) ** 2, 0.0))
-    lowest, highest = -driver.braking_share * GRIP * spare, driver.driving_share * GRIP * spare
-    limited_acceleration = max(lowest, min(highest, driver.drive_power / speed, acceleration))
-    return Command(limited, limited_acceleration, progress, lateral_error)
+    Args:
+        plan: line and speed.
+        car: what is driven.
+        driver: who drives.
+        progress: where on the plan the car starts [m].
+        speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
+    """
+
+    def __init__(
+        self, plan: Plan, car: Car, driver: Driver, progress: float = 0.0, speed_at: Callable[[float], tuple[float, float]] | None = None
+    ) -> None:
+        self.plan, self.car, self.driver, self.progress = plan, car, driver, progress
+        self._speed_at = speed_at
+        self._per_metre = 1.0 / float(plan.distance[1])
+        self._last_cell = len(plan.distance) - 2
+        self._x, self._y, self._heading, self._curvature, self._speed, self._acceleration, self._friction, self._bank, self._grade = (
+            values.tolist()
+            for values in (
+                plan.x, plan.y, plan.heading, plan.curvature, plan.speed, plan.acceleration, plan.friction, plan.bank, plan.grade
+            )
+        )  # fmt: skip
+
+    @property
+    def start(self) -> tuple[float, float, float, float]:
+        """Place [m], heading [rad] and speed [m/s] at which the car starts."""
+        cell, share = self._cell(self.progress)
+        x, y, heading, speed = (_between(values, cell, share) for values in (self._x, self._y, self._heading, self._speed))
+        return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """What the driver does at a time [s], given what is seen of the car."""
+        car, driver = self.car, self.driver
+        speed, sideslip = seen.speed, seen.sideslip
+        lateral_error, heading_error, here, share = self._locate(seen, sideslip)
+        ahead, share_ahead = self._cell(self.progress + speed * (driver.steering_lag + driver.response * speed))
+        friction = max(_between(self._friction, ahead, share_ahead), 0.05)
+        bank, grade = _between(self._bank, here, share), _between(self._grade, here, share)
+        grip = car.grip * friction
+
+        preview = max(speed * driver.preview_time, 3.0)
+        error_ahead = lateral_error + preview * math.sin(heading_error)
+        meant = _between(self._curvature, ahead, share_ahead)
+        most = driver.saturation * grip / max(speed, 1.0) ** 2
+        curvature = max(-most, min(most, meant - 2.0 * error_ahead / preview**2))
+        lateral = curvature * speed**2 + GRAVITY * math.sin(bank)
+        steer = self._steer(meant, curvature - meant, speed, bank, friction)
+        steer -= driver.yaw_damping * (seen.yaw_rate - speed * curvature)
+        sliding = sideslip - car.sideslip_for(curvature, lateral, friction)
+        beyond = max(abs(sliding) - driver.slide, 0.0)
+        steer += driver.countersteer * math.copysign(beyond, sliding)
+
+        target, feedforward = (
+            self._speed_at(time)
+            if self._speed_at
+            else (_between(self._speed, here, share), _between(self._acceleration, ahead, share_ahead))
+        )
+        resistance = car.resistance(speed, seen.yaw_rate, seen.steer, sideslip) - GRAVITY * math.sin(grade)
+        acceleration = feedforward + driver.speed_gain * (target - speed) + resistance
+        spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
+        highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0)) * max(1.0 - beyond / 0.1, 0.0)
+        lowest = -max(driver.braking_share * grip * spare, 0.1 * grip)
+        return Command(
+            steering_velocity=steering_velocity(car, driver, steer, seen.steer),
+            acceleration=max(lowest, min(highest, acceleration)),
+            progress=self.progress,
+            lateral_error=lateral_error,
+            friction=_between(self._friction, here, share),
+            bank=bank,
+            grade=grade,
+            heading=_between(self._heading, here, share),
+        )
+
+    def _steer(self, meant: float, more: float, speed: float, bank: float, friction: float) -> float:
+        """Steering angle [rad] of the curvature that is meant, and of ``more`` [1/m] to get back to the line.
+
+        The latter with no more steering than half of the grip takes: at the limit a car hardly answers, and a driver who asks it
+        ever harder weaves.
+        """
+        car = self.car
+        held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
+        moderate = 0.5 * car.grip * friction
+        per_curvature = car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
+        return held + per_curvature * more
+
+    def _locate(self, seen: Observation, sideslip: float) -> tuple[float, float, int, float]:
+        """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the last progress."""
+        for _ in range(2):
+            cell, share = self._cell(self.progress)
+            heading = _between(self._heading, cell, share)
+            dx, dy = seen.x - _between(self._x, cell, share), seen.y - _between(self._y, cell, share)
+            along, across = math.cos(heading), math.sin(heading)
+            self.progress = max(self.progress + dx * along + dy * across, 0.0)
+        error = dy * along - dx * across
+        cell, share = self._cell(self.progress)
+        return error, math.remainder(seen.yaw + sideslip - heading, 2.0 * math.pi), cell, share
+
+    def _cell(self, distance: float) -> tuple[int, float]:
+        """Sample before a distance and the share of the way to the next one, held at the plan's ends."""
+        position = distance * self._per_metre
+        before = min(max(int(position), 0), self._last_cell)
+        return before, min(max(position - before, 0.0), 1.0)
 
 
-def _locate(plan: Plan, progress: float, seen: Observation) -> tuple[float, float, float]:
-    """Progress [m], lateral error [m] and heading error [rad], by two Newton steps from the last progress."""
-    for _ in range(2):
-        heading = _at(plan, plan.heading, progress)
-        dx, dy = seen.x - _at(plan, plan.x, progress), seen.y - _at(plan, plan.y, progress)
-        progress += dx * math.cos(heading) + dy * math.sin(heading)
-    lateral_error = dy * math.cos(heading) - dx * math.sin(heading)
-    return progress, lateral_error, math.remainder(seen.travel_direction - heading, 2.0 * math.pi)
+def steering_velocity(car: Car, driver: Driver, wanted: float, steer: float) -> float:
+    """Of the road wheels towards a wanted angle [rad/s], within what the car allows."""
+    wanted = max(-car.largest_steer, min(car.largest_steer, wanted))
+    return max(-car.steering_rate, min(car.steering_rate, (wanted - steer) / driver.steering_lag))
 
 
-def _at(plan: Plan, values: FloatArray, distance: float) -> float:
-    """Linear interpolation on the plan's uniform grid, held at its ends."""
-    position = distance / plan.distance[1]
-    before = min(max(int(position), 0), len(values) - 2)
-    share = min(max(position - before, 0.0), 1.0)
-    return float(values[before] + share * (values[before + 1] - values[before]))
+def _between(values: list[float], before: int, share: float) -> float:
+    low = values[before]
+    return low + share * (values[before + 1] - low)
 
 
-def _unroll(course: Course, n_laps: int) -> Course:
-    """The course laid end to end ``n_laps`` times, with heading going on."""
-
-    def repeat(values: FloatArray, per_lap: float = 0.0) -> FloatArray:
-        laps = [values[:-1] + lap * per_lap for lap in range(n_laps)]
-        return np.concatenate([*laps, values[-1:] + (n_laps - 1) * per_lap])
-
-    return Course(
-        name=course.name,
-        arc_length=repeat(course.arc_length, course.length),
-        x=repeat(course.x),
-        y=repeat(course.y),
-        heading=repeat(course.heading, course.turning),
-        curvature=repeat(course.curvature),
-    )
+def _repeat(values: FloatArray, n_laps: int, per_lap: float = 0.0) -> FloatArray:
+    """Values along a lap laid end to end ``n_laps`` times, going on by ``per_lap``."""
+    laps = [values[:-1] + lap * per_lap for lap in range(n_laps)]
+    return np.concatenate([*laps, values[-1:] + (n_laps - 1) * per_lap])
 
 
 def _sines(

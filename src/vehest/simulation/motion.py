@@ -9,24 +9,34 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+WHEELS = ("fl", "fr", "rl", "rr")
+"""Order of the columns of (T, 4) arrays: front left, front right, rear left, rear right."""
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """True motion of the centre of gravity of the car body, uniformly sampled; every array has shape (T,).
+    """True motion of the centre of gravity of the car body, uniformly sampled; arrays have shape (T,) or (T, 4).
 
-    Axes are those of ISO 8855: x forward, y left, z up; a left turn has positive steer, yaw_rate and ay.
+    Axes are those of ISO 8855: x forward, y left, z up; a left turn has positive steer, yaw_rate and ay. They yaw with
+    the car and stay level with the road; columns of (T, 4) arrays are WHEELS.
 
     Args:
         rate_hz: sampling rate [Hz].
         x, y: position on the ground [m].
         yaw: heading, counter-clockwise from the x axis, not wrapped [rad].
-        vx, vy: velocity in the axes of the yawed, level body [m/s].
+        vx, vy: velocity [m/s].
         yaw_rate: [rad/s].
-        ax, ay: acceleration in the same axes, dvx/dt - vy·yaw_rate and dvy/dt + vx·yaw_rate [m/s²].
+        ax, ay: acceleration, dvx/dt - vy·yaw_rate and dvy/dt + vx·yaw_rate [m/s²].
         steer: road-wheel angle of the front axle [rad].
-        roll: positive with the left side up, as in a left turn [rad].
-        pitch: positive with the nose down, as when braking [rad].
-        wheel_speed_fl, wheel_speed_fr, wheel_speed_rl, wheel_speed_rr: rotational speeds [rad/s].
+        roll: of the body against the road, positive with the left side up, as in a left turn [rad].
+        pitch: of the body against its place at rest, positive with the nose down, as when braking [rad].
+        roll_rate, pitch_rate: their derivatives [rad/s].
+        wheel_speed: rotational speeds (T, 4) [rad/s].
+        tyre_fx, tyre_fy: forces of the road on the tyres, along and across the body, not the wheel (T, 4) [N].
+        tyre_fz: wheel loads, positive (T, 4) [N].
+        friction: scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road.
+        bank: of the road, positive with its left side higher [rad].
+        grade: of the road, positive downhill [rad].
     """
 
     rate_hz: float
@@ -41,10 +51,15 @@ class Motion:
     steer: FloatArray
     roll: FloatArray
     pitch: FloatArray
-    wheel_speed_fl: FloatArray
-    wheel_speed_fr: FloatArray
-    wheel_speed_rl: FloatArray
-    wheel_speed_rr: FloatArray
+    roll_rate: FloatArray
+    pitch_rate: FloatArray
+    wheel_speed: FloatArray
+    tyre_fx: FloatArray
+    tyre_fy: FloatArray
+    tyre_fz: FloatArray
+    friction: FloatArray
+    bank: FloatArray
+    grade: FloatArray
 
     def __len__(self) -> int:
         return len(self.x)

@@ -1,21 +1,30 @@
-"""Parameters of the multi-body plant: a set published by CommonRoad, with named values replaced."""
+"""Parameters of the multi-body plant: a set published by CommonRoad, with named values replaced.
+
+The library has one tyre for all wheels. Here the rear axle may have its own: ``tire_rear`` replaces values of ``tire``,
+which is then the front axle's.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import namedtuple
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from vehiclemodels.utils.longitudinal_parameters import LongitudinalParameters
 from vehiclemodels.utils.steering_parameters import SteeringParameters
 from vehiclemodels.utils.tireParameters import TireParameters
-from vehiclemodels.utils.trailer_parameters import TrailerParameters
 from vehiclemodels.vehicle_parameters import VehicleParameters, setup_vehicle_parameters
 
 from vehest.data.errors import ConfigurationError
+
+FloatArray = NDArray[np.float64]
 
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
 """Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
@@ -25,23 +34,20 @@ def _field_names(library_class: type) -> list[str]:
     return [entry.name for entry in fields(library_class)]
 
 
-# The library's dataclasses again as named tuples, which compiled code can read. They stand at module level, under
-# fixed names, because a compiled function is found again on disk by the type of its arguments.
+_FRONT_TYRE, _REAR_TYRE = "tire", "tire_rear"
+
+# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre.
 SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
 LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
 TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
-TrailerValues = namedtuple("TrailerValues", _field_names(TrailerParameters))  # type: ignore[misc]
-MultiBodyValues = namedtuple("MultiBodyValues", _field_names(VehicleParameters))  # type: ignore[misc]
-
-_TUPLE_OF: Mapping[type, type] = MappingProxyType(
-    {
-        SteeringParameters: SteeringValues,
-        LongitudinalParameters: LongitudinalValues,
-        TireParameters: TyreValues,
-        TrailerParameters: TrailerValues,
-        VehicleParameters: MultiBodyValues,
-    }
+MultiBodyValues = namedtuple(  # type: ignore[misc]
+    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name != "trailer"), _REAR_TYRE]
 )
+
+GROUPS: Mapping[str, type] = MappingProxyType(
+    {"steering": SteeringValues, "longitudinal": LongitudinalValues, _FRONT_TYRE: TyreValues, _REAR_TYRE: TyreValues}
+)
+"""Fields of MultiBodyValues that are named tuples themselves."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +58,8 @@ class Vehicle:
         name: what recordings call it.
         parameter_set: number of the published set it starts from.
         overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
-            values of a group (``tire``, ``steering``, ``longitudinal``).
+            values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
+        driver: values of a driver who knows this car, by the driver's names; the plant does not read them.
 
     Raises:
         ConfigurationError: no such set, no such parameter, or a value that is not a finite number.
@@ -61,41 +68,72 @@ class Vehicle:
     name: str
     parameter_set: int
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    driver: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         library_parameters(self)
+        rear_tyre(self)
+        for name, value in self.driver.items():
+            _require_number(f"vehicle '{self.name}': driver's value '{name}'", value)
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``.
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides`` and ``driver``.
 
     Raises:
         ConfigurationError: a key is missing or unknown, or see Vehicle.
     """
-    known = {"name", "parameter_set", "overrides"}
+    known = {"name", "parameter_set", "overrides", "driver"}
     unknown = sorted(set(configuration) - known)
     missing = sorted({"name", "parameter_set"} - set(configuration))
     if unknown or missing:
         raise ConfigurationError(f"vehicle configuration: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
-    overrides = _plain(configuration.get("overrides") or {})
-    return Vehicle(str(configuration["name"]), configuration["parameter_set"], overrides)
+    overrides, driver = (_plain(configuration.get(key) or {}) for key in ("overrides", "driver"))
+    return Vehicle(str(configuration["name"]), configuration["parameter_set"], overrides, driver)
 
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
-    """The library's own parameter object with the overrides in place; a fresh one at every call."""
+    """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh one at every call."""
     if vehicle.parameter_set not in PUBLISHED_SETS:
         known = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
         raise ConfigurationError(
             f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
         )
-    parameters = setup_vehicle_parameters(vehicle.parameter_set)
-    _override(parameters, vehicle.overrides, vehicle.name, prefix="")
+    parameters = deepcopy(_published(vehicle.parameter_set))
+    known_to_library = {name: value for name, value in vehicle.overrides.items() if name != _REAR_TYRE}
+    _override(parameters, known_to_library, vehicle.name, prefix="")
     return parameters
+
+
+@cache
+def _published(parameter_set: int) -> VehicleParameters:
+    """Read from the library's files, which takes 20 ms."""
+    return setup_vehicle_parameters(parameter_set)
+
+
+def rear_tyre(vehicle: Vehicle) -> TireParameters:
+    """Parameters of the rear tyres: the front ones with the overrides of ``tire_rear`` in place."""
+    tyre = library_parameters(vehicle).tire
+    overrides = vehicle.overrides.get(_REAR_TYRE, {})
+    if not isinstance(overrides, Mapping):
+        raise ConfigurationError(f"vehicle '{vehicle.name}': override '{_REAR_TYRE}' must be a mapping, not {overrides!r}")
+    _override(tyre, overrides, vehicle.name, prefix=f"{_REAR_TYRE}.")
+    return tyre
 
 
 def compiled_parameters(vehicle: Vehicle) -> Any:
     """The same values as nested named tuples of floats (MultiBodyValues); absent ones are NaN."""
-    return _as_values(library_parameters(vehicle))
+    parameters = library_parameters(vehicle)
+    rear = _as_values(TyreValues, rear_tyre(vehicle))
+    return _as_values(MultiBodyValues, parameters, **{_REAR_TYRE: rear})
+
+
+def parameter_vector(parameters: Any) -> FloatArray:
+    """The values of (nested) named tuples one after the other, in the order of their fields."""
+    values: list[float] = []
+    for value in parameters:
+        values.extend(parameter_vector(value) if isinstance(value, tuple) else [value])
+    return np.array(values)
 
 
 def _plain(mapping: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,23 +146,29 @@ def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, 
         if name not in _field_names(type(parameters)):
             known = ", ".join(_field_names(type(parameters)))
             raise ConfigurationError(f"{where} names no parameter of the plant; known ones: {known}")
-        is_group = type(getattr(parameters, name)) in _TUPLE_OF
+        is_group = is_dataclass(getattr(parameters, name))
         if is_group != isinstance(value, Mapping):
             raise ConfigurationError(f"{where} must be {'a mapping' if is_group else 'a number'}, not {value!r}")
         if is_group:
             _override(getattr(parameters, name), value, vehicle_name, prefix=f"{prefix}{name}.")
             continue
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ConfigurationError(f"{where} must be a finite number, not {value!r}")
+        _require_number(where, value)
         setattr(parameters, name, float(value))
 
 
-def _as_values(parameters: Any) -> Any:
-    values = []
-    for entry in fields(parameters):
-        value = getattr(parameters, entry.name)
-        if type(value) in _TUPLE_OF:
-            values.append(_as_values(value))
+def _require_number(where: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ConfigurationError(f"{where} must be a finite number, not {value!r}")
+
+
+def _as_values(values_class: Any, parameters: Any, **others: Any) -> Any:
+    values = dict(others)
+    for name in values_class._fields:
+        if name in values:
+            continue
+        value = getattr(parameters, name)
+        if name in GROUPS:
+            values[name] = _as_values(GROUPS[name], value)
         else:
-            values.append(math.nan if value is None else float(value))
-    return _TUPLE_OF[type(parameters)](*values)
+            values[name] = math.nan if value is None else float(value)
+    return values_class(**values)

@@ -1,0 +1,116 @@
+"""Cars and sensors that differ from drive to drive, drawn from stated ranges: for training that must generalise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.parameters import Vehicle, library_parameters
+from vehest.simulation.sensor_levels import SensorLevel, SensorLevels
+
+_STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Parameters of the plant that are scaled together.
+
+    Args:
+        parameters: the library's names, ``tire.p_dy1`` for one of a group.
+        factor: lowest and highest scale, drawn uniformly for every drive.
+    """
+
+    parameters: tuple[str, ...]
+    factor: tuple[float, float]
+
+
+def variations_from_config(entries: Any) -> tuple[Variation, ...]:
+    """Variations as a data set's ``vary`` spells them: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``.
+
+    Raises:
+        ConfigurationError: an entry says something else.
+    """
+    if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
+        raise ConfigurationError(f"vary is a list of {{parameters, factor}}, not {entries}")
+    variations = []
+    for entry in entries:
+        if not isinstance(entry, Mapping) or set(entry) != {"parameters", "factor"} or isinstance(entry["parameters"], str):
+            raise ConfigurationError(f"vary: an entry is {{parameters: [m, m_s], factor: [0.9, 1.2]}}, not {entry}")
+        variations.append(Variation(tuple(str(name) for name in entry["parameters"]), _range(entry["factor"], "vary")))
+    return tuple(variations)
+
+
+def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
+    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing varies.
+
+    Raises:
+        ConfigurationError: a name is no parameter of the plant.
+    """
+    if not variations:
+        return vehicle
+    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+    overrides = _deep(vehicle.overrides)
+    published = library_parameters(vehicle)
+    for variation in variations:
+        factor = float(generator.uniform(*variation.factor))
+        for name in variation.parameters:
+            *group, last = name.split(".")
+            holder, target = published, overrides
+            for part in group:
+                holder, target = getattr(holder, part, None), target.setdefault(part, {})
+            value = getattr(holder, last, None)
+            if not isinstance(value, int | float):
+                raise ConfigurationError(f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled")
+            target[last] = float(value) * factor
+    return replace(vehicle, overrides=overrides)
+
+
+@dataclass(frozen=True)
+class SensorVariation:
+    """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of error.
+
+    Args:
+        factors: kind of error (``noise``, ``offset``, …) -> lowest and highest scale.
+    """
+
+    factors: Mapping[str, tuple[float, float]]
+
+    @classmethod
+    def from_config(cls, entries: Any) -> SensorVariation:
+        """Variation as a data set's ``vary_sensors`` spells it: ``{noise: [0.5, 2], delay: [0, 1.5]}``.
+
+        Raises:
+            ConfigurationError: an unknown kind of error, or no range.
+        """
+        kinds = [entry.name for entry in fields(SensorLevel)]
+        if not isinstance(entries, Mapping) or set(entries) - set(kinds):
+            raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} to ranges of scales, not {entries}")
+        return cls({str(kind): _range(value, "vary_sensors") for kind, value in entries.items()})
+
+    def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
+        """Levels as the seed scales them; the same ones if nothing varies. References stay as they are."""
+        if not self.factors:
+            return levels
+        generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
+        changed: dict[str, Any] = {}
+        for entry in fields(levels):
+            level = getattr(levels, entry.name)
+            if isinstance(level, SensorLevel):
+                scales = {kind: float(generator.uniform(*factor)) for kind, factor in self.factors.items()}
+                changed[entry.name] = replace(level, **{kind: getattr(level, kind) * scale for kind, scale in scales.items()})
+        return replace(levels, **changed)
+
+
+def _range(value: Any, where: str) -> tuple[float, float]:
+    numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(end, int | float) for end in value)
+    if not numbers or len(value) != 2 or not 0.0 <= value[0] <= value[1]:
+        raise ConfigurationError(f"{where}: a range is a pair [lowest, highest] of scales, not {value}")
+    return float(value[0]), float(value[1])
+
+
+def _deep(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _deep(value) if isinstance(value, Mapping) else value for name, value in mapping.items()}

@@ -1,0 +1,51 @@
+"""Manoeuvres: what a drive consists of, from the first sample to the last.
+
+Each is a frozen dataclass of its parameters, made from a configuration by ``manoeuvre_from_config``, and gives a controller for a car,
+a surface and a seed. A parameter of type Range is a number, or a pair from which every drive draws one, uniformly. ``severity`` is always
+the share of the grip that the driver means to use, on the surface at hand. Values without a source are assumed.
+
+Time is zero at the first sample of the recording; SETTLING_TIME before it the car starts, rolling straight ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.circles import BrakingInTurn, SteadyCircle
+from vehest.simulation.cones import DoubleLaneChange, Slalom
+from vehest.simulation.laps import FastLap, Laps, SpeedLaps
+from vehest.simulation.manoeuvre import Manoeuvre
+from vehest.simulation.open_loop import RandomSteer, Spiral, StepSteer
+
+MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
+    made.name: made
+    for made in (Laps, SpeedLaps, FastLap, DoubleLaneChange, Slalom, SteadyCircle, BrakingInTurn, StepSteer, Spiral, RandomSteer)
+}
+"""Manoeuvres by name."""
+
+
+def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
+    """A manoeuvre from its ``name`` and any of its parameters.
+
+    Raises:
+        ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
+    """
+    values = dict(configuration)
+    name = values.pop("name", None)
+    if name not in MANOEUVRES:
+        raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(MANOEUVRES))}")
+    known = {entry.name for entry in fields(MANOEUVRES[name])}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise ConfigurationError(f"manoeuvre '{name}': unknown keys {unknown}; it has {sorted(known)}")
+    try:
+        return MANOEUVRES[name](**{key: _tupled(value) for key, value in values.items()})
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"manoeuvre '{name}': a value is of the wrong kind in {values}") from error
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list | tuple) else value

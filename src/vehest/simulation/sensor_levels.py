@@ -1,0 +1,247 @@
+"""How good simulated sensors are: presets, each number with its source."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+from vehest.data.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class SensorLevel:
+    """How large the errors of one sensor are; ``unit`` is its channel's unit.
+
+    shown = quantise((1 + scale) true(t - delay) + offset + drift(t) + noise(t))
+
+    Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
+    samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
+
+    Args:
+        noise: density of the white noise [unit/√Hz].
+        offset: standard deviation of a constant that is drawn for each drive [unit].
+        drift: standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit].
+        drift_time: its correlation time [s].
+        quantisation: step of the values shown [unit].
+        delay: age of what is shown; the first value is held before the start [s].
+        scale: standard deviation of a relative error that is drawn for each drive [1].
+
+    Raises:
+        ConfigurationError: a value is negative or not finite, or the correlation time is zero.
+    """
+
+    noise: float = 0.0
+    offset: float = 0.0
+    drift: float = 0.0
+    drift_time: float = 300.0
+    quantisation: float = 0.0
+    delay: float = 0.0
+    scale: float = 0.0
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ConfigurationError(f"{entry.name} must be zero or positive, not {value}")
+        if self.drift_time == 0.0:
+            raise ConfigurationError("drift_time must be positive, not 0")
+
+
+def _require_finite(levels: Any, not_negative: str) -> None:
+    for entry in fields(levels):
+        value = getattr(levels, entry.name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigurationError(f"{entry.name} must be finite, not {value}")
+    if getattr(levels, not_negative) < 0.0:
+        raise ConfigurationError(f"{not_negative} must be zero or positive, not {getattr(levels, not_negative)}")
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """Where the inertial unit sits and how it is turned against the body.
+
+    Args:
+        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
+        roll, pitch, yaw: of its axes against the body's, right-handed about x, y and z, as a body's roll, pitch and yaw [rad].
+        misalignment: standard deviation of what is drawn for a drive and added to each of the three angles [rad].
+
+    Raises:
+        ConfigurationError: a value is not finite, or the misalignment is negative.
+    """
+
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    lever_z: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    misalignment: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_finite(self, not_negative="misalignment")
+
+
+@dataclass(frozen=True)
+class Tilt:
+    """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero.
+
+    Args:
+        roll, pitch: of the body against the road. They also make the gyros measure about the body's axes instead of the road's.
+        bank, grade: of the road.
+    """
+
+    roll: bool = True
+    pitch: bool = True
+    bank: bool = True
+    grade: bool = True
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The sensor that gives vx_ref, vy_ref, yaw_rate_ref and, as atan2(vy_ref, vx_ref), sideslip_ref.
+
+    It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to the centre of gravity with its
+    own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
+
+    Args:
+        kind: what it stands for, ``optical``, ``gnss`` or ``ideal``.
+        vx, vy: errors of the velocity along its axes [m/s].
+        yaw_rate: errors of its gyro [rad/s].
+        heading: errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here.
+        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
+        lever_error: standard deviation of what is drawn for a drive for lever_x and lever_y each [m].
+
+    Raises:
+        ConfigurationError: a lever is not finite, lever_error is negative, or heading has errors without a meaning.
+    """
+
+    kind: str = "ideal"
+    vx: SensorLevel = SensorLevel()
+    vy: SensorLevel = SensorLevel()
+    yaw_rate: SensorLevel = SensorLevel()
+    heading: SensorLevel = SensorLevel()
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    lever_z: float = 0.0
+    lever_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_finite(self, not_negative="lever_error")
+        if self.heading.delay or self.heading.scale or self.heading.quantisation:
+            raise ConfigurationError("heading has noise, offset and drift only")
+
+
+GNSS = Reference(
+    kind="gnss",
+    # Noise: read off the Ferrari recording, whose reference is of this kind. Drift: the 0.1 km/h of Racelogic's VBOX 3i Dual Antenna
+    # (technical specifications); its correlation time is assumed.
+    vx=SensorLevel(noise=0.0017, drift=0.028, drift_time=10.0),
+    vy=SensorLevel(noise=0.0020, drift=0.028, drift_time=10.0),
+    # Noise: 0.01 °/s/√Hz, drift: bias stability of 0.0028 °/s, both of Racelogic's VBOX 3iS (technical specifications); time assumed.
+    yaw_rate=SensorLevel(noise=1.75e-4, drift=4.9e-5),
+    # 0.1° with antennas 1 m apart (VBOX 3i Dual Antenna) or 2 m apart (OxTS RT user manual: 0.2° per metre); time and share of the
+    # constant part, which is how well the antennas are aligned with the car, are assumed.
+    heading=SensorLevel(offset=0.0010, drift=0.0014, drift_time=30.0),
+    lever_error=0.02,  # assumed
+)
+"""Dual-antenna GNSS with inertial sensors: little noise, slow errors."""
+
+OPTICAL = Reference(
+    kind="optical",
+    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet of one was at hand.
+    vx=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
+    vy=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
+    yaw_rate=SensorLevel(noise=1.75e-4, offset=0.001, delay=0.008),
+    heading=SensorLevel(offset=0.0017),  # a tenth of a degree in mounting, assumed
+    lever_x=2.0,  # in the front bumper, as in Bertipaglia et al. 2024; distance and height assumed
+    lever_z=-0.2,
+    lever_error=0.02,  # assumed
+)
+"""Optical sensor over the road, in the front bumper: more noise, a delay, and errors of the place where it sits."""
+
+REFERENCES: dict[str, Reference] = {reference.kind: reference for reference in (OPTICAL, GNSS, Reference())}
+
+
+@dataclass(frozen=True)
+class SensorLevels:
+    """Errors of all sensors of a car; the defaults are those of production sensors, the preset ``default``.
+
+    Each sensor and each kind of error has a random stream of its own: what one level is changes nothing else.
+
+    Args:
+        vx: of the forward speed, which is the true speed with the errors of an odometer, not computed from the wheels: 0.05 m/s at
+            100 Hz, a step of 0.01 km/h, and the tyre's radius as scale. All assumed.
+        yaw_rate: noise 0.1 °/s at 100 Hz, step 0.01 °/s and scale 3 % at three standard deviations of Bosch's SMI700 (product
+            information). Offset assumed, far inside its ±3 °/s, since control units learn it at standstill. Drift: 2 K of the
+            0.015 °/s/K of Bosch's BMG160 (CISS manual). Delay: of its low-pass at 21 Hz.
+        roll_rate, pitch_rate: as yaw_rate; assumed.
+        ax, ay: noise 6 mg at 100 Hz, step g/5000 and scale 3 % at three standard deviations of Bosch's SMI700. Offset assumed, as that of
+            yaw_rate, far inside its ±50 mg; drift assumed, 1 mg. Delay: of its low-pass at 21 Hz.
+        steer: of the road-wheel angle, from a steering-wheel sensor. Step: the 0.1° of Bosch's LWS 5 over an assumed ratio of
+            16; delay: one message at 100 Hz (LWS 7); noise and offset, which stand for play and compliance, assumed.
+        wheel_speed: of each wheel; scale stands for the tyre's radius, which who uses the speed takes to be known. All assumed.
+        fx, fy, fz: of each wheel. Step: 24 kN over 4000 of A&D's wheel force sensor; the rest assumed, about 0.5 % of that range each.
+            For trucks take more.
+        imu: where yaw_rate, roll_rate, pitch_rate, ax and ay are measured. At the centre of gravity, as control units correct for the
+            place; misalignment 0.2°, assumed.
+        tilt: which angles let gravity in.
+        reference: of the reference channels.
+    """
+
+    vx: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.0028, delay=0.02, scale=0.005)
+    yaw_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
+    roll_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
+    pitch_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
+    ax: SensorLevel = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
+    ay: SensorLevel = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
+    steer: SensorLevel = SensorLevel(noise=7.1e-5, offset=0.0017, quantisation=1.1e-4, delay=0.01)
+    wheel_speed: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.01, delay=0.01, scale=0.005)
+    fx: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+    fy: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+    fz: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+    imu: Mounting = Mounting(misalignment=0.0035)
+    tilt: Tilt = Tilt()
+    reference: Reference = GNSS
+
+
+NO_ERRORS = ("kind", "drift_time")
+"""Fields that are no errors and stay when the others are switched off."""
+
+
+def without_errors(level: Any) -> Any:
+    """A level, or a dataclass of levels, with all its errors off."""
+    if isinstance(level, Reference):
+        return Reference()
+    if is_dataclass(level):
+        values = {entry.name: getattr(level, entry.name) for entry in fields(level) if entry.name not in NO_ERRORS}
+        return replace(level, **{name: without_errors(value) for name, value in values.items()})  # type: ignore[type-var]
+    return False if isinstance(level, bool) else 0.0
+
+
+# The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014, 20140222_01_01_03; its sensors cannot
+# be told from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
+RACE = SensorLevels(
+    vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
+    # Noise and delay read off; offset and scale assumed.
+    yaw_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),
+    roll_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),  # assumed, as yaw_rate
+    pitch_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),
+    # Read off but for the scale (assumed). Offset: the mean of what the accelerations lack against the reference's velocities; drift:
+    # what is left of that below 0.5 Hz when delays, white noise and the gravity of roll and pitch are taken out, a banked road included;
+    # its time is known to a factor of two. Delays are known to some 3 ms, by what other bands than 0.2 to 2 Hz give.
+    ax=SensorLevel(noise=0.088, offset=0.025, drift=0.0153, drift_time=1.8, delay=0.0151, scale=0.003),
+    ay=SensorLevel(noise=0.13, offset=0.028, drift=0.17, drift_time=11.5, delay=0.0183, scale=0.003),
+    steer=SensorLevel(noise=1.7e-5, offset=0.0017, quantisation=1.23e-4),  # noise and step read off; offset assumed
+    imu=Mounting(),  # what it is turned by is in the offsets that were read off
+)
+"""A race car of the sixties with good instruments."""
+
+
+def ideal_sensors() -> SensorLevels:
+    """Sensors without any error: they show the true motion of the centre of gravity in the road's axes."""
+    levels: SensorLevels = without_errors(SensorLevels())
+    return levels
+
+
+PRESETS: dict[str, SensorLevels] = {"default": SensorLevels(), "race": RACE, "ideal": ideal_sensors()}
