@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.data.splits import Span, Split, split_from_config
+from vehest.data.splits import Catalogue, Span, Split, split_from_config
 from vehest.data.windows import window_starts, windows_of
 
 PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
@@ -143,7 +144,148 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_every_split_that_is_shipped_is_one(file: Path) -> None:
     config = yaml.safe_load(file.read_text(encoding="utf-8"))
-    assert split_from_config(config).name == file.stem
+    cruising = drives({f"{role}_1": [3.0] * 300 for role in ("train", "validation", "test")}, vx=[20.0] * 300)
+    assert split_from_config(config, cruising).name == file.stem
+
+
+# --- patterns and conditions
+
+
+def drives(ay: Mapping[str, Sequence[float]], vx: Sequence[float] | None = None, start_time: float = 0.0) -> Catalogue:
+    """A catalogue of data set ``d``, or of any, with drives at 100 Hz of a given ay."""
+
+    def reader(name: str) -> Callable[[Iterable[str]], Recording]:
+        everything = {"ay": np.array(ay[name]), "vx": np.array(vx or [10.0] * len(ay[name]))}
+        gappy = frozenset({"ay"})
+        recording = Recording(name, "car", 100.0, start_time, everything, gappy=gappy)
+        return lambda channels: recording.select(channels)
+
+    return lambda dataset: {name: reader(name) for name in ay}
+
+
+def kept_of(keep: object, catalogue: Catalogue, **entry: object) -> Split:
+    """A split whose training is cut by a condition."""
+    train = {"recordings": "train_*", **entry, "keep": keep}
+    return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
+
+
+def test_a_pattern_names_recordings_in_the_order_of_their_ids() -> None:
+    catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
+    config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
+    assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
+
+
+def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it() -> None:
+    asked: list[str] = []
+
+    def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        asked.append(dataset)
+        return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
+
+    plain = {"name": "s", "dataset": "d", "train": [{"recording": "a1"}], "validation": [{"recording": "b1"}]}
+    split_from_config(plain, catalogue)
+    assert asked == []
+    split_from_config(plain | {"train": [{"recordings": "a*"}], "validation": [{"recordings": "b*"}]}, catalogue)
+    assert asked == ["d"]
+
+
+def test_a_condition_keeps_whole_stretches_that_last() -> None:
+    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
+    ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
+    keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
+    split = kept_of(keep, drives({"train_1": ay}, start_time=50.0))
+    assert [(span.start, span.stop) for span in split.train] == [(52.0, 54.0), (54.01, math.inf)]
+    kept = split.kept["train"]
+    assert (kept.n_recordings, kept.n_spans) == (1, 2)
+    assert [kept.seconds, kept.of_seconds] == pytest.approx([5.0, 7.01])
+    assert kept.describe() == "0.1 of 0.1 min in 2 stretches of 1 recording"
+
+
+@PROPERTY
+@given(st.lists(st.tuples(st.sampled_from([0.0, 5.0, -9.0, math.nan]), st.integers(1, 40)), min_size=1, max_size=12), st.integers(0, 30))
+def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces: list[tuple[float, int]], shortest: int) -> None:
+    ay = [value for value, length in pieces for _ in range(length)]
+    expected: set[int] = set()
+    run: list[int] = []
+    for k, value in enumerate([*ay, math.inf]):
+        if abs(value) <= 5.0:
+            run.append(k)
+            continue
+        expected.update(run if len(run) >= shortest else [])
+        run = []
+    catalogue = drives({"train_1": ay}, start_time=3.3)
+    keep = {"magnitude": {"ay": {"at_most": 5.0}}, "at_least_seconds": shortest / 100.0}
+    if not expected:
+        with pytest.raises(ConfigurationError, match="keeps nothing"):
+            kept_of(keep, catalogue)
+        return
+    recording = catalogue("d")["train_1"](["ay"])
+    ranges = [recording.index_range(span.start, span.stop) for span in kept_of(keep, catalogue).train]
+    assert {k for first, end in ranges for k in range(first, end)} == expected
+    assert all(one[1] < other[0] for one, other in pairwise(ranges))
+
+
+def test_all_channels_of_a_condition_must_meet_it() -> None:
+    ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
+    keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
+    spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
+    assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
+
+
+def test_a_condition_looks_at_no_more_than_the_range() -> None:
+    keep = {"magnitude": {"ay": {"at_most": 7.0}}}
+    spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
+    assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
+
+
+CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
+
+
+@pytest.mark.parametrize(
+    ("entry", "what"),
+    [
+        ({"recordings": "lap_*"}, "no recording of data set 'd' matches 'lap_*' (it has train_1)"),
+        ({"recordings": "train_*", "recording": "train_1"}, "needs a recording and a dataset (or recordings, a pattern)"),
+        ({"recording": "train_9", "keep": CONDITION}, "no recording 'train_9'"),
+        ({"keep": "slow"}, "keep of train is {magnitude: {channel: {at_least, at_most}}, at_least_seconds}, not slow"),
+        ({"keep": {}}, "keep of train is {magnitude"),
+        ({"keep": {"magnitude": {"ay": {"at_most": 7.0}}, "seconds": 2}}, "keep of train is {magnitude"),
+        ({"keep": {"magnitude": "ay"}}, "magnitude maps channels to {at_least, at_most}, not ay"),
+        ({"keep": {"magnitude": {"lateral": {"at_most": 7.0}}}}, "there is no channel 'lateral'"),
+        ({"keep": {"magnitude": {"ay": 7.0}}}, "'ay' needs at_least, at_most or both, not 7.0"),
+        ({"keep": {"magnitude": {"ay": {}}}}, "'ay' needs at_least, at_most or both"),
+        ({"keep": {"magnitude": {"ay": {"most": 7.0}}}}, "'ay' needs at_least, at_most or both"),
+        ({"keep": {"magnitude": {"ay": {"at_most": "seven"}}}}, "at_most of 'ay' must be a number, not seven"),
+        ({"keep": {"magnitude": {"ay": {"at_most": True}}}}, "at_most of 'ay' must be a number, not True"),
+        ({"keep": {"magnitude": {"ay": {"at_most": -7.0}}}}, "no magnitude of 'ay' lies between 0 and -7"),
+        ({"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}}, "no magnitude of 'ay' lies between 8 and 7"),
+        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds must be zero or positive, not -1"),
+        ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
+    ],
+)
+def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry: dict[str, object], what: str) -> None:
+    named = {} if "recording" in entry else {"recordings": "train_*"}
+    config = {"name": "s", "dataset": "d", "train": [{**named, **entry}], "validation": [{"recording": "v"}]}
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config, drives({"train_1": [0.0] * 200}))
+    assert what in str(error.value)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
+def test_patterns_and_conditions_without_recordings_say_what_they_need(entry: dict[str, object]) -> None:
+    config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
+    with pytest.raises(ConfigurationError, match="patterns and conditions need the recordings of data set 'd'"):
+        split_from_config(config)
+
+
+def test_a_condition_on_a_channel_that_a_recording_lacks_names_both() -> None:
+    with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
+        kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
+
+
+# --- windows
 
 
 def recorded(name: str, length: int, offset: float) -> Recording:

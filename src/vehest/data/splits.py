@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
+from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
+from vehest.data.recording import Recording
+from vehest.data.stretches import Condition, stretches_where
 
 VALIDATION = "validation"
+
+Catalogue = Callable[[str], Mapping[str, Callable[[Iterable[str]], Recording]]]
+"""Of the name of a data set: its recordings as ingested, by id, each as a function that reads the named channels."""
 
 
 def check_name(name: str, what: str) -> None:
@@ -49,8 +56,41 @@ class Span:
 
 
 @dataclass(frozen=True)
+class Kept:
+    """How much a condition left of the recordings that it was put to.
+
+    Args:
+        n_recordings: how many there were.
+        n_spans: how many stretches were kept.
+        seconds: their time [s].
+        of_seconds: time of the recordings, or of their ranges [s].
+    """
+
+    n_recordings: int
+    n_spans: int
+    seconds: float
+    of_seconds: float
+
+    def describe(self) -> str:
+        """For messages and reports, for example ``61.2 of 90.0 min in 402 stretches of 161 recordings``."""
+        minutes = f"{self.seconds / 60.0:.1f} of {self.of_seconds / 60.0:.1f} min"
+        return f"{minutes} in {_counted(self.n_spans, 'stretch', 'es')} of {_counted(self.n_recordings, 'recording', 's')}"
+
+
+def _counted(number: int, what: str, plural: str) -> str:
+    return f"{number} {what}{'' if number == 1 else plural}"
+
+
+@dataclass(frozen=True)
 class Split:
     """Training, validation and named test stretches.
+
+    Args:
+        name: of the split.
+        train: stretches to learn from.
+        validation: stretches to stop on.
+        tests: name of a test set -> its stretches.
+        kept: ``train``, ``validation`` or name of a test set -> what was kept, where a condition decided it.
 
     Raises:
         ConfigurationError: no training or validation stretch, or a stretch that serves two purposes.
@@ -60,6 +100,7 @@ class Split:
     train: tuple[Span, ...]
     validation: tuple[Span, ...]
     tests: Mapping[str, tuple[Span, ...]]
+    kept: Mapping[str, Kept] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         if not self.train:
@@ -101,45 +142,149 @@ class Split:
         return self.train + self.validation + tests
 
 
-def split_from_config(config: Mapping[str, Any]) -> Split:
+def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
     """Build a split from plain values, as conf/split/*.yaml holds them.
 
+    Args:
+        config: its values.
+        catalogue: the recordings; asked only for data sets whose recordings are named by a pattern or cut by a condition.
+
     Raises:
-        ConfigurationError: a key is missing, misspelt or of the wrong type.
+        ConfigurationError: a key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a condition that
+            none meets; or either of them without a catalogue.
+        DataError: a recording lacks a channel that a condition looks at.
     """
     name = str(config.get("name", "unnamed"))
     unknown = set(config) - {"name", "title", "dataset", "train", "validation", "tests"}
     if unknown:
         raise ConfigurationError(f"split '{name}': unknown key '{sorted(unknown)[0]}'")
-    default = config.get("dataset")
     tests = config.get("tests") or {}
     if not isinstance(tests, Mapping):
         raise ConfigurationError(f"split '{name}': 'tests' must map a name to a list of ranges")
+    ranges = _Ranges(name, config.get("dataset"), catalogue)
     return Split(
         name=name,
-        train=_spans(name, default, config.get("train") or []),
-        validation=_spans(name, default, config.get("validation") or []),
-        tests={str(test): _spans(name, default, spans) for test, spans in tests.items()},
+        train=ranges.spans("train", config.get("train") or []),
+        validation=ranges.spans(VALIDATION, config.get("validation") or []),
+        tests={str(test): ranges.spans(str(test), entries) for test, entries in tests.items()},
+        kept=ranges.kept,
     )
 
 
-def _spans(split: str, default_dataset: Any, entries: Any) -> tuple[Span, ...]:
-    if not isinstance(entries, Sequence) or isinstance(entries, str):
-        raise ConfigurationError(f"split '{split}': ranges come as a list of recording, start and stop, not {entries}")
-    spans = []
-    for entry in entries:
+class _Ranges:
+    """Turns the ranges of a configuration into spans.
+
+    Args:
+        split: its name.
+        dataset: that serves ranges which name none.
+        catalogue: the recordings.
+    """
+
+    def __init__(self, split: str, dataset: Any, catalogue: Catalogue | None) -> None:
+        self._split, self._dataset, self._catalogue = split, dataset, catalogue
+        self._known: dict[str, Mapping[str, Callable[[Iterable[str]], Recording]]] = {}
+        self.kept: dict[str, Kept] = {}
+
+    def spans(self, role: str, entries: Any) -> tuple[Span, ...]:
+        """The spans of one role."""
+        if not isinstance(entries, Sequence) or isinstance(entries, str):
+            raise ConfigurationError(f"split '{self._split}': ranges come as a list of recording, start and stop, not {entries}")
+        spans: list[Span] = []
+        for entry in entries:
+            whole = self._named(entry)
+            if entry.get("keep") is None:
+                spans += whole
+            else:
+                condition = _condition(entry["keep"], f"split '{self._split}': keep of {role}")
+                spans += self._cut(role, whole, condition)
+        return tuple(spans)
+
+    def _named(self, entry: Any) -> list[Span]:
+        """Spans of one entry, before any condition."""
         if not isinstance(entry, Mapping):
-            raise ConfigurationError(f"split '{split}': a range is {{recording, start, stop}}, not {entry}")
-        unknown = set(entry) - {"dataset", "recording", "start", "stop"}
+            raise ConfigurationError(f"split '{self._split}': a range is {{recording, start, stop}}, not {entry}")
+        unknown = set(entry) - {"dataset", "recording", "recordings", "start", "stop", "keep"}
         if unknown:
-            raise ConfigurationError(f"split '{split}': unknown key '{sorted(unknown)[0]}' in {dict(entry)}")
-        dataset = entry.get("dataset", default_dataset)
-        if dataset is None or "recording" not in entry:
-            raise ConfigurationError(f"split '{split}': each range needs a recording and a dataset, not {dict(entry)}")
+            raise ConfigurationError(f"split '{self._split}': unknown key '{sorted(unknown)[0]}' in {dict(entry)}")
+        dataset = entry.get("dataset", self._dataset)
+        if dataset is None or ("recording" in entry) == ("recordings" in entry):
+            raise ConfigurationError(
+                f"split '{self._split}': each range needs a recording and a dataset (or recordings, a pattern), not {dict(entry)}"
+            )
         try:
             start = float(entry.get("start", -math.inf))
             stop = float(entry.get("stop", math.inf))
         except (TypeError, ValueError):
-            raise ConfigurationError(f"split '{split}': start and stop of {dict(entry)} must be numbers [s]") from None
-        spans.append(Span(str(dataset), str(entry["recording"]), start, stop))
-    return tuple(spans)
+            raise ConfigurationError(f"split '{self._split}': start and stop of {dict(entry)} must be numbers [s]") from None
+        names = [str(entry["recording"])] if "recording" in entry else self._matching(str(dataset), str(entry["recordings"]))
+        return [Span(str(dataset), name, start, stop) for name in names]
+
+    def _matching(self, dataset: str, pattern: str) -> list[str]:
+        recordings = self._recordings(dataset)
+        names = sorted(name for name in recordings if fnmatchcase(name, pattern))
+        if not names:
+            known = ", ".join([*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])])
+            raise ConfigurationError(f"split '{self._split}': no recording of data set '{dataset}' matches '{pattern}' (it has {known})")
+        return names
+
+    def _recordings(self, dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        if dataset not in self._known:
+            if self._catalogue is None:
+                raise ConfigurationError(f"split '{self._split}': its patterns and conditions need the recordings of data set '{dataset}'")
+            self._known[dataset] = self._catalogue(dataset)
+        return self._known[dataset]
+
+    def _cut(self, role: str, whole: Sequence[Span], condition: Condition) -> list[Span]:
+        """Those stretches of spans in which a condition holds; notes how much that is."""
+        spans: list[Span] = []
+        seconds = of_seconds = 0.0
+        for span in whole:
+            recordings = self._recordings(span.dataset)
+            if span.recording not in recordings:
+                raise ConfigurationError(f"split '{self._split}': data set '{span.dataset}' has no recording '{span.recording}'")
+            recording = recordings[span.recording](condition.magnitude)
+            first, end = recording.index_range(span.start, span.stop)
+            of_seconds += (end - first) / recording.rate_hz
+            for begin, after in stretches_where(recording, condition, first, end):
+                start = span.start if begin == first else recording.start_time + begin / recording.rate_hz
+                stop = span.stop if after == end else recording.start_time + after / recording.rate_hz
+                spans.append(Span(span.dataset, span.recording, start, stop))
+                seconds += (after - begin) / recording.rate_hz
+        if not spans:
+            raise ConfigurationError(f"split '{self._split}': the condition of {role} keeps nothing ({condition.describe()})")
+        before = self.kept.get(role, Kept(0, 0, 0.0, 0.0))
+        self.kept[role] = Kept(
+            before.n_recordings + len(whole), before.n_spans + len(spans), before.seconds + seconds, before.of_seconds + of_seconds
+        )
+        return spans
+
+
+def _condition(values: Any, where: str) -> Condition:
+    """A condition from ``magnitude``, a mapping from channels to at_least and at_most, and ``at_least_seconds``."""
+    if not isinstance(values, Mapping) or set(values) - {"magnitude", "at_least_seconds"} or not values.get("magnitude"):
+        raise ConfigurationError(f"{where} is {{magnitude: {{channel: {{at_least, at_most}}}}, at_least_seconds}}, not {values}")
+    if not isinstance(values["magnitude"], Mapping):
+        raise ConfigurationError(f"{where}: magnitude maps channels to {{at_least, at_most}}, not {values['magnitude']}")
+    bounds: dict[str, tuple[float, float]] = {}
+    for channel, limits in values["magnitude"].items():
+        if channel not in CHANNELS:
+            raise ConfigurationError(f"{where}: there is no channel '{channel}'; see 'vehest data channels'")
+        if not isinstance(limits, Mapping) or not limits or set(limits) - {"at_least", "at_most"}:
+            raise ConfigurationError(f"{where}: '{channel}' needs at_least, at_most or both, not {limits}")
+        at_least, at_most = (_number(limits.get(key, default), f"{where}: {key} of '{channel}'") for key, default in _BOUNDS)
+        if not 0.0 <= at_least <= at_most:
+            raise ConfigurationError(f"{where}: no magnitude of '{channel}' lies between {at_least:g} and {at_most:g}")
+        bounds[str(channel)] = (at_least, at_most)
+    seconds = _number(values.get("at_least_seconds", 0.0), f"{where}: at_least_seconds")
+    if not 0.0 <= seconds < math.inf:
+        raise ConfigurationError(f"{where}: at_least_seconds must be zero or positive, not {seconds:g}")
+    return Condition(bounds, seconds)
+
+
+_BOUNDS = (("at_least", 0.0), ("at_most", math.inf))
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        raise ConfigurationError(f"{where} must be a number, not {value}")
+    return float(value)
