@@ -11,8 +11,12 @@ import yaml
 
 from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, MissingError
+from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
+from vehest.simulation.parameters import library_parameters, vehicle_from_configuration
+from vehest.simulation.sensors import SensorLevels
 from vehest.sources.base import open_source, source_module, source_names
 from vehest.sources.simulated import SimulatedSource
+from vehest.stages.config import compose_config, missing_keys
 
 CONF = Path(__file__).parents[1] / "conf"
 DATASETS = sorted((CONF / "dataset").glob("*.yaml"))
@@ -20,17 +24,20 @@ VEHICLE = yaml.safe_load((CONF / "vehicle" / "bmw_320i_low.yaml").read_text(enco
 
 
 def simulated(**changes: object) -> dict[str, Any]:
-    drives = [{"id": "a", "seed": 1, "duration": 3}, {"id": "b", "seed": 2, "duration": 2.5}]
+    drives = [drive("a", 3.0, seed=1), drive("b", 2.5, seed=2)]
     return {"name": "sim", "source": "simulated", "vehicle": VEHICLE, "rate_hz": 50, "drives": drives, **changes}
 
 
+def drive(name: str, duration: float = 2.0, **more: object) -> dict[str, object]:
+    return {"id": name, "manoeuvre": {"name": "laps", "course": "handling", "duration": duration}, **more}
+
+
 @pytest.mark.parametrize("file", DATASETS, ids=lambda file: file.stem)
-def test_every_data_set_that_is_shipped_opens(file: Path, tmp_path: Path) -> None:
-    config = yaml.safe_load(file.read_text(encoding="utf-8").replace("${root}", str(tmp_path)))
-    if config.pop("defaults", None):
-        config["vehicle"] = VEHICLE
+def test_every_data_set_that_is_shipped_opens(file: Path) -> None:
+    config = compose_config("ingest", [f"dataset={file.stem}", "root=elsewhere"])["dataset"]
     assert config["name"] == file.stem
-    assert open_source(config).name == file.stem
+    if not missing_keys(config):
+        assert open_source(config).name == file.stem
 
 
 def test_every_source_has_a_module_that_opens() -> None:
@@ -58,24 +65,83 @@ def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate() -> None
 def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed() -> None:
     source = open_source(simulated())
     np.testing.assert_array_equal(source.read("b")["ay"], source.read("b")["ay"])
-    other = open_source(simulated(drives=[{"id": "b", "seed": 3, "duration": 2.5}]))
+    other = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
     assert not np.array_equal(other.read("b")["ay"], source.read("b")["ay"])
 
 
+def test_a_drive_without_a_seed_has_one_of_its_own_from_the_data_sets_seed_and_its_name() -> None:
+    drives = [drive("a"), drive("b")]
+    seeds = {name: entry.seed for name, entry in SimulatedSource(simulated(drives=drives, seed=1)).drives.items()}
+    assert seeds["a"] != seeds["b"]
+    assert SimulatedSource(simulated(drives=drives[1:], seed=1)).drives["b"].seed == seeds["b"], "whatever other drives there are"
+    assert SimulatedSource(simulated(drives=drives, seed=2)).drives["b"].seed != seeds["b"]
+
+
+def test_count_makes_as_many_drives_with_seeds_of_their_own() -> None:
+    source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
+    assert source.ids() == ["a_001", "a_002", "a_003"]
+    assert len({entry.seed for entry in source.drives.values()}) == 3
+
+
+def test_of_several_vehicles_each_drive_has_the_one_it_names() -> None:
+    heavier = {**VEHICLE, "name": "heavier"}
+    config = simulated(vehicles={"one": VEHICLE, "other": heavier}, drives=[drive("a", vehicle="one"), drive("b", vehicle="other")])
+    del config["vehicle"]
+    assert [open_source(config).read(name).vehicle for name in ("a", "b")] == [VEHICLE["name"], "heavier"]
+    with pytest.raises(ConfigurationError, match="drive 'a': vehicle 'None' is not one of: one, other"):
+        SimulatedSource({**config, "drives": [drive("a")]})
+
+
+def test_cars_of_a_fleet_differ_from_drive_to_drive_within_the_stated_range() -> None:
+    masses = []
+    vary = [{"parameters": ["m", "m_s"], "factor": [0.8, 1.2]}]
+    vehicle = vehicle_from_configuration(VEHICLE)
+    nominal = library_parameters(vehicle)
+    for seed in range(40):
+        parameters = library_parameters(varied(vehicle, variations_from_config(vary), seed))
+        masses.append(parameters.m / nominal.m)
+        assert parameters.m_s / nominal.m_s == pytest.approx(masses[-1]), "scaled together"
+    assert 0.8 <= min(masses) < 0.84
+    assert 1.16 < max(masses) <= 1.2
+    assert library_parameters(varied(vehicle, variations_from_config(vary), 7)).m / nominal.m == masses[7]
+    with pytest.raises(ConfigurationError, match=r"vary: 'tire\.grip' is no parameter of vehicle"):
+        varied(vehicle, variations_from_config([{"parameters": ["tire.grip"], "factor": [1, 2]}]), 0)
+
+
+def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
+    levels = SensorLevels()
+    variation = SensorVariation.from_config({"noise": [2.0, 3.0], "delay": [0.0, 0.0]})
+    changed = variation.applied(levels, 3)
+    assert 2.0 <= changed.yaw_rate.noise / levels.yaw_rate.noise <= 3.0
+    assert changed.yaw_rate.delay == 0.0
+    assert changed.yaw_rate.offset == levels.yaw_rate.offset
+    assert changed.reference == levels.reference
+    assert changed.yaw_rate.noise / levels.yaw_rate.noise != changed.ay.noise / levels.ay.noise
+
+
 def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
-    with pytest.raises(MissingError, match=r"no drive 'c' \(it has a, b\)"):
+    with pytest.raises(MissingError, match=r"no drive 'c' \(it has a, b, …\)"):
         open_source(simulated()).read("c")
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"drives": [{"id": "a", "seed": 1}]}, "a drive has an id, a seed and a duration"),
-        ({"drives": ["a"]}, "a drive has an id, a seed and a duration"),
-        ({"drives": [{"id": "a", "seed": "one", "duration": 3}]}, "drive 'a' needs a whole number as seed"),
-        ({"drives": [{"id": "a", "seed": 1, "duration": 0}]}, "drive 'a' needs a whole number as seed and a positive duration"),
-        ({"drives": [{"id": "a", "seed": 1, "duration": 3}] * 2}, "two drives are called 'a'"),
-        ({"sensors": "perfect"}, "sensors 'perfect' is not one of: default, ideal"),
+        ({"drives": [{"id": "a", "seed": 1}]}, "a drive has an id, a manoeuvre and, if need be, count, seed, stability_control, surface"),
+        ({"drives": ["a"]}, "a drive has an id, a manoeuvre"),
+        ({"drives": [{"id": "a", "manoeuvre": "laps"}]}, "drive 'a': manoeuvre is a mapping with a name, such as {name: laps}, not laps"),
+        ({"drives": [drive("a", seed="one")]}, "drive 'a': seed must be a whole number, zero or positive, not one"),
+        ({"drives": [drive("a", seed=1, count=2)]}, "drive 'a': give seed for a single drive, or count, not both"),
+        ({"drives": [drive("a", count=1.5)]}, "drive 'a': count must be a whole number of drives, not 1.5"),
+        ({"drives": [drive("a", stability_control="on")]}, "drive 'a': stability_control must be true or false, not on"),
+        ({"drives": [drive("a", surface="icy")]}, "there is no surface 'icy'; there are dry, wet, patchy"),
+        ({"drives": [drive("a", 0.0)]}, "data set 'sim': manoeuvre 'laps': duration must lie between"),
+        ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
+        ({"seed": -1}, "seed must be a whole number, zero or positive, not -1"),
+        ({"vary": {"m": 1}}, "vary is a list of {parameters, factor}"),
+        ({"vary": [{"parameters": ["m"], "factor": [2, 1]}]}, "vary: a range is a pair [lowest, highest] of scales, not [2, 1]"),
+        ({"vary_sensors": {"hum": [0, 1]}}, "vary_sensors is a mapping from"),
+        ({"sensors": "perfect"}, "default, race, ideal"),
         ({"sensor": "ideal"}, "has no option 'sensor'"),
     ],
 )

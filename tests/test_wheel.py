@@ -49,7 +49,8 @@ def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_pat
     assert "ksnn" in _vehest(installed, tmp_path, "train", "--help").stdout
     result = _vehest(installed, tmp_path, "config", "train", "--json")
     assert json.loads(result.stdout)["estimator"]["name"] == "ksnn"
-    drives = "drives=[{id: drive_1, seed: 1, duration: 20}, {id: drive_2, seed: 2, duration: 10}, {id: drive_3, seed: 3, duration: 10}]"
+    lap = "manoeuvre: {name: laps, course: handling, duration: "
+    drives = f"drives=[{{id: drive_1, {lap}20}}}}, {{id: drive_2, {lap}10}}}}, {{id: drive_3, {lap}10}}}}]"
     result = _vehest(installed, tmp_path, "ingest", "sim_quickstart", f"dataset.{drives}", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["recordings"] == ["drive_1", "drive_2", "drive_3"]

@@ -15,7 +15,7 @@ import typer
 
 from vehest.data.errors import ConfigurationError, VehestError
 from vehest.stages.completion import complete_override
-from vehest.stages.config_files import choices, pipeline_names, summary
+from vehest.stages.config_files import choices, is_simulated, pipeline_names, summary
 from vehest.version import __version__
 
 if TYPE_CHECKING:
@@ -50,13 +50,22 @@ def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, 
     def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
         given = [str(word) for word in context.params.get("overrides") or []]
         own = str(context.params.get("command") or command)
-        return complete_override(own, given, incomplete)
+        dataset = context.params.get("dataset")
+        chosen = [f"dataset={dataset}"] if dataset else []
+        if own == "simulate":
+            short = [("seed=0", "short for dataset.seed")] if "seed=0".startswith(incomplete) else []
+            return short + complete_override("ingest", chosen + given, incomplete)
+        return complete_override(own, chosen + given, incomplete)
 
     return complete
 
 
 def _complete_dataset(incomplete: str) -> list[tuple[str, str]]:
     return [(name, summary("dataset", name)) for name in choices("dataset") if name.startswith(incomplete)]
+
+
+def _complete_simulated(incomplete: str) -> list[tuple[str, str]]:
+    return [(name, note) for name, note in _complete_dataset(incomplete) if is_simulated(name)]
 
 
 def _complete_pipeline(incomplete: str) -> list[str]:
@@ -102,10 +111,11 @@ def ingest(
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
+    jobs: Jobs = None,
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
-    with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet) as workshop:
+    with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
         if download:
             from vehest.stages.download import download_files
 
@@ -114,6 +124,32 @@ def ingest(
     _say(
         as_json, {"folder": str(artefact.folder), "recordings": sorted(Path(n).stem for n in artefact.outputs), "skipped": artefact.skipped}
     )
+
+
+@app.command()
+def simulate(
+    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=_complete_simulated)],
+    overrides: Annotated[list[str] | None, _overrides("simulate")] = None,
+    dry_run: DryRun = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    jobs: Jobs = None,
+) -> None:
+    """Simulate a data set into the store: `vehest simulate sim_bmw seed=1`.
+
+    The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
+    that spin or leave the road are kept, flagged in their provenance, and counted.
+    """
+    from vehest.stages.simulate import outcome_of, simulation_config
+
+    config = simulation_config(dataset, overrides or [])
+    with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+        artefact = workshop.ingest(config)
+    outcome = outcome_of(artefact).as_plain()
+    if not as_json:
+        outcome |= {name: _counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
+    _say(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
 
 
 @app.command(epilog=_offered("dataset"))
@@ -180,7 +216,6 @@ def evaluate(
 
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`.
     """
-    from vehest.data.splits import split_from_config
     from vehest.stages.artefacts import find, read_artefact
     from vehest.stages.estimate import find_model, preparation_of
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
@@ -190,7 +225,7 @@ def evaluate(
 
     config = _compose("eval", overrides or [])
     with _workshop(config, force={"evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
-        split, protocol = split_from_config(config["split"]), protocol_from_config(config["evaluation"])
+        split, protocol = workshop.split(config), protocol_from_config(config["evaluation"])
         if model is not None:
             trained = read_artefact(find_model(model, workshop.output))
             if trained.stage != "train":
@@ -497,9 +532,15 @@ def _run_pipeline(
         outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
     page = outcome.report.folder / "report.html"
     if as_json:
-        rows = json.loads(outcome.leaderboard.to_json(orient="records"))
+        shown = ("leaderboard", outcome.leaderboard) if outcome.overview is None else ("overview", outcome.overview)
         published = str(outcome.published) if outcome.published else None
-        typer.echo(_json({"report": str(page), "published": published, "leaderboard": rows}))
+        typer.echo(_json({"report": str(page), "published": published, shown[0]: json.loads(shown[1].to_json(orient="records"))}))
+        return
+    if outcome.overview is not None:
+        _table([*outcome.overview.columns], [[_cell(value) for value in row] for row in outcome.overview.itertuples(index=False)])
+        typer.echo(f"report: {page}")
+        if outcome.published is not None:
+            typer.echo(f"published: {outcome.published}")
         return
     for test_set, rows in outcome.leaderboard.groupby("test_set", sort=False):
         typer.echo(f"\n{pipeline.title}: test set '{test_set}'")
@@ -536,16 +577,15 @@ def _names(group: str, overrides: list[str] | None) -> bool:
 
 
 def _train_job(config: Config, workshop: Workshop) -> Any:
-    from vehest.data.splits import split_from_config
     from vehest.stages.train import plan_train
 
-    split = split_from_config(config["split"])
+    split = workshop.split(config)
     return plan_train(config, split, workshop.data_for(split, _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz"), config))
 
 
 @contextmanager
 def _workshop(
-    config: Config, *, force: set[str], dry_run: bool, quiet: bool, jobs: int | None = 1, track: bool = False
+    config: Config, *, force: set[str], dry_run: bool, quiet: bool, jobs: int | None = None, track: bool = False
 ) -> Iterator[Workshop]:
     """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
     from vehest.stages.console import Messages
@@ -590,6 +630,12 @@ def _say(as_json: bool, outcome: dict[str, Any]) -> None:
         typer.echo(f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}")
 
 
+def _counted(names: list[str]) -> str:
+    """How many there are, and the first of them."""
+    some = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
+    return f"{len(names)} ({some})" if names else "0"
+
+
 def _json(outcome: Any) -> str:
     """An outcome as JSON; what is not a finite number becomes null."""
 
@@ -601,6 +647,13 @@ def _json(outcome: Any) -> str:
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return json.dumps(plain(outcome), indent=1, ensure_ascii=False, allow_nan=False)
+
+
+def _cell(value: Any) -> str:
+    """A value of a table, numbers with four significant digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "–"
+    return str(value)
 
 
 def _table(header: list[str], rows: list[list[str]]) -> None:

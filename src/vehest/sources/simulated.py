@@ -1,44 +1,72 @@
-"""Drives simulated on the spot: CommonRoad's multi-body plant, a driver, a course and sensors."""
+"""Drives simulated on the spot: CommonRoad's multi-body plant, a driver, manoeuvres, surfaces and sensors."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source
 
+OPTIONS_OF_A_DRIVE = frozenset({"id", "count", "seed", "vehicle", "manoeuvre", "surface", "stability_control"})
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One simulated drive of a data set.
+
+    Args:
+        seed: of everything that is drawn.
+        vehicle: its configuration.
+        manoeuvre: its configuration.
+        surface: name or configuration.
+        stability_control: whether it is switched on.
+    """
+
+    seed: int
+    vehicle: Mapping[str, Any]
+    manoeuvre: Mapping[str, Any]
+    surface: Any
+    stability_control: bool
+
 
 class SimulatedSource(Source):
     """Simulated drives, a recording each.
 
-    Options: ``vehicle`` (from conf/vehicle), ``course``, ``rate_hz``, ``drives`` (a list of id, seed and duration) and ``sensors``
-    (``default`` or ``ideal``).
+    Options: ``vehicle`` (from conf/vehicle) or ``vehicles`` (several, by name), ``drives`` (a list of id, manoeuvre and, if need be, count,
+    seed, vehicle, surface, stability_control), ``seed``, ``rate_hz``, ``sensors``, ``surface``, ``stability_control``, ``vary`` and
+    ``vary_sensors``.
     """
 
-    keys = frozenset({"course", "rate_hz", "drives", "sensors"})
+    keys = frozenset({"vehicles", "drives", "seed", "rate_hz", "sensors", "surface", "stability_control", "vary", "vary_sensors"})
+    slow = True
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
+        from vehest.simulation.fleet import SensorVariation, variations_from_config
+        from vehest.simulation.manoeuvres import manoeuvre_from_config
+        from vehest.simulation.sensors import sensor_levels_from_config
+        from vehest.simulation.surface import surface_from_config
+
         super().__init__(dataset)
-        self.drives: dict[str, Mapping[str, Any]] = {}
-        for drive in dataset.get("drives") or []:
-            if not isinstance(drive, Mapping) or set(drive) != {"id", "seed", "duration"}:
-                raise ConfigurationError(f"data set '{self.name}': a drive has an id, a seed and a duration, not {drive}")
-            if not isinstance(drive["seed"], int) or not isinstance(drive["duration"], int | float) or drive["duration"] <= 0:
-                raise ConfigurationError(
-                    f"data set '{self.name}': drive '{drive['id']}' needs a whole number as seed and a positive duration [s], "
-                    f"not {drive['seed']} and {drive['duration']}"
-                )
-            if str(drive["id"]) in self.drives:
-                raise ConfigurationError(f"data set '{self.name}': two drives are called '{drive['id']}', names must differ")
-            self.drives[str(drive["id"])] = drive
-        if "vehicle" not in dataset:
-            raise ConfigurationError(f"data set '{self.name}': a simulated data set needs a vehicle from conf/vehicle")
-        if dataset.get("sensors", "default") not in ("default", "ideal"):
-            raise ConfigurationError(f"data set '{self.name}': sensors '{dataset['sensors']}' is not one of: default, ideal")
+        self.seed = _whole_number(dataset.get("seed", 0), f"data set '{self.name}': seed")
+        self.vehicles = self._vehicles()
+        self.drives = self._drives()
+        try:
+            self.sensors = sensor_levels_from_config(dataset.get("sensors"))
+            self.variations = variations_from_config(dataset.get("vary") or [])
+            self.sensor_variation = SensorVariation.from_config(dataset.get("vary_sensors") or {})
+            for drive in self.drives.values():
+                manoeuvre_from_config(drive.manoeuvre)
+                surface_from_config(drive.surface)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"data set '{self.name}': {error}") from None
 
     def inputs(self) -> dict[str, str | Path]:
         """The plant's library and its version; there are no files."""
@@ -50,23 +78,91 @@ class SimulatedSource(Source):
 
     def read(self, recording_id: str) -> Recording:
         """Simulate one drive."""
-        from vehest.simulation.course import course_by_name
         from vehest.simulation.drive import simulate_drive
+        from vehest.simulation.fleet import varied
+        from vehest.simulation.manoeuvres import manoeuvre_from_config
         from vehest.simulation.parameters import vehicle_from_configuration
-        from vehest.simulation.sensors import SensorLevels, ideal_sensors
+        from vehest.simulation.surface import surface_from_config
 
         if recording_id not in self.drives:
-            raise MissingError(f"data set '{self.name}' has no drive '{recording_id}' (it has {', '.join(self.drives)})")
+            raise MissingError(f"data set '{self.name}' has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)")
         drive = self.drives[recording_id]
         return simulate_drive(
             id=recording_id,
-            vehicle=vehicle_from_configuration(self.dataset["vehicle"]),
-            course=course_by_name(str(self.dataset.get("course", "handling"))),
-            duration=float(drive["duration"]),
-            seed=int(drive["seed"]),
+            vehicle=varied(vehicle_from_configuration(drive.vehicle), self.variations, drive.seed),
+            manoeuvre=manoeuvre_from_config(drive.manoeuvre),
+            seed=drive.seed,
             rate_hz=float(self.dataset.get("rate_hz", 100.0)),
-            sensors=ideal_sensors() if self.dataset.get("sensors") == "ideal" else SensorLevels(),
+            sensors=self.sensor_variation.applied(self.sensors, drive.seed),
+            stability_control=drive.stability_control,
+            surface=surface_from_config(drive.surface),
         )
+
+    def _vehicles(self) -> dict[str, Mapping[str, Any]]:
+        one, several = self.dataset.get("vehicle"), self.dataset.get("vehicles")
+        if isinstance(one, Mapping) and not several:
+            return {"": one}
+        if one is None and isinstance(several, Mapping) and several and all(isinstance(entry, Mapping) for entry in several.values()):
+            return {str(name): entry for name, entry in several.items()}
+        raise ConfigurationError(
+            f"data set '{self.name}': a simulated data set needs a vehicle from conf/vehicle, or vehicles, a mapping of several"
+        )
+
+    def _drives(self) -> dict[str, Drive]:
+        drives: dict[str, Drive] = {}
+        for entry in self.dataset.get("drives") or []:
+            if not isinstance(entry, Mapping) or not {"id", "manoeuvre"} <= set(entry) or set(entry) - OPTIONS_OF_A_DRIVE:
+                known = ", ".join(sorted(OPTIONS_OF_A_DRIVE - {"id", "manoeuvre"}))
+                raise ConfigurationError(f"data set '{self.name}': a drive has an id, a manoeuvre and, if need be, {known}; not {entry}")
+            where = f"data set '{self.name}': drive '{entry['id']}'"
+            if not isinstance(entry["manoeuvre"], Mapping):
+                raise ConfigurationError(f"{where}: manoeuvre is a mapping with a name, such as {{name: laps}}, not {entry['manoeuvre']}")
+            for drive_id in _ids_of(entry, where):
+                if drive_id in drives:
+                    raise ConfigurationError(f"data set '{self.name}': two drives are called '{drive_id}', names must differ")
+                drives[drive_id] = Drive(
+                    seed=self._seed_of(entry, drive_id, where),
+                    vehicle=self._vehicle_of(entry, where),
+                    manoeuvre=dict(entry["manoeuvre"]),
+                    surface=entry.get("surface", self.dataset.get("surface")),
+                    stability_control=_switch(entry.get("stability_control", self.dataset.get("stability_control", False)), where),
+                )
+        return drives
+
+    def _seed_of(self, entry: Mapping[str, Any], drive_id: str, where: str) -> int:
+        """The drive's own seed, or one that follows from the data set's and the drive's name, whatever other drives there are."""
+        if "seed" in entry:
+            if "count" in entry:
+                raise ConfigurationError(f"{where}: give seed for a single drive, or count, not both")
+            return _whole_number(entry["seed"], f"{where}: seed")
+        return int(np.random.SeedSequence([self.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0])
+
+    def _vehicle_of(self, entry: Mapping[str, Any], where: str) -> Mapping[str, Any]:
+        name = entry.get("vehicle", next(iter(self.vehicles)) if len(self.vehicles) == 1 else None)
+        if name not in self.vehicles:
+            raise ConfigurationError(f"{where}: vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
+        return self.vehicles[name]
+
+
+def _ids_of(entry: Mapping[str, Any], where: str) -> list[str]:
+    if "count" not in entry:
+        return [str(entry["id"])]
+    count = entry["count"]
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise ConfigurationError(f"{where}: count must be a whole number of drives, not {count}")
+    return [f"{entry['id']}_{position:03d}" for position in range(1, count + 1)]
+
+
+def _whole_number(value: Any, where: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise ConfigurationError(f"{where} must be a whole number, zero or positive, not {value}")
+    return value
+
+
+def _switch(value: Any, where: str) -> bool:
+    if not isinstance(value, bool):
+        raise ConfigurationError(f"{where}: stability_control must be true or false, not {value}")
+    return value
 
 
 SOURCE = SimulatedSource

@@ -44,6 +44,15 @@ def summary(group: str, choice: str) -> str:
     return ""
 
 
+def is_simulated(dataset: str) -> bool:
+    """Whether a data set's file says that it is simulated."""
+    for folder in (local_conf(), packaged_conf()):
+        file = folder / "dataset" / f"{dataset}.yaml" if folder else None
+        if file and file.is_file():
+            return "\nsource: simulated\n" in file.read_text(encoding="utf-8")
+    return False
+
+
 def find_pipeline(name: str) -> Path | None:
     """A pipeline by path or by name: as given, then ./pipelines, then the packaged ones."""
     given = Path(name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.data.splits import VALIDATION, Split
+from vehest.data.recording import Recording
+from vehest.data.splits import VALIDATION, Catalogue, Split, split_from_config
+from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
 from vehest.stages.config import Config, compose_config
@@ -22,7 +24,7 @@ from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
 from vehest.stages.evaluate import METRICS, read_scored
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished, run_group
-from vehest.stages.ingest import plan_ingest, write_ingest
+from vehest.stages.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.stages.launcher import Failure, Task, launch
 from vehest.stages.signals import StopSignals
 from vehest.stages.tracking import Tracker
@@ -58,6 +60,7 @@ class Workshop:
     _made: dict[str, Artefact] = field(default_factory=dict)
     _datasets: dict[str, Config] = field(default_factory=dict)
     _data: dict[tuple[str, float, str], Artefact] = field(default_factory=dict)
+    _splits: dict[str, Split] = field(default_factory=dict)
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate.
@@ -71,12 +74,34 @@ class Workshop:
             def report(done: int, total: int, name: str) -> None:
                 bars.step(f"ingest {plan.label}", done, total, name)
 
-            return self._ensure(plan, lambda folder: write_ingest(config, folder, report))
+            made = self._ensure(plan, lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report))
+        drop_parts(plan)
+        return made
 
     def downsample(self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]) -> Artefact:
         """The recordings of a data set at another rate."""
         plan = plan_downsample(ingested, rate_hz, options, self.output)
         return self._ensure(plan, lambda folder: write_downsample(ingested, plan.config, folder))
+
+    def split(self, config: Config) -> Split:
+        """The split of a configuration; where it names or cuts recordings by rules, its data sets are ingested for it.
+
+        Raises:
+            NotThereYet: in a dry run, if they would have to be made.
+        """
+        key = json.dumps(config["split"], sort_keys=True)
+        if key not in self._splits:
+            self._splits[key] = split = split_from_config(config["split"], self._catalogue(config))
+            for role, kept in split.kept.items():
+                self.messages.line("done", "split", f"{split.name}, {role}", f"keeps {kept.describe()}")
+        return self._splits[key]
+
+    def _catalogue(self, config: Config) -> Catalogue:
+        def recordings_of(name: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+            ingested = self.ingest(self.dataset_config(name, config))
+            return {file.removesuffix(".parquet"): partial(read_recording, ingested.folder / file) for file in ingested.outputs}
+
+        return recordings_of
 
     def data_for(self, split: Split, rate_hz: float, config: Config) -> dict[str, Artefact]:
         """Every data set of a split at a rate."""
