@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style
+from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 PNG_DPI = 150
 PNG_COLOURS = 256
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
+_LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,13 @@ class Column:
         header: what it is called, unit included.
         digits: significant digits of its typical value, from which the decimals of all follow.
         decimals: decimals of every value, instead of ``digits``.
+        each: every value has its own decimals, as in a column of different units.
     """
 
     header: str
     digits: int = 3
     decimals: int | None = None
+    each: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,7 @@ class Document:
     Args:
         title: plain text.
         blocks: Markdown text (headings from ``##`` down), tables and figures, in reading order.
+        data: name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``.
 
     Raises:
         ValueError: two tables or two figures share a name, or a name is no file name.
@@ -90,10 +94,11 @@ class Document:
 
     title: str
     blocks: Sequence[Block]
+    data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for kind in (Table, Figure):
-            names = [block.name for block in self.blocks if isinstance(block, kind)]
+            names = [block.name for block in self.blocks if isinstance(block, kind)] + (list(self.data) if kind is Table else [])
             for name in names:
                 if not _NAME.fullmatch(name):
                     raise ValueError(f"'{name}' cannot name a file of a report")
@@ -101,7 +106,26 @@ class Document:
                     raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
 
 
-def write_document(document: Document, folder: Path, *, page: bool = True) -> None:
+def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bool = True) -> None:
+    """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
+
+    Args:
+        documents: name of the file -> document; ``report`` is the one to start with.
+        folder: an existing folder.
+        page: whether to write the self-contained pages too.
+
+    Raises:
+        ValueError: tables or figures of two documents share a name, or a name is no file name.
+    """
+    blocks = [block for document in documents.values() for block in document.blocks]
+    Document("all pages", blocks, {name: frame for document in documents.values() for name, frame in document.data.items()})
+    for name, document in documents.items():
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"'{name}' cannot name a file of a report")
+        write_document(document, folder, page=page, name=name)
+
+
+def write_document(document: Document, folder: Path, *, page: bool = True, name: str = "report") -> None:
     """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html`` where ``page`` is set.
 
     The same document gives the same bytes.
@@ -110,21 +134,23 @@ def write_document(document: Document, folder: Path, *, page: bool = True) -> No
         document: what to write.
         folder: an existing folder.
         page: whether to write the self-contained page too.
+        name: of both files, without ending.
     """
     numbers = _numbers(document)
     images: dict[str, bytes] = {}
+    for table, frame in document.data.items():
+        _write_table(folder, table, frame)
     for block in document.blocks:
         if isinstance(block, Table):
-            (folder / "tables").mkdir(exist_ok=True)
-            block.frame.to_csv(folder / "tables" / f"{block.name}.csv", index=False, lineterminator="\n", encoding="utf-8")
+            _write_table(folder, block.name, block.frame)
         elif isinstance(block, Figure):
             (folder / "figures").mkdir(exist_ok=True)
             (folder / "figures" / f"{block.name}.png").write_bytes(_png(block.static))
             images[block.name] = _svg(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    _write_text(folder / "report.md", _markdown(document, numbers))
+    _write_text(folder / f"{name}.md", _markdown(document, numbers))
     if page:
-        _write_text(folder / "report.html", _page(document, numbers, images))
+        _write_text(folder / f"{name}.html", _page(document, numbers, images))
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
@@ -149,6 +175,8 @@ def _number_cells(values: list[Any], column: Column) -> list[str]:
     if all(isinstance(value, int) for value in values):
         return [fixed(value, 0) for value in values]
     numbers = [float(value) if value is not None and value == value else math.nan for value in values]
+    if column.each:
+        return [fixed(number, 0) if number.is_integer() else significant(number, column.digits) for number in numbers]
     decimals = decimals_for(numbers, column.digits) if column.decimals is None else column.decimals
     return [fixed(number, decimals) for number in numbers]
 
@@ -203,6 +231,11 @@ def _for_both_schemes(svg: bytes) -> bytes:
     return re.sub(r"(<svg\b[^>]*>)", lambda opening: opening[0] + style, text, count=1).encode("utf-8")
 
 
+def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
+    (folder / "tables").mkdir(exist_ok=True)
+    frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8")
+
+
 def _write_text(path: Path, text: str) -> None:
     path.write_bytes(text.encode("utf-8"))
 
@@ -246,7 +279,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
-            blocks.append({"kind": "text", "html": Markup(markdown.render(block))})
+            blocks.append({"kind": "text", "html": Markup(_LINK_TO_PAGE.sub(r'href="\1.html"', markdown.render(block)))})
             continue
         shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(block.caption))}
         if isinstance(block, Table):

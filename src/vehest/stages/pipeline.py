@@ -1,8 +1,12 @@
-"""A pipeline: sweeps of trainings, the evaluations they feed, and the study that draws tables and figures from them."""
+"""A pipeline: sweeps of trainings, the evaluations they feed, and the study that draws tables and figures from them.
+
+Or data sets alone, and the study that draws tables and figures from their recordings.
+"""
 
 from __future__ import annotations
 
 import difflib
+import importlib
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,18 +17,21 @@ import pandas as pd
 import yaml
 
 from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
-from vehest.data.splits import check_name, split_from_config
+from vehest.data.splits import check_name
 from vehest.stages.artefacts import Artefact
 from vehest.stages.config import Config, compose_config, expand, has_key, key_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
 from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.group import Evaluation, Group, existing, is_finished
 from vehest.stages.report import ReportJob, leaderboard_of, plan_report, publish, write_report
+from vehest.stages.survey import SurveyJob, ingest_all, lost_by_publishing, overview_of, plan_survey, write_survey
 from vehest.stages.tracking import Tracker
 from vehest.stages.train import TrainJob, new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
 
-KEYS = {"study", "title", "about", "report", "split", "sweeps", "evaluation", "publish"}
+COMPARISON = {"split", "sweeps", "evaluation"}
+SURVEY = {"datasets", "optional_datasets"}
+KEYS = {"study", "title", "about", "report", "publish", *COMPARISON, *SURVEY}
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,8 @@ class Pipeline:
         evaluation: overrides of conf/eval.yaml's ``evaluation``.
         publish: whether its outcome also goes to results/<study>.
         file: where it was read from.
+        datasets: conf/dataset whose recordings it shows, where it compares no estimators; split and sweeps are empty then.
+        optional_datasets: further ones, that it goes on without where their raw files are not here.
     """
 
     study: str
@@ -52,6 +61,8 @@ class Pipeline:
     evaluation: tuple[str, ...]
     publish: bool
     file: Path
+    datasets: tuple[str, ...] = ()
+    optional_datasets: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -60,13 +71,15 @@ class PipelineOutcome:
 
     Args:
         report: artefact of the report stage.
-        leaderboard: its table, one row an estimator and test set.
+        leaderboard: its table, one row an estimator and test set; empty where it compares none.
         published: folder in results/, if it was published.
+        overview: table of a study of recordings alone.
     """
 
     report: Artefact
     leaderboard: pd.DataFrame
     published: Path | None
+    overview: pd.DataFrame | None = None
 
 
 def read_pipeline(name: str) -> Pipeline:
@@ -85,35 +98,56 @@ def read_pipeline(name: str) -> Pipeline:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict) or set(content) - KEYS or not {"study", "report", "split", "sweeps"} <= set(content):
-        wrong = sorted(set(content) - KEYS)[:1] if isinstance(content, dict) else []
-        reason = f"unknown key '{wrong[0]}'" if wrong else "it needs study, report, split and sweeps"
+    if not isinstance(content, dict) or set(content) - KEYS:
+        reason = f"unknown key '{min(set(content) - KEYS)}'" if isinstance(content, dict) else "it holds no keys"
         raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
-    sweeps = content["sweeps"]
+    survey = bool(SURVEY & set(content))
+    needed = {"study", "report", "datasets"} if survey else {"study", "report", "split", "sweeps"}
+    if not needed <= set(content) or (survey and COMPARISON & set(content)):
+        raise ConfigurationError(
+            f"'{file}' is not a pipeline: it needs study, report, split and sweeps; or study, report and datasets, and no split or sweeps"
+        )
+    sweeps = content.get("sweeps", [])
     if not isinstance(sweeps, list) or not all(isinstance(sweep, list) and sweep for sweep in sweeps):
         raise ConfigurationError(f"'{file}': sweeps must be a list of lists of overrides")
+    datasets, optional = (_names_in(content.get(key, []), f"'{file}': {key}") for key in ("datasets", "optional_datasets"))
+    if survey and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
+        raise ConfigurationError(f"'{file}': datasets must name some, and none of them twice")
     if importlib.util.find_spec(f"vehest.studies.{content['report']}") is None:
         raise ConfigurationError(f"'{file}': there is no study module '{content['report']}' in vehest.studies")
+    if not hasattr(importlib.import_module(f"vehest.studies.{content['report']}"), "documents" if survey else "build"):
+        takes = "split and sweeps" if survey else "datasets"
+        raise ConfigurationError(f"'{file}': the study module '{content['report']}' draws its report from {takes}")
     check_name(str(content["study"]), f"'{file}': study")
     return Pipeline(
         study=str(content["study"]),
         title=str(content.get("title", content["study"])),
         about=" ".join(str(content.get("about", "")).split()),
         report=str(content["report"]),
-        split=str(content["split"]),
+        split=str(content.get("split", "")),
         sweeps=tuple(tuple(str(override) for override in sweep) for sweep in sweeps),
         evaluation=tuple(f"evaluation.{key}={value}" for key, value in (content.get("evaluation") or {}).items()),
         publish=bool(content.get("publish", False)),
         file=file,
+        datasets=datasets,
+        optional_datasets=optional,
     )
 
 
+def _names_in(content: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(content, list) or not all(isinstance(name, str) for name in content):
+        raise ConfigurationError(f"{where} must be a list of names in conf/dataset")
+    return tuple(content)
+
+
 def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Config]:
-    """The configuration of every job; further overrides apply to the sweeps that have their key.
+    """The configuration of every job; further overrides apply to the sweeps, or data sets, that have their key.
 
     Raises:
-        ConfigurationError: an override that suits none of the sweeps.
+        ConfigurationError: an override that suits none of them.
     """
+    if pipeline.datasets:
+        return _survey_configs(pipeline, overrides)
     composed: dict[tuple[str, ...], Config] = {}
 
     def config_of(job: tuple[str, ...]) -> Config:
@@ -146,6 +180,25 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
     return configs
 
 
+def _survey_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Config]:
+    """The configuration of every ingest. Nothing is tracked, and so what is said about tracking suits."""
+    if any(key_of(override) == "dataset" for override in overrides):
+        raise ConfigurationError(
+            f"the data sets belong to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change them there"
+        )
+    used = {override for override in overrides if key_of(override).split(".")[0] == "tracking"}
+    configs = []
+    for name in (*pipeline.datasets, *pipeline.optional_datasets):
+        base = compose_config("ingest", [f"dataset={name}"])
+        suiting = [override for override in overrides if has_key(base, key_of(override))]
+        used.update(suiting)
+        configs.append(compose_config("ingest", [f"dataset={name}", *suiting]))
+    for override in overrides:
+        if override not in used:
+            raise ConfigurationError(f"'{override}' suits no data set of '{pipeline.file.name}': none has an option '{key_of(override)}'")
+    return configs
+
+
 def content_overrides(overrides: Sequence[str]) -> list[str]:
     """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
     return [override for override in overrides if key_of(override).split(".")[0] not in {"root", "output", "tracking"}]
@@ -174,6 +227,8 @@ def run_pipeline(
         NotThereYet: in a dry run.
         Stopped: a signal came.
     """
+    if pipeline.datasets:
+        return _run_survey(pipeline, configs, overrides, workshop, only_report=only_report)
     first = configs[0]
     workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn)
     workshop.tags = {"vehest.study": pipeline.study}
@@ -208,7 +263,7 @@ def run_pipeline(
         study=pipeline.study,
         title=pipeline.title,
         about=pipeline.about,
-        command=" ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides]),
+        command=_command(pipeline, overrides),
         module=pipeline.report,
         members=members,
         evaluation=evaluation,
@@ -216,12 +271,54 @@ def run_pipeline(
         training=[*_training_facts(configs), _resampling_fact(configs)],
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
-    published = None
-    if pipeline.publish and not workshop.dry_run and not overrides:
-        published = Path("results") / pipeline.study
-        if publish(report, published):
-            workshop.messages.line("done", "publish", str(published))
+    published = _publish(pipeline, report, overrides, workshop)
     return PipelineOutcome(report, leaderboard_of(job), published)
+
+
+def _run_survey(
+    pipeline: Pipeline, configs: Sequence[Config], overrides: Sequence[str], workshop: Workshop, *, only_report: bool
+) -> PipelineOutcome:
+    try:
+        here, ingested, absent = ingest_all(configs, pipeline.optional_datasets, workshop, only_report=only_report)
+    except NotThereYet:
+        workshop.messages.line("plan", "report", pipeline.study)
+        raise
+    job = SurveyJob(
+        study=pipeline.study,
+        title=pipeline.title,
+        about=pipeline.about,
+        command=_command(pipeline, overrides),
+        module=pipeline.report,
+        configs=here,
+        ingested=ingested,
+        absent=absent,
+    )
+    report = workshop.ensure(plan_survey(job, workshop.output), lambda folder: write_survey(job, folder))
+    published = None
+    lost = lost_by_publishing(absent, _results_of(pipeline)) if pipeline.publish else []
+    if lost:
+        workshop.messages.warn(f"not published: '{_results_of(pipeline)}' shows data set '{lost[0]}', and this run could not read it")
+    else:
+        published = _publish(pipeline, report, overrides, workshop)
+    return PipelineOutcome(report, pd.DataFrame(), published, overview_of(report))
+
+
+def _command(pipeline: Pipeline, overrides: Sequence[str]) -> str:
+    return " ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides])
+
+
+def _results_of(pipeline: Pipeline) -> Path:
+    return Path("results") / pipeline.study
+
+
+def _publish(pipeline: Pipeline, report: Artefact, overrides: Sequence[str], workshop: Workshop) -> Path | None:
+    """Publish a study as it is written: not what overrides changed."""
+    if not pipeline.publish or workshop.dry_run or overrides:
+        return None
+    published = _results_of(pipeline)
+    if publish(report, published):
+        workshop.messages.line("done", "publish", str(published))
+    return published
 
 
 def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
@@ -233,7 +330,7 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
         for key in ("split", "evaluation", "downsample"):
             if config[key] != configs[0][key]:
                 raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
-        split = split_from_config(config["split"])
+        split = workshop.split(config)
         if not any(split.tests.values()):
             raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
         protocol = protocol_from_config(config["evaluation"])

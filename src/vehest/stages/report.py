@@ -23,7 +23,7 @@ from vehest.stages.train import recording_file
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefacts
 
 STAGE = "report"
-PAGE = "report.html"
+PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
 
 
@@ -132,13 +132,13 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
 
 
 def publish(report: Artefact, folder: Path) -> bool:
-    """Copy a report without its page to ``folder``; returns whether anything there changed.
+    """Copy a report without its pages to ``folder``; returns whether anything there changed.
 
     Raises:
         MissingError: it cannot be written.
         ConfigurationError: the folder holds something else.
     """
-    wanted = {name: digest for name, digest in report.outputs.items() if name not in {PAGE, MANIFEST}}
+    wanted = {name: digest for name, digest in report.outputs.items() if name != MANIFEST and not name.endswith(PAGE_ENDING)}
     if folder.is_dir():
         present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
         if present == wanted:

@@ -1,14 +1,16 @@
-"""What a study is made from: metrics, estimates, references and training histories that earlier stages wrote."""
+"""What a study is made from: recordings, metrics, estimates, references and training histories that earlier stages wrote."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
 from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
 from vehest.data.splits import Split
 from vehest.data.store import read_estimate, read_recording
 from vehest.evaluation.metrics import Protocol, Scored, score
@@ -101,3 +103,70 @@ class StudyArtefacts:
             score(model.estimate(test_set, position), read_recording(self.references[span.dataset, span.recording]), span, self.protocol)
             for position, span in enumerate(spans)
         ]
+
+
+@dataclass(frozen=True)
+class StoredDataset:
+    """A data set in the store.
+
+    Args:
+        name: in conf/dataset.
+        title: for people.
+        kind: ``real`` or ``simulated``.
+        config: what its ingest was told, prose aside.
+        files: recording -> Parquet file at the native rate.
+    """
+
+    name: str
+    title: str
+    kind: str
+    config: Mapping[str, Any]
+    files: Mapping[str, Path]
+
+    def recordings(self, channels: Iterable[str] | None = None) -> Iterator[Recording]:
+        """All recordings, one at a time, with all or some of their channels.
+
+        Raises:
+            DataError: a file is damaged or lacks a channel.
+        """
+        wanted = None if channels is None else list(channels)
+        for file in self.files.values():
+            yield read_recording(file, wanted)
+
+
+@dataclass(frozen=True)
+class AbsentDataset:
+    """A data set that a study would show and whose raw files are not here.
+
+    Args:
+        name: in conf/dataset.
+        title: for people.
+        licence: whose recordings they are.
+        citation: what to cite.
+    """
+
+    name: str
+    title: str
+    licence: str
+    citation: str
+
+
+@dataclass(frozen=True)
+class SurveyArtefacts:
+    """Everything that a study of recordings alone may look at.
+
+    Args:
+        study: name of the study.
+        title: its title.
+        about: a paragraph on what is shown, from the pipeline file.
+        command: the command that makes this report.
+        datasets: in the order of the pipeline file.
+        absent: those that could not be read.
+    """
+
+    study: str
+    title: str
+    about: str
+    command: str
+    datasets: Sequence[StoredDataset]
+    absent: Sequence[AbsentDataset]

@@ -1,0 +1,158 @@
+"""Report of a study of recordings alone: data sets that were ingested, or simulated, to tables, figures and pages."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vehest.data.errors import MissingError
+from vehest.stages.artefacts import Artefact, StagePlan, find, provenance
+from vehest.stages.code_version import code_version
+from vehest.stages.config import Config
+from vehest.stages.ingest import plan_ingest
+from vehest.stages.report import PROVENANCE, STAGE
+from vehest.stages.workshop import NotThereYet, Workshop
+from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
+
+OVERVIEW = "tables/overview.csv"
+
+
+@dataclass(frozen=True)
+class SurveyJob:
+    """A report to draw.
+
+    Args:
+        study: name of the study.
+        title: its title.
+        about: a paragraph on it.
+        command: the command that makes it.
+        module: module of `vehest.studies`.
+        configs: configuration of each ingest.
+        ingested: what these made.
+        absent: data sets that the study goes on without.
+    """
+
+    study: str
+    title: str
+    about: str
+    command: str
+    module: str
+    configs: Sequence[Config]
+    ingested: Sequence[Artefact]
+    absent: Sequence[AbsentDataset]
+
+
+def ingest_all(
+    configs: Sequence[Config], optional: Sequence[str], workshop: Workshop, *, only_report: bool = False
+) -> tuple[list[Config], list[Artefact], list[AbsentDataset]]:
+    """Ingest data sets, those left out whose raw files are not here though the study can go on without them.
+
+    Args:
+        configs: of the ingests.
+        optional: names of data sets that the study can go on without.
+        workshop: where stages run.
+        only_report: take what is there, ingest nothing.
+
+    Returns:
+        Configurations and artefacts of those that are here, and those that are not.
+
+    Raises:
+        MissingError: raw files are not here, or ``only_report`` and recordings are not there.
+        NotThereYet: in a dry run, after all were looked at.
+        Stopped: a signal came; what was ingested stays.
+    """
+    here: list[Config] = []
+    ingested: list[Artefact] = []
+    absent: list[AbsentDataset] = []
+    waits = False
+    for config in configs:
+        dataset = config["dataset"]
+        try:
+            plan = plan_ingest(config)
+        except MissingError as error:
+            if dataset["name"] not in optional:
+                raise
+            workshop.messages.warn(f"{error}; the study goes on without it")
+            absent.append(AbsentDataset(dataset["name"], *(_prose(dataset, key) for key in ("title", "licence", "citation"))))
+            continue
+        if only_report and find(plan) is None:
+            raise MissingError(f"data set '{plan.label}' has not been ingested; run 'vehest run' first")
+        try:
+            ingested.append(workshop.ingest(config))
+            here.append(config)
+        except NotThereYet:
+            waits = True
+    if waits:
+        raise NotThereYet
+    return here, ingested, absent
+
+
+def plan_survey(job: SurveyJob, output: Path) -> StagePlan:
+    """What a report is made from."""
+    config = {key: getattr(job, key) for key in ("study", "title", "about", "command", "module")}
+    about = {own["dataset"]["name"]: [_prose(own["dataset"], "title"), _kind(own["dataset"])] for own in job.configs}
+    return StagePlan(
+        stage=STAGE,
+        label=job.study,
+        config={**config, "datasets": about, "absent": [asdict(dataset) for dataset in job.absent]},
+        inputs={artefact.label: artefact.digest for artefact in job.ingested},
+        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
+        output=output,
+    )
+
+
+def write_survey(job: SurveyJob, folder: Path) -> None:
+    """Draw the study into ``folder``: report.md, a page each part of it, the same as HTML, tables, figures, provenance."""
+    from vehest.report.document import write_documents
+
+    write_documents(importlib.import_module(f"vehest.studies.{job.module}").documents(_artefacts(job)), folder)
+    about = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
+    about |= {"study": job.study, "command": job.command}
+    about["kinds"] = {own["dataset"]["name"]: _kind(own["dataset"]) for own in job.configs}
+    about["absent"] = [dataset.name for dataset in job.absent]
+    about["recordings"] = {
+        f"{artefact.label}/{Path(name).stem}": digest for artefact in job.ingested for name, digest in artefact.outputs.items()
+    }
+    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def overview_of(report: Artefact) -> pd.DataFrame:
+    """The study's overview, as the report shows it."""
+    return pd.read_csv(report.folder / OVERVIEW, float_precision="round_trip")
+
+
+def lost_by_publishing(absent: Sequence[AbsentDataset], folder: Path) -> list[str]:
+    """Data sets that a published study shows and one that lacks ``absent`` would not."""
+    try:
+        shown = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["kinds"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [dataset.name for dataset in absent if dataset.name in shown]
+
+
+def _artefacts(job: SurveyJob) -> SurveyArtefacts:
+    datasets = [
+        StoredDataset(
+            name=config["dataset"]["name"],
+            title=_prose(config["dataset"], "title"),
+            kind=_kind(config["dataset"]),
+            config=artefact.config,
+            files={Path(name).stem: artefact.folder / name for name in artefact.outputs},
+        )
+        for config, artefact in zip(job.configs, job.ingested, strict=True)
+    ]
+    return SurveyArtefacts(job.study, job.title, job.about, job.command, datasets, job.absent)
+
+
+def _prose(dataset: Mapping[str, Any], key: str) -> str:
+    return " ".join(str(dataset.get(key, dataset["name"])).split())
+
+
+def _kind(dataset: Mapping[str, Any]) -> str:
+    return str(dataset.get("kind", "real"))
