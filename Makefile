@@ -10,7 +10,7 @@ TORCH ?= 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 JOBS ?= 2
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive bench-training bench-ingest
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground bench-training bench-ingest bench-simulation
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -56,11 +56,17 @@ docs: $(INSTALLED) ## write the reference pages that are made from the code
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
 
+proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
+	$(BIN)/vehest run pipelines/proving_ground.yaml
+
 bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
 	$(BIN)/python benchmarks/training.py
 
 bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 columns against a bare pyarrow.csv.read_csv
 	$(BIN)/python benchmarks/ingest.py
+
+bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data sets on all cores against one (10 minutes)
+	$(BIN)/python benchmarks/simulation.py
 
 clean: ## remove what can be made again (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

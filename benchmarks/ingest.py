@@ -75,9 +75,15 @@ def whole_stage(root: Path) -> Callable[[], Any]:
     """What ``vehest ingest`` does: hash the files, read, check, write Parquet, hash that."""
     from vehest.stages.artefacts import make
     from vehest.stages.ingest import plan_ingest, write_ingest
+    from vehest.stages.signals import StopSignals
 
     config = configuration(root)
-    return lambda: make(plan_ingest(config), lambda folder: write_ingest(config, folder))
+
+    def run() -> Any:
+        plan = plan_ingest(config)
+        return make(plan, lambda folder: write_ingest(config, plan, folder, 1, StopSignals(), lambda *_: None))
+
+    return run
 
 
 def configuration(root: Path) -> dict[str, Any]:
