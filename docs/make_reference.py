@@ -1,4 +1,4 @@
-"""Write the pages that are made from the code: docs/reference.md, docs/channels.md, and the leaderboard in README.md.
+"""Write the pages that are made from the code: docs/reference.md, docs/channels.md, docs/manoeuvres.md, and the leaderboard in README.md.
 
 Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
 """
@@ -6,6 +6,8 @@ Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
 from __future__ import annotations
 
 import csv
+import inspect
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
@@ -32,6 +34,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
     return {
         root / "docs" / "reference.md": reference_page(root),
         root / "docs" / "channels.md": channels_page(),
+        root / "docs" / "manoeuvres.md": manoeuvres_page(root),
         readme: with_leaderboard(readme.read_text(encoding="utf-8"), root / BOARD_SOURCE),
     }
 
@@ -61,15 +64,12 @@ def channels_page() -> str:
     from vehest.data import units
     from vehest.data.channels import CHANNELS
     from vehest.evaluation.metrics import UNITS
-    from vehest.simulation.sensors import SensorLevel, SensorLevels
 
     channels = [
         (f"`{c.name}`", c.unit, c.meaning, f"{c.low:g} … {c.high:g}" if abs(c.low) != 3.141592653589793 else "-π … π")
         for c in CHANNELS.values()
     ]
     conversions = [(f"`{unit}`", si, f"{factor:.10g}") for unit, (si, factor) in units._UNITS.items()]
-    levels = [(field.name, getattr(SensorLevels(), field.name)) for field in fields(SensorLevels)]
-    sensors = [(f"`{name}`", f"{level.noise:g}", f"{level.offset:g}") for name, level in levels if isinstance(level, SensorLevel)]
     parts = [
         "# Channels, units and metrics",
         MADE,
@@ -81,15 +81,152 @@ def channels_page() -> str:
         "## Units",
         "What `unit:` may say in conf/dataset; values are multiplied by the factor.",
         _table(("unit", "becomes", "factor"), conversions),
-        "## Simulated sensors",
-        "Standard deviations of the white noise of each sample and of the constant offset that a drive's sensor has, with "
-        "`sensors: default`, in the channel's unit. `wheel_speed` stands for all four wheels. With `sensors: ideal` all are zero.",
-        _table(("sensor", "noise", "offset"), sensors),
+        *_simulated_sensors(),
         "## Metrics",
         "Names and units in `metrics.csv`; definitions: [estimators.md](estimators.md#metrics).",
         _table(("metric", "unit"), [(f"`{name}`", unit) for name, unit in UNITS.items()]),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def manoeuvres_page(root: Path) -> str:
+    """Manoeuvres of the proving ground with their parameters, its courses, and its vehicles."""
+    from vehest.simulation import tracks
+    from vehest.simulation.course import course_by_name
+    from vehest.simulation.manoeuvres import MANOEUVRES
+
+    parts = [
+        "# Manoeuvres, courses and vehicles of the proving ground",
+        MADE,
+        "How a data set uses them: [sources/simulated.md](sources/simulated.md).",
+        "## Manoeuvres",
+        "A parameter with a pair as its default is a range: give a number, or a pair from which every drive draws, uniformly. `severity` "
+        "is the share of the grip that the driver means to use, on the surface at hand.",
+    ]
+    for name, made in sorted(MANOEUVRES.items()):
+        described = _sections(made)
+        parts.append(f"### `{name}`")
+        parts.append(described.pop(""))
+        rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
+        parts.append(_table(("parameter", "default", "meaning"), rows))
+    courses = [(name, course_by_name(name)) for name in tracks.LAYOUTS]
+    parts += [
+        "## Courses",
+        _table(
+            ("course", "length [m]", "smallest radius [m]", "bank up to [deg]"),
+            [
+                (f"`{name}`", f"{c.length:.0f}", f"{1.0 / abs(c.curvature).max():.0f}", f"{math.degrees(abs(c.bank).max()):.1f}")
+                for name, c in courses
+            ],
+            right=3,
+        ),
+        "Where their layouts come from: `vehest.simulation.tracks`.",
+        "## Vehicles",
+        "With the source of every value: [reference.md](reference.md#confvehicle).",
+        _table(
+            ("vehicle", "what it is"),
+            [(f"`{file.stem}`", _first_comment(file)) for file in sorted((root / "conf" / "vehicle").glob("*.yaml"))],
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _as_yaml(value: Any) -> str:
+    if isinstance(value, tuple):
+        return f"[{', '.join(_as_yaml(entry) for entry in value)}]"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return {None: "null", True: "true", False: "false"}.get(value, str(value)) if value is None or isinstance(value, bool) else str(value)
+
+
+def _sections(described: type) -> dict[str, str]:
+    """A docstring's first paragraph, under the empty name, and its arguments by name."""
+    text = inspect.getdoc(described) or ""
+    sections = {"": " ".join(text.split("\n\n")[0].split())}
+    if "Args:" in text:
+        for entry in re.split(r"\n    (?=\w)", text.split("Args:")[1].split("\n\n")[0]):
+            names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
+            if names:
+                sections |= dict.fromkeys(names.split(", "), meaning)
+    return sections
+
+
+def _simulated_sensors() -> Iterable[str]:
+    from vehest.simulation.sensor_levels import PRESETS, REFERENCES, SensorLevels
+
+    header = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
+    references = (REFERENCES["gnss"], REFERENCES["optical"])
+    levers = ("lever_x", "lever_y", "lever_z", "lever_error")
+    yield "## Simulated sensors"
+    yield (
+        "`shown = quantise((1 + scale) true(t - delay) + offset + drift(t) + noise(t))`, in the channel's unit. Noise is a density: at a "
+        "rate of f Hz it is the √(f/2)-fold as standard deviation of a sample, 7.07 times at 100 Hz. Offset and scale are drawn for each "
+        "drive, with these standard deviations; drift is a first-order Gauss-Markov process of this standard deviation and correlation "
+        "time. Each error of each sensor has a random stream of its own: what one level is changes no other sample."
+    )
+    yield (
+        "`imu` is where the gyros and accelerometers sit (`lever_x`, `lever_y`, `lever_z` from the centre of gravity [m]) and how they are "
+        "turned (`roll`, `pitch`, `yaw`, and a `misalignment` drawn for each of the three [rad]). `tilt` says which of `roll` and `pitch` "
+        "of the body, `bank` and `grade` of the road let gravity into the accelerometers. Roll and pitch themselves are not measured."
+    )
+    yield (
+        "A data set says `sensors: default`, `race` or `ideal` (no errors, the road's axes), or changes a preset. `off` takes a whole "
+        "sensor's errors away, `switched_off` names single ones; `*` stands for all sensors but the reference:"
+    )
+    yield (
+        "```yaml\nsensors:\n  preset: race\n  reference: optical\n  ay: {noise: 0, offset: 0.05}\n  steer: off\n  tilt: {bank: off}\n"
+        '  imu: {lever_x: 0.3}\n  switched_off: [vx.delay, "*.drift"]\n```'
+    )
+    yield "### `sensors: default`"
+    yield f"Production sensors. {_mounting(PRESETS['default'].imu)}"
+    yield _table(header, _sensor_rows(PRESETS["default"]))
+    yield "Where the numbers come from:"
+    yield "\n".join(f"- {line}" for line in _arguments(SensorLevels))
+    yield "### `sensors: race`"
+    yield f"A race car of the sixties with good instruments, as in the Ferrari recording. {_mounting(PRESETS['race'].imu)}"
+    yield _table(header, _sensor_rows(PRESETS["race"]))
+    yield (
+        "Read off the recording by `read_off` of `vehest.simulation.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` and `steer` "
+        "(median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of `yaw_rate`, `ax` and "
+        "`ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is left below 0.5 Hz, of "
+        "the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a banked road is part of it). "
+        "How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are those of `default`."
+    )
+    yield "### `reference: gnss` and `reference: optical`"
+    yield (
+        "Where `vx_ref`, `vy_ref`, `yaw_rate_ref` and `sideslip_ref` come from; `gnss` belongs to `default` and `race`. The sensor "
+        "measures velocity where it sits, in axes turned by the error `heading` [rad], and moves it to the centre of gravity with its own "
+        "yaw rate and a lever known to `lever_error`. The sources stand beside the numbers in `vehest.simulation.sensor_levels`."
+    )
+    yield _table(("reference", *header), [(f"`{r.kind}`", *row) for r in references for row in _sensor_rows(r)])
+    rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in references]
+    yield _table(("reference", *(f"`{lever}` [m]" for lever in levers)), rows)
+
+
+def _sensor_rows(levels: Any) -> Iterable[tuple[str, ...]]:
+    """A row for each sensor among the fields of a dataclass of levels."""
+    from vehest.simulation.sensor_levels import SensorLevel
+
+    for field in fields(levels):
+        level = getattr(levels, field.name)
+        if isinstance(level, SensorLevel):
+            drift = f"{level.drift:g} ({level.drift_time:g} s)" if level.drift else "0"
+            rest = (f"{level.quantisation:g}", f"{1e3 * level.delay:g}", f"{1e2 * level.scale:g}")
+            yield f"`{field.name}`", f"{level.noise:g}", f"{level.offset:g}", drift, *rest
+
+
+def _mounting(imu: Any) -> str:
+    place = ", ".join(f"`{field.name}` {getattr(imu, field.name):g}" for field in fields(imu) if getattr(imu, field.name))
+    return f"`imu`: {place}; the rest is zero." if place else "`imu`: all zero."
+
+
+def _arguments(described: type) -> Iterable[str]:
+    """What a dataclass's docstring says about its sensors, a line each."""
+    text = inspect.getdoc(described) or ""
+    for entry in re.split(r"\n    (?=\w)", text.split("Args:")[1].split("\nRaises:")[0]):
+        names, _, meaning = " ".join(entry.split()).partition(": ")
+        if names.split(", ")[0] in {field.name for field in fields(described)}:
+            yield f"{', '.join(f'`{name}`' for name in names.split(', '))}: {meaning}"
 
 
 def with_leaderboard(readme: str, source: Path) -> str:
