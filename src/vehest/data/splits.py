@@ -52,8 +52,11 @@ class Span:
 class Split:
     """Training, validation and named test stretches.
 
+    Without training and validation stretches it is for estimators that learn nothing.
+
     Raises:
-        ConfigurationError: no training or validation stretch, or a stretch that serves two purposes.
+        ConfigurationError: training without validation stretches or the other way round, no stretch at all, or a stretch that
+            serves two purposes.
     """
 
     name: str
@@ -62,9 +65,11 @@ class Split:
     tests: Mapping[str, tuple[Span, ...]]
 
     def __post_init__(self) -> None:
-        if not self.train:
+        if not (self.train or self.validation or self.tests):
+            raise ConfigurationError(f"split '{self.name}' has no ranges at all")
+        if self.validation and not self.train:
             raise ConfigurationError(f"split '{self.name}' has nothing to train on")
-        if not self.validation:
+        if self.train and not self.validation:
             raise ConfigurationError(f"split '{self.name}' has nothing to validate on")
         check_name(self.name, "split")
         for name, spans in self.tests.items():
