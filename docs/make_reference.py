@@ -332,7 +332,7 @@ def _options(file: Path, prefix: str = "") -> Iterable[tuple[str, str, str]]:
     lines = file.read_text(encoding="utf-8").splitlines()
     if any("@package _global_" in line for line in lines):
         prefix = ""
-    above: list[str] = []
+    above: list[tuple[int, str]] = []  # indentation and name of the groups that a line stands in
     skipping = False
     for line in lines:
         found = re.match(r"^(\s*)(\w+):\s*(.*?)\s*(?:(?<=\s)#\s*(.*))?$", line)
@@ -340,14 +340,15 @@ def _options(file: Path, prefix: str = "") -> Iterable[tuple[str, str, str]]:
             continue
         indent, key, value, comment = found.groups()
         if not indent:
-            above, skipping = [], key == "defaults"
+            skipping = key == "defaults"
         if skipping:
             continue
+        above = [(depth, group) for depth, group in above if depth < len(indent)]
         if value:
-            dotted = ".".join(filter(None, [prefix, *above, key]))
+            dotted = ".".join(filter(None, [prefix, *(group for _, group in above), key]))
             yield f"`{dotted}`", f"`{value}`", comment or ""
         else:
-            above.append(key)
+            above.append((len(indent), key))
 
 
 def _default_groups(file: Path) -> list[str]:

@@ -51,7 +51,7 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: gru, ksnn"),
+        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: factor_graph, gru, kalman, ksnn"),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
         (["colour=red"], "unknown option 'colour'"),
@@ -123,6 +123,7 @@ def test_completion_offers_groups_options_and_values(elsewhere):
     assert "Gated recurrent unit" in offered["estimator=gru"]
     assert [text for text, _ in complete_override("train", ["estimator=gru"], "estimator.n")] == ["estimator.n_states=5"]
     assert [text for text, _ in complete_override("train", ["estimator=luenberger"], "estimator.")] == ["estimator.rate_hz=100"]
+    assert [text for text, _ in complete_override("train", ["estimator=kalman"], "estimator.car.m")] == ["estimator.car.mass=982"]
 
 
 def _bash_completion(words: list[str], position: int, cwd: Path) -> list[str]:
@@ -134,7 +135,7 @@ def _bash_completion(words: list[str], position: int, cwd: Path) -> list[str]:
 
 def test_bash_completes_after_the_equals_sign_where_it_breaks_words(elsewhere):
     assert "estimator=ksnn" in _bash_completion(["vehest", "train", "est"], 2, elsewhere)
-    assert _bash_completion(["vehest", "train", "estimator", "=", "k"], 4, elsewhere) == ["ksnn"]
+    assert _bash_completion(["vehest", "train", "estimator", "=", "ks"], 4, elsewhere) == ["ksnn"]
     assert set(_bash_completion(["vehest", "train", "estimator", "="], 3, elsewhere)) >= {"gru", "ksnn", "lstm", "luenberger"}
     assert "train" in _bash_completion(["vehest", "tr"], 1, elsewhere)
     assert "sim_quickstart" in _bash_completion(["vehest", "ingest", "sim"], 2, elsewhere)

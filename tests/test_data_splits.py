@@ -114,6 +114,14 @@ def test_plain_values_make_a_split() -> None:
     assert split.datasets == ("d", "e")
 
 
+def test_a_split_may_have_tests_only_but_not_nothing() -> None:
+    config = {"name": "s", "dataset": "d", "train": [], "validation": [], "tests": {"t": [{"recording": "x"}]}}
+    split = split_from_config(config)
+    assert (split.train, split.validation, split.datasets) == ((), (), ("d",))
+    with pytest.raises(ConfigurationError, match="split 's' has no ranges at all"):
+        split_from_config(config | {"tests": {}})
+
+
 @pytest.mark.parametrize(
     ("changes", "what"),
     [

@@ -7,18 +7,25 @@ import pytest
 import yaml
 
 from conftest import planar_drive
+from single_track_drive import linear_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
-from vehest.training.settings import DirectSearchSettings, SupervisedSettings
+from vehest.training.settings import DirectSearchSettings, NoTraining, SupervisedSettings
+
+CAUSAL = {"factor_graph": {"window": 0.05}}  # of those that are offline by default, settings with which they are not
 
 
 def _fitted(name, dtype="float64", **config):
-    estimator = estimator_class(name).from_config(config)
+    if name == "factor_graph":
+        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
+    estimator = estimator_class(name).from_config(CAUSAL.get(name, {}) | config)
     estimator.seed(0)
-    if name == "luenberger":
+    if estimator.training_type is NoTraining:
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), NoTraining())
+    elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
     else:
@@ -28,6 +35,8 @@ def _fitted(name, dtype="float64", **config):
 
 
 def _drive_for(estimator):
+    if "steer" in estimator.channels:
+        return linear_drive(12.0, estimator.settings.rate_hz, seed=4)[0].without_references()
     return planar_drive(12.0, estimator.settings.rate_hz, seed=4, noise=0.02).without_references()
 
 
@@ -158,9 +167,9 @@ def test_window_network_has_no_state_to_start_from(drive):
 
 
 def test_registry_knows_names_and_modules():
-    assert set(estimator_names()) >= {"luenberger", "ksnn", "gru", "lstm"}
+    assert set(estimator_names()) >= {"luenberger", "ksnn", "gru", "lstm", "kalman", "factor_graph"}
     assert estimator_module("ksnn") == "vehest.estimators.ksnn"
-    with pytest.raises(ConfigurationError, match="is not one of: gru, ksnn, lstm, luenberger"):
+    with pytest.raises(ConfigurationError, match="is not one of: factor_graph, gru, kalman, ksnn, lstm, luenberger"):
         estimator_class("kalman_filter_from_the_future")
     with pytest.raises(ConfigurationError, match="'windowed' is not one of"):
         estimator_class("windowed")

@@ -85,6 +85,8 @@ def _counted(number: int, what: str, plural: str) -> str:
 class Split:
     """Training, validation and named test stretches.
 
+    Without training and validation stretches it is for estimators that learn nothing.
+
     Args:
         name: of the split.
         train: stretches to learn from.
@@ -93,7 +95,8 @@ class Split:
         kept: ``train``, ``validation`` or name of a test set -> what was kept, where a condition decided it.
 
     Raises:
-        ConfigurationError: no training or validation stretch, or a stretch that serves two purposes.
+        ConfigurationError: training without validation stretches or the other way round, no stretch at all, or a stretch that
+            serves two purposes.
     """
 
     name: str
@@ -103,9 +106,11 @@ class Split:
     kept: Mapping[str, Kept] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        if not self.train:
+        if not (self.train or self.validation or self.tests):
+            raise ConfigurationError(f"split '{self.name}' has no ranges at all")
+        if self.validation and not self.train:
             raise ConfigurationError(f"split '{self.name}' has nothing to train on")
-        if not self.validation:
+        if self.train and not self.validation:
             raise ConfigurationError(f"split '{self.name}' has nothing to validate on")
         check_name(self.name, "split")
         for name, spans in self.tests.items():

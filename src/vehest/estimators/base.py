@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
@@ -81,7 +81,7 @@ class Estimator(ABC):
         channels: measured channels it reads.
         settings_type: dataclass of its settings.
         training_type: dataclass of the settings of its fit.
-        causal: whether an estimate uses measurements up to its own time only.
+        skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
 
@@ -90,7 +90,7 @@ class Estimator(ABC):
     channels: ClassVar[tuple[str, ...]]
     settings_type: ClassVar[type[EstimatorSettings]]
     training_type: ClassVar[type]
-    causal: ClassVar[bool] = True
+    skippable: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, settings: EstimatorSettings) -> None:
         self.settings = settings
@@ -106,6 +106,16 @@ class Estimator(ABC):
         return cls(settings_from_config(cls.settings_type, config, "estimator"))
 
     @property
+    def causal(self) -> bool:
+        """Whether an estimate uses measurements up to its own time only; if so, it also runs online."""
+        return True
+
+    @property
+    def learns(self) -> bool:
+        """Whether the fit takes anything from recordings; if not, it needs none."""
+        return True
+
+    @property
     def variant(self) -> str:
         """What the paper calls this configuration."""
         return self.name
@@ -118,7 +128,7 @@ class Estimator(ABC):
     @property
     def batch_key(self) -> tuple[Any, ...]:
         """Estimators with equal keys may be fitted together as members."""
-        return (self.name, *asdict(self.settings).items())
+        return (self.name, self.settings)
 
     @property
     @abstractmethod
@@ -169,15 +179,15 @@ class Estimator(ABC):
         for name in self.channels:
             if name not in recording:
                 raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' needs")
-            if name in recording.gappy and np.isnan(recording[name]).any():
+            if name in recording.gappy and name not in self.skippable and np.isnan(recording[name]).any():
                 raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip")
         return recording.select(self.channels)
 
-    def _wrapped(self, recording: Recording, vy: FloatArray, **others: FloatArray) -> Estimate:
+    def _wrapped(self, recording: Recording, vy: FloatArray, covariance: FloatArray | None = None, **others: FloatArray) -> Estimate:
         """An `Estimate` on the recording's clock; sideslip is atan2(vy, vx) with the measured vx."""
         channels = {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"]), **others}
         mode = "causal" if self.causal else "offline"
-        return Estimate(recording.id, self.name, recording.rate_hz, recording.start_time, channels, mode)  # type: ignore[arg-type]
+        return Estimate(recording.id, self.name, recording.rate_hz, recording.start_time, channels, mode, covariance)  # type: ignore[arg-type]
 
     @abstractmethod
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:

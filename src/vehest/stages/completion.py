@@ -65,7 +65,7 @@ def _content(command: str, given: list[str]) -> dict[str, dict[str, Any]]:
     for group, choice in groups.items():
         content = _yaml(f"{group}/{choice}.yaml") if choice else {}
         content = content.get(group, content) if isinstance(content.get(group), dict) else content
-        options |= {f"{group}.{key}": value for key, value in content.items() if _is_plain(value) and key not in ("name", "defaults")}
+        options |= _dotted(group, {key: value for key, value in content.items() if key not in ("name", "defaults")})
     return {"groups": groups, "options": options}
 
 
@@ -84,6 +84,17 @@ def _collect_root(command: str, groups: dict[str, Any], options: dict[str, Any])
             options |= {f"{key}.{inner}": default for inner, default in value.items() if _is_plain(default)}
         elif _is_plain(value):
             options[str(key)] = value
+
+
+def _dotted(prefix: str, content: dict[str, Any]) -> dict[str, Any]:
+    """Plain values of nested groups by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in content.items():
+        if isinstance(value, dict):
+            found |= _dotted(f"{prefix}.{key}", value)
+        elif _is_plain(value):
+            found[f"{prefix}.{key}"] = value
+    return found
 
 
 def _is_plain(value: Any) -> bool:

@@ -137,7 +137,8 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         figures = accuracy(parts)
         if name != VALIDATION:
             figures |= {key: fit[key] for key in ("n_parameters", "epochs", "train_seconds")}
-            figures["step_seconds"] = _step_seconds(estimator, _measured(job, spans[0]))
+            if estimator.causal:
+                figures["step_seconds"] = _step_seconds(estimator, _measured(job, spans[0]))
         trained_on = "+".join(about["datasets"])
         datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
         kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
@@ -166,8 +167,8 @@ def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Art
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:
-    """Everything that is scored; the validation range too, since seeds are chosen on it."""
-    return {VALIDATION: split.validation, **split.tests}
+    """Everything that is scored; the validation range too, where there is one, since seeds are chosen on it."""
+    return {**({VALIDATION: split.validation} if split.validation else {}), **split.tests}
 
 
 def scored_spans(split: Split) -> list[Span]:

@@ -370,7 +370,7 @@ def _training_facts(configs: Sequence[Config]) -> list[str]:
         training = config["training"]
         options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
         names = sorted({c["estimator"]["name"] for c in configs if c["training"] == training})
-        fact = f"{', '.join(names)}: {training['name']} ({options})"
+        fact = f"{', '.join(names)}: {training['name']} ({options})" if options else f"{', '.join(names)}: nothing is trained"
         if fact not in facts:
             facts.append(fact)
     return facts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,11 +66,11 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
 
     Args:
         config: as composed for ``train``.
-        split: ranges to learn from.
+        split: ranges to learn from; not recorded for an estimator that learns nothing.
         data: data set -> recordings at the estimator's rate.
 
     Raises:
-        ConfigurationError: a setting that makes no sense, or a training that does not suit the estimator.
+        ConfigurationError: a setting that makes no sense, a training that does not suit the estimator, or nothing to learn from.
         DataError: the split names a recording that the data set does not have.
     """
     estimator = new_estimator(config["estimator"])
@@ -78,6 +78,12 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
     seed = config["seed"]
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {seed!r}")
+    if not estimator.learns:
+        split = replace(split, train=(), validation=())
+    elif not split.train:
+        raise ConfigurationError(
+            f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' learns; take another split"
+        )
     spans = [*split.train, *split.validation]
     inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in spans}
     plan = StagePlan(
@@ -89,6 +95,7 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
             "train": [_plain(span) for span in split.train],
             "validation": [_plain(span) for span in split.validation],
             "seed": seed,
+            **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
         },
         inputs=inputs,
         code=code_version([estimator_module(estimator.name), "vehest.estimators.model_files", "vehest.data.store"], own=[__name__]),
@@ -125,7 +132,7 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         "validated_on": [span.describe() for span in job.split.validation],
         "datasets": list(dict.fromkeys(span.dataset for span in job.split.train)),
         "n_parameters": estimator.n_parameters,
-        "downsample": _preparation(job),
+        "downsample": _preparation(job.data),
         "interrupted": record.interrupted,
     }
     save_model(estimator, folder, about)
@@ -135,9 +142,9 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
     _write_csv(folder / FIT_METRICS, ["metric", "value"], metrics.items())
 
 
-def _preparation(job: TrainJob) -> dict[str, Any]:
+def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
     """How the recordings were brought to the estimator's rate, as ``downsample`` of the configuration says it."""
-    config = job.data[job.split.train[0].dataset].config
+    config = next(iter(data.values())).config  # the same for all data sets of a job
     return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
 
 

@@ -200,7 +200,9 @@ class Workshop:
                 self.messages.line("stop", "train", member.model.label, detail)
             else:
                 epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
-                self.messages.line("done", "train", member.model.label, f"{epochs}validation MSE {fit['best_validation_loss']:.4g} m²/s²")
+                loss = fit.get("best_validation_loss")
+                outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation MSE {loss:.4g} m²/s²"
+                self.messages.line("done", "train", member.model.label, f"{epochs}{outcome}")
             self.log_fit(member.model, fit)
         if member.evaluation is not None and not member.evaluation.skipped:
             figures = test_figures(member.evaluation)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Literal, TypeVar
 
 from vehest.data.errors import ConfigurationError
@@ -63,26 +63,37 @@ class DirectSearchSettings:
             raise ConfigurationError(f"training.tolerance must be positive, not {self.tolerance}")
 
 
+@dataclass(frozen=True)
+class NoTraining:
+    """Nothing to set: what the estimator needs is given, or read off the data as it is."""
+
+
 Settings = TypeVar("Settings")
 
 
 def settings_from_config(kind: type[Settings], config: Mapping[str, Any], group: str) -> Settings:
-    """Build a settings dataclass from plain values.
+    """Build a settings dataclass from plain values; a mapping becomes the dataclass that the field's default is of.
 
     Raises:
         ConfigurationError: an unknown key, or a value of the wrong type.
     """
     types = {field.name: str(field.type) for field in fields(kind)}  # type: ignore[arg-type]
+    nested = {field.name: type(field.default) for field in fields(kind) if is_dataclass(field.default)}  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for key, value in config.items():
         if key == "name":
             continue
         if key not in types:
-            raise ConfigurationError(f"{group}.{key} is not an option of {group}; options: {', '.join(types)}")
-        values[key] = _converted(f"{group}.{key}", value, types[key])
+            raise ConfigurationError(f"{group}.{key} is not an option of {group}; options: {', '.join(types) or 'none'}")
+        if key in nested:
+            if not isinstance(value, Mapping):
+                raise ConfigurationError(f"{group}.{key} must be a group of options, not {value!r}")
+            values[key] = settings_from_config(nested[key], value, f"{group}.{key}")
+        else:
+            values[key] = _converted(f"{group}.{key}", value, types[key])
     try:
         return kind(**values)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         raise ConfigurationError(f"{group}: {error}") from None
 
 
@@ -95,7 +106,9 @@ def _converted(name: str, value: Any, type_name: str) -> Any:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value != int(value):
             raise ConfigurationError(f"{name} must be a whole number, not {value!r}")
         return int(value)
-    if type_name == "float":
+    if value is None and "None" in type_name.split(" | "):
+        return None
+    if "float" in type_name.split(" | "):
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ConfigurationError(f"{name} must be a number, not {value!r}")
         return float(value)

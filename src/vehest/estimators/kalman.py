@@ -1,0 +1,223 @@
+"""Kalman filter over the linear single track: the KF of Leanza et al. 2021, as in Table VI of Da Lio et al. 2023."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import FloatArray, Recording
+from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
+from vehest.estimators.single_track import SingleTrackEstimator, SingleTrackSettings, checked_sample, require_positive
+from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.kalman import LinearModel
+from vehest.filters.kalman_scan import kalman_scan
+from vehest.filters.noise_levels import high_passed_level
+from vehest.training.context import FitContext
+
+LEVELS = ("yaw_rate", "ay", "steer")
+SILENT = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations of the sensors' noise, given, or else read off measured signals above a frequency.
+
+    Args:
+        read_from: ``training`` (the recordings of the fit) or ``recording`` (each recording that is estimated, as a whole).
+        yaw_rate: [rad/s]; read if none is given.
+        ay: [m/s²]; read if none is given.
+        steer: [rad]; read if none is given.
+        cutoff: frequency above which signals count as noise, as a fraction of the Nyquist frequency.
+        steer_factor: by which the steering's level is multiplied.
+    """
+
+    read_from: Literal["training", "recording"] = "training"
+    yaw_rate: float | None = None
+    ay: float | None = None
+    steer: float | None = None
+    cutoff: float = 0.2
+    steer_factor: float = 1000.0
+
+    def __post_init__(self) -> None:
+        if self.read_from not in ("training", "recording"):
+            raise ConfigurationError(f"estimator.noise.read_from '{self.read_from}' is not one of: training, recording")
+        require_positive("estimator.noise", {name: getattr(self, name) for name in (*LEVELS, "steer_factor")})
+        if not 0.0 < self.cutoff < 0.8:
+            raise ConfigurationError(f"estimator.noise.cutoff must lie between 0 and 0.8 of the Nyquist frequency, not at {self.cutoff}")
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Levels that are not given."""
+        return tuple(name for name in LEVELS if getattr(self, name) is None)
+
+
+@dataclass(frozen=True)
+class KalmanSettings(SingleTrackSettings):
+    """Settings of the Kalman filter.
+
+    Args:
+        noise: levels of the sensors' noise.
+        initial_deviation: standard deviation of β and r before the first sample [rad, rad/s].
+    """
+
+    noise: SensorNoise = SensorNoise()
+    initial_deviation: float = 100.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_positive("estimator", {"initial_deviation": self.initial_deviation})
+
+
+class KalmanFilter(SingleTrackEstimator):
+    """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is a noisy input.
+
+    Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels are standard deviations of the
+    high-passed signals; no reference is looked at.
+
+    Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public code.
+    """
+
+    name = "kalman"
+    title = "Kalman filter"
+    settings_type = KalmanSettings
+    settings: KalmanSettings
+
+    def __init__(self, settings: KalmanSettings) -> None:
+        super().__init__(settings)
+        self.levels = {name: _number(getattr(settings.noise, name)) for name in LEVELS}
+
+    @property
+    def causal(self) -> bool:
+        """Not if noise levels are read off the whole recording, later samples included."""
+        return self.settings.noise.read_from == "training" or not self.settings.noise.unknown
+
+    @property
+    def learns(self) -> bool:
+        """Whether noise levels are read off the training recordings."""
+        return self.settings.noise.read_from == "training" and bool(self.settings.noise.unknown)
+
+    @property
+    def variant(self) -> str:
+        """Where the noise levels come from, unless it is the training."""
+        if self.learns:
+            return self.name
+        return "kalman_given_noise" if self.causal else "kalman_own_noise"
+
+    @property
+    def full_title(self) -> str:
+        """Title with where the noise levels come from."""
+        if self.learns:
+            return self.title
+        return f"{self.title}, noise {'given' if self.causal else 'read off the recording itself'}"
+
+    @property
+    def n_parameters(self) -> int:
+        """Noise levels that the fit reads."""
+        return len(self.settings.noise.unknown) if self.learns else 0
+
+    @classmethod
+    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+        """Read noise levels off the measured channels of the training recordings."""
+        started = time.monotonic()
+        for member in members:
+            assert isinstance(member, KalmanFilter)
+            if member.learns:
+                member.levels = member._levels_of(data.train)
+        return [FitRecord(metrics={"epochs": 0, "train_seconds": (time.monotonic() - started) / len(members)}) for _ in members]
+
+    def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
+        levels = dict(self.levels)
+        for name in self.settings.noise.unknown:
+            among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+            try:
+                levels[name] = high_passed_level([recording[name] for recording in recordings], self.settings.noise.cutoff)
+            except ValueError as error:
+                raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
+            if not levels[name] > SILENT:
+                raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
+        return levels
+
+    def _known_levels(self) -> dict[str, float]:
+        if any(math.isnan(level) for level in self.levels.values()):
+            raise ConfigurationError("the Kalman filter has no noise levels yet; fit or load it first, or give estimator.noise")
+        return self.levels
+
+    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+        levels = self._known_levels() if self.causal else self._levels_of([recording])
+        measurements = recording.stack(self.channels)
+        first = self.first_state(measurements[0, 1], self.settings.initial_deviation, initial_state)
+        filtered = self.filter_samples(measurements, levels, first).filtered
+        return self.wrapped_state(recording, filtered.mean, filtered.covariance)
+
+    def filter_samples(self, samples: FloatArray, levels: Mapping[str, float], first: Gaussian[FloatArray]) -> Filtered[FloatArray]:
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement."""
+        yaw_rate, vx, ay, steer = samples.T
+        A, B, C, D = self.sampled_model(vx)
+        observation = np.zeros((len(samples), 2, 2))
+        observation[:, 0], observation[:, 1, 1] = C, 1.0
+        spread = levels["steer"] * self.settings.noise.steer_factor * B
+        model = LinearModel(
+            transition=A,
+            transition_offset=B * steer[:, None],
+            process_noise=spread[:, :, None] * spread[:, None, :],
+            observation=observation,
+            observation_offset=np.stack([D * steer, np.zeros_like(steer)], axis=1),
+            observation_noise=np.diag([levels["ay"] ** 2, levels["yaw_rate"] ** 2]),
+        )
+        return kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first)
+
+    def online(self) -> KalmanStepper:
+        """A stepper that knows nothing of the state yet."""
+        if not self.causal:
+            raise ConfigurationError(
+                "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
+                "set estimator.noise.read_from=training, or give the levels"
+            )
+        self._known_levels()
+        return KalmanStepper(self)
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Noise levels; NaN where they are read off each recording."""
+        return {name: np.array([level]) for name, level in self.levels.items()}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take noise levels back."""
+        if set(weights) != set(LEVELS) or any(values.shape != (1,) for values in weights.values()):
+            raise DataError(f"weights of 'kalman' must be one level each of {', '.join(LEVELS)}, not {', '.join(weights)}")
+        self.levels = {name: float(weights[name][0]) for name in LEVELS}
+
+
+class KalmanStepper(Stepper):
+    """The filter, one sample at a time."""
+
+    def __init__(self, estimator: KalmanFilter) -> None:
+        self._estimator = estimator
+        self._last: FloatArray | None = None
+        self._state: Gaussian[FloatArray] | None = None
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample; NaN in yaw_rate or ay is skipped."""
+        estimator = self._estimator
+        row = checked_sample(sample, estimator.channels, estimator.skippable)
+        if self._last is None or self._state is None:
+            rows, state = row[None], estimator.first_state(row[1], estimator.settings.initial_deviation, None)
+        else:  # the last sample's measurements are part of the state already
+            rows, state = np.stack([self._last, row]), self._state
+            rows[0, [0, 2]] = np.nan
+        filtered = estimator.filter_samples(rows, estimator.levels, state).filtered
+        self._last, self._state = row, Gaussian(filtered.mean[-1], filtered.covariance[-1])
+        return {"vy": float(row[1] * math.tan(self._state.mean[0])), "yaw_rate": float(self._state.mean[1])}
+
+
+def _number(level: float | None) -> float:
+    return math.nan if level is None else level
+
+
+ESTIMATOR = KalmanFilter

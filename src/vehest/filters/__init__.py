@@ -1,0 +1,1 @@
+"""Generic filters: batched, differentiable, and compiled where speed is the point; they know no car."""

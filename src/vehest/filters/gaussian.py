@@ -1,0 +1,46 @@
+"""What all filters hand around: Gaussian states, and what filtering a sequence leaves behind."""
+
+from __future__ import annotations
+
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+FloatArray = NDArray[np.float64]
+Array = TypeVar("Array", Tensor, NDArray[np.float64])
+"""A tensor where gradients are wanted, a NumPy array in compiled filters."""
+
+
+class Gaussian(NamedTuple, Generic[Array]):
+    """A normal distribution of a state, or one a sample.
+
+    Attributes:
+        mean: (..., n).
+        covariance: (..., n, n), symmetric.
+    """
+
+    mean: Array
+    covariance: Array
+
+
+class Filtered(NamedTuple, Generic[Array]):
+    """What a filter knows after a sequence of T samples.
+
+    Attributes:
+        predicted: state at each sample before its measurement; mean (..., T, n). The first is the initial state.
+        filtered: state at each sample after its measurement.
+        innovation: measurement minus what was expected of it, (..., T, m); 0 where nothing was measured.
+        innovation_covariance: (..., T, m, m); rows and columns of what was not measured are those of the identity, so that
+            eᵀS⁻¹e counts what was measured only.
+        measured: whether there was a measurement, bool, (..., T, m).
+        log_likelihood: of each sample's measurements given those before, (..., T); 0 where nothing was measured.
+    """
+
+    predicted: Gaussian[Array]
+    filtered: Gaussian[Array]
+    innovation: Array
+    innovation_covariance: Array
+    measured: Tensor | NDArray[np.bool_]
+    log_likelihood: Array

@@ -1,0 +1,191 @@
+"""The Kalman filter of `vehest.filters.kalman` for one long sequence, compiled: the same numbers, no gradients."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from vehest.filters.gaussian import Filtered, FloatArray, Gaussian
+from vehest.filters.kalman import LinearModel, shapes_of
+
+
+def kalman_scan(model: LinearModel[FloatArray], measurements: FloatArray, initial: Gaussian[FloatArray]) -> Filtered[FloatArray]:
+    """Filter one sequence in float64; what is NaN was not measured and is skipped.
+
+    Args:
+        model: as for `kalman_filter`, without a batch; what is constant over time needs no dimension for it.
+        measurements: y, (T, m).
+        initial: state at the first sample before its measurement, mean (n,).
+
+    Raises:
+        ValueError: shapes do not fit each other.
+        numpy.linalg.LinAlgError: an innovation covariance is not positive definite.
+    """
+    if measurements.ndim != 2 or len(measurements) == 0:
+        raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
+    steps, m = measurements.shape
+    n = model.transition.shape[-1]
+    parts = [
+        _contiguous(part, (steps, *shape), name) for name, part, shape in zip(LinearModel._fields, model, shapes_of(n, m), strict=True)
+    ]
+    predicted = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
+    filtered = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
+    innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
+    failed = _scan(
+        *parts,
+        _contiguous(measurements, (steps, m), "measurements"),
+        _contiguous(initial.mean, (n,), "initial.mean"),
+        _contiguous(initial.covariance, (n, n), "initial.covariance"),
+        *predicted,
+        *filtered,
+        innovation,
+        covariance,
+        likelihood,
+    )
+    if failed >= 0:
+        raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
+    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(measurements), likelihood)
+
+
+def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+    try:
+        return np.ascontiguousarray(np.broadcast_to(np.asarray(values, dtype=np.float64), shape))
+    except ValueError:
+        raise ValueError(f"{name} of shape {np.shape(values)} does not fit {shape}") from None
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _scan(A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post_cov, innovation, innovation_cov, likelihood):  # type: ignore[no-untyped-def]
+    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1."""
+    steps, m = y.shape
+    n = len(mean)
+    seen_C, seen_R = np.empty((m, n)), np.empty((m, m))
+    cross, gain, whitened = np.empty((m, n)), np.empty((n, m)), np.empty(m)
+    kept, left, right = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    factor, weighted = np.empty((m, m)), np.empty((n, m))
+    for k in range(steps):
+        if k == 0:
+            prior_mean[0], prior_cov[0] = mean, cov
+        else:
+            _multiply(A[k - 1], post_cov[k - 1], left)
+            _multiply_transposed(left, A[k - 1], right)
+            for i in range(n):
+                total = b[k - 1, i]
+                for j in range(n):
+                    total += A[k - 1, i, j] * post_mean[k - 1, j]
+                    prior_cov[k, i, j] = right[i, j] + Q[k - 1, i, j]
+                prior_mean[k, i] = total
+            _make_symmetric(prior_cov[k])
+        count = 0
+        for i in range(m):
+            known = not math.isnan(y[k, i])
+            count += known
+            error = y[k, i] - d[k, i] if known else 0.0
+            for j in range(n):
+                seen_C[i, j] = C[k, i, j] if known else 0.0
+                error -= seen_C[i, j] * prior_mean[k, j]
+            innovation[k, i] = error
+            for j in range(m):
+                both = known and not math.isnan(y[k, j])
+                seen_R[i, j] = R[k, i, j] if both else (1.0 if i == j else 0.0)
+        S = innovation_cov[k]
+        _multiply(seen_C, prior_cov[k], cross)
+        _multiply_transposed(cross, seen_C, S)
+        for i in range(m):
+            for j in range(m):
+                S[i, j] += seen_R[i, j]
+        _make_symmetric(S)
+        if not _cholesky(S, factor):
+            return k
+        for j in range(n):  # gain = (S⁻¹ C P)ᵀ
+            for i in range(m):
+                whitened[i] = cross[i, j]
+            _solve(factor, whitened)
+            for i in range(m - 1, -1, -1):
+                total = whitened[i]
+                for c in range(i + 1, m):
+                    total -= factor[c, i] * gain[j, c]
+                gain[j, i] = total / factor[i, i]
+        for i in range(n):
+            total = prior_mean[k, i]
+            for c in range(m):
+                total += gain[i, c] * innovation[k, c]
+            post_mean[k, i] = total
+            for j in range(n):
+                part = 1.0 if i == j else 0.0
+                for c in range(m):
+                    part -= gain[i, c] * seen_C[c, j]
+                kept[i, j] = part
+        _multiply(kept, prior_cov[k], left)
+        _multiply_transposed(left, kept, post_cov[k])
+        _multiply(gain, seen_R, weighted)
+        _multiply_transposed(weighted, gain, right)
+        for i in range(n):
+            for j in range(n):
+                post_cov[k, i, j] += right[i, j]
+        _make_symmetric(post_cov[k])
+        for i in range(m):
+            whitened[i] = innovation[k, i]
+        _solve(factor, whitened)
+        total = count * math.log(2.0 * math.pi)
+        for i in range(m):
+            total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
+        likelihood[k] = -0.5 * total
+    return -1
+
+
+@numba.njit(inline="always")
+def _multiply(a, b, out):  # type: ignore[no-untyped-def]
+    for i in range(a.shape[0]):
+        for j in range(b.shape[1]):
+            total = 0.0
+            for c in range(a.shape[1]):
+                total += a[i, c] * b[c, j]
+            out[i, j] = total
+
+
+@numba.njit(inline="always")
+def _multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
+    """A Bᵀ."""
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            total = 0.0
+            for c in range(a.shape[1]):
+                total += a[i, c] * b[j, c]
+            out[i, j] = total
+
+
+@numba.njit(inline="always")
+def _make_symmetric(a):  # type: ignore[no-untyped-def]
+    for i in range(a.shape[0]):
+        for j in range(i):
+            a[i, j] = a[j, i] = 0.5 * (a[i, j] + a[j, i])
+
+
+@numba.njit(inline="always")
+def _cholesky(a, lower):  # type: ignore[no-untyped-def]
+    """Lower factor of a symmetric matrix; False if it is not positive definite."""
+    for i in range(a.shape[0]):
+        for j in range(i + 1):
+            total = a[i, j]
+            for c in range(j):
+                total -= lower[i, c] * lower[j, c]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                lower[i, i] = math.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    return True
+
+
+@numba.njit(inline="always")
+def _solve(lower, vector):  # type: ignore[no-untyped-def]
+    """L⁻¹ times a vector, in place."""
+    for i in range(lower.shape[0]):
+        total = vector[i]
+        for c in range(i):
+            total -= lower[i, c] * vector[c]
+        vector[i] = total / lower[i, i]

@@ -1,0 +1,1 @@
+"""Physics of the car in torch: parameters and models; gradients pass through."""

@@ -1,0 +1,93 @@
+"""Estimators that learn nothing: no training range is needed, recorded, or held against a test."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from place import DATASET, Place
+from single_track_drive import linear_drive
+
+UNITS = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad", "vy_ref": "m/s"}
+OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
+
+
+@pytest.fixture
+def steered(place) -> Place:
+    """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
+    folder = place.folder / "raw" / "steered"
+    folder.mkdir()
+    for name, seed in (("first", 1), ("second", 2)):
+        drive = linear_drive(30.0, seed=seed)[0]
+        pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in UNITS}}).to_csv(folder / f"{name}.csv", index=False)
+    channels = {name: {"column": name, "unit": unit} for name, unit in UNITS.items()}
+    dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+    whole = {"name": "whole", "dataset": "steered", "train": [], "validation": [], "tests": {"test": [{"recording": "second"}]}}
+    cut = whole | {
+        "name": "cut",
+        "train": [{"recording": "first"}],
+        "validation": [{"recording": "second", "stop": 10}],
+        "tests": {"test": [{"recording": "second", "start": 10}]},
+    }
+    for group, content in (("dataset", dataset), ("split", whole), ("split", cut)):
+        text = yaml.safe_dump(content, allow_unicode=True)
+        (Path("conf") / group / f"{content['name']}.yaml").write_text(text)
+    return place
+
+
+def figures_of(out: str) -> dict:
+    return {name: value for name, value in json.loads(out).items() if name.endswith(".test")}
+
+
+def test_whole_recording_is_a_test_without_training(steered):
+    assert steered("train", *OWN_NOISE, "split=whole")[0] == 0
+    code, out, _ = steered("eval", *OWN_NOISE, "split=whole", "--json")
+    assert code == 0
+    figures = figures_of(out)
+    assert 0 < figures["rmse_sideslip.test"] < 5
+    assert figures["n_parameters.test"] == 0
+    assert "step_seconds.test" not in figures, "offline: there is no online step to time"
+    with open(Path(json.loads(out)["folder"]) / "metrics.csv", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert {(row["trained_on"], row["mode"], row["test_set"]) for row in rows} == {("", "offline", "test")}
+
+
+def test_model_that_learnt_nothing_is_the_same_for_every_split_and_may_be_tested_on_any(steered):
+    folders = [json.loads(steered("train", *OWN_NOISE, f"split={split}", "--json")[1])["model"] for split in ("whole", "cut")]
+    assert folders[0] == folders[1]
+    assert steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0] == 0
+    other = json.loads(steered("train", *OWN_NOISE, "split=cut", "downsample.method=decimate", "--json")[1])["model"]
+    assert other != folders[0], "how recordings are prepared is part of a model"
+
+
+def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
+    arguments = ("estimator=kalman", "tracking=none", "--json")
+    code, out, err = steered("train", *arguments, "split=cut")
+    assert code == 0
+    assert json.loads(out)["n_parameters"] == 3
+    assert "3 parameters" in err
+    figures = figures_of(steered("eval", *arguments, "split=cut")[1])
+    assert math.isfinite(figures["step_seconds.test"])
+    folder = json.loads(out)["model"]
+    assert "shares samples with" in steered.refused("eval", "--model", folder, "split=whole", "tracking=none")[1]
+
+
+def test_estimator_that_learns_is_refused_where_there_is_nothing_to_learn_from(steered):
+    line = steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none")[1]
+    assert "split 'whole' has nothing to train on, and estimator 'ksnn' learns" in line
+
+
+def test_study_without_training_reports(steered):
+    pipeline = {"study": "given", "report": "drive", "split": "whole", "sweeps": [[*OWN_NOISE[:2]]]}
+    (Path("pipelines") / "given.yaml").write_text(yaml.safe_dump(pipeline))
+    code, out, _ = steered("run", "given", "tracking=none", "--json")
+    assert code == 0
+    (row,) = json.loads(out)["leaderboard"]
+    assert row["estimator"] == "kalman"
+    assert 0 < row["rmse_sideslip"] < 5
