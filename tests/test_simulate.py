@@ -115,6 +115,55 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place: Place) -> None:
     assert "spun: 1 (wild)" in out
 
 
+def test_a_spin_at_high_speed_is_no_impossible_recording(place: Place) -> None:
+    wild = {"name": "random_steer", "speed": [45.0, 60.0], "severity": [1.4, 1.8], "duration": 8.0}
+    simulated(place, [{"id": "fast", "count": 4, "manoeuvre": wild}], defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"])
+    outcome = made(place, "--jobs", "1")
+    assert outcome["drives"] == 4
+    assert len(outcome["spun"]) >= 1
+    sideways = [np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max() for name in outcome["spun"]]
+    assert max(sideways) > 40.0, "beyond what the check of other recordings lets pass"
+    code, out, _ = place("data", "check", "sim")
+    assert code == 0
+    assert "the simulated car spun here" in out
+
+
+def test_a_run_whose_twin_was_faster_takes_what_that_one_made(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulated(place, [{"id": "lap", "count": 2, "manoeuvre": LAP}])
+    read, twin = SimulatedSource.read, []
+
+    def with_a_twin(self: SimulatedSource, recording_id: str):
+        if not twin:
+            twin.append(recording_id)
+            twin.append(made(place, "--jobs", "1")["folder"])
+        return read(self, recording_id)
+
+    monkeypatch.setattr(SimulatedSource, "read", with_a_twin)
+    outcome = made(place, "--jobs", "1")
+    assert outcome["drives"] == 2
+    assert outcome["folder"] == twin[1]
+
+
+def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
+    simulated(place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100)
+    file = place.folder / "conf" / "dataset" / "sim.yaml"
+    content = yaml.safe_load(file.read_text())
+    del content["kind"]
+    file.write_text(yaml.safe_dump(content))
+    split = {"name": "sim", "dataset": "sim", "train": [{"recording": "a"}], "validation": [{"recording": "b"}]}
+    split["tests"] = {"test": [{"recording": "c"}]}
+    (place.folder / "conf" / "split" / "sim.yaml").write_text(yaml.safe_dump(split))
+    study = {"study": "s", "title": "t", "report": "drive", "split": "sim"}
+    study["sweeps"] = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
+    (place.folder / "pipelines" / "sim.yaml").write_text(yaml.safe_dump(study))
+    code, out, err = place("run", "sim", "--jobs", "1", "--json")
+    assert code == 0, err
+    report = Path(json.loads(out)["report"]).with_name("report.md").read_text()
+    assert "**Simulated data:** every number here comes from simulated recordings" in report
+    assert "real data" not in report.lower()
+    assert "| real |" not in report
+
+
 def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     made(place, "--jobs", "1")

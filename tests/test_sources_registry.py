@@ -12,9 +12,9 @@ import yaml
 from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
-from vehest.simulation.parameters import library_parameters, vehicle_from_configuration
+from vehest.simulation.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
 from vehest.simulation.sensors import SensorLevels
-from vehest.sources.base import open_source, source_module, source_names
+from vehest.sources.base import kind_of, open_source, source_module, source_names
 from vehest.sources.simulated import SimulatedSource
 from vehest.stages.config import compose_config, missing_keys
 
@@ -108,6 +108,44 @@ def test_cars_of_a_fleet_differ_from_drive_to_drive_within_the_stated_range() ->
         varied(vehicle, variations_from_config([{"parameters": ["tire.grip"], "factor": [1, 2]}]), 0)
 
 
+def test_tyres_of_both_axles_vary_and_what_is_named_twice_is_scaled_twice() -> None:
+    vehicle = vehicle_from_configuration(compose_config("ingest", ["dataset=sim_bmw"])["dataset"]["vehicle"])
+    vary = variations_from_config(
+        [{"parameters": ["tire.p_ky1", "tire_rear.p_ky1"], "factor": [0.5, 0.5]}, {"parameters": ["tire_rear.p_ky1"], "factor": [1.1, 1.1]}]
+    )
+    nominal, changed = compiled_parameters(vehicle), compiled_parameters(varied(vehicle, vary, 0))
+    assert changed.tire.p_ky1 == pytest.approx(0.5 * nominal.tire.p_ky1)
+    assert changed.tire_rear.p_ky1 == pytest.approx(0.55 * nominal.tire_rear.p_ky1)
+    assert changed.tire_rear.p_dy1 == nominal.tire_rear.p_dy1
+
+
+def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles() -> None:
+    dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
+    vehicle, vary = vehicle_from_configuration(dataset["vehicle"]), variations_from_config(dataset["vary"])
+    cars = [compiled_parameters(varied(vehicle, vary, seed)) for seed in range(50)]
+    for car in cars:
+        assert car.m_s + car.m_uf + car.m_ur == pytest.approx(car.m, abs=1.0)
+    for axle in ("tire", "tire_rear"):
+        assert np.std([getattr(car, axle).p_ky1 for car in cars]) > 0.5
+        assert np.std([getattr(car, axle).p_dy1 for car in cars]) > 0.05
+    assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), "the front axle lets go first, or about when the rear one does"
+
+
+def test_worn_tyres_of_the_truck_are_worn_at_both_axles() -> None:
+    vehicles = compose_config("ingest", ["dataset=sim_heavy"])["dataset"]["vehicles"]
+    nominal, worn = (compiled_parameters(vehicle_from_configuration(vehicles[name])) for name in ("nominal", "worn"))
+    for axle in ("tire", "tire_rear"):
+        assert getattr(worn, axle).p_ky1 / getattr(nominal, axle).p_ky1 == pytest.approx(0.85, abs=0.001)
+
+
+@pytest.mark.parametrize("kind", ["real", "measured"])
+def test_nobody_can_call_a_simulation_real(kind: str) -> None:
+    with pytest.raises(ConfigurationError, match="simulated"):
+        SimulatedSource(simulated(kind=kind))
+    assert kind_of({"source": "simulated"}) == "simulated"
+    assert kind_of({"source": "tabular"}) == "real"
+
+
 def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
     levels = SensorLevels()
     variation = SensorVariation.from_config({"noise": [2.0, 3.0], "delay": [0.0, 0.0]})
@@ -137,6 +175,25 @@ def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
         ({"drives": [drive("a", surface="icy")]}, "there is no surface 'icy'; there are dry, wet, patchy"),
         ({"drives": [drive("a", 0.0)]}, "data set 'sim': manoeuvre 'laps': duration must lie between"),
         ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
+        ({"drives": 5}, "drives is a list of mappings"),
+        ({"rate_hz": "abc"}, "rate_hz must be a number between 1 and 1000, not 'abc'"),
+        ({"rate_hz": 1e-9}, "rate_hz must be a number between 1 and 1000, not 1e-09"),
+        ({"accept": 5}, "accept is a list of checks"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": ["laps"]}}]}, "there is no manoeuvre '('laps',)'"),
+        ({"drives": [drive("a", (1, 2))]}, "manoeuvre 'laps': duration must be a number, not (1, 2)"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": "random_steer", "band": [0.1]}}]}, "band must be a pair of numbers, not [0.1]"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": "slalom", "cones": True}}]}, "cones must be a whole number, not True"),
+        ({"drives": [drive("a", vehicle=["b"])]}, "drive 'a': vehicle '['b']' is not one of"),
+        ({"drives": [drive("a", surface=5)]}, "a surface is one of dry, wet, patchy, or a mapping"),
+        ({"drives": [drive("a", surface={"friction": "x"})]}, "surface 'own': friction must be a number, not 'x'"),
+        ({"drives": [drive("a", surface={"patches": 0.5, "patch_length": 5})]}, "patch_length is a pair"),
+        ({"vary": [{"parameters": 5, "factor": [1, 1]}]}, "vary: an entry is {parameters"),
+        ({"vary": [{"parameters": ["R_w"], "factor": [0, 1]}]}, "vary: a factor must be positive"),
+        ({"vary": [{"parameters": ["R_w"], "factor": [1, float("inf")]}]}, "vary: a range is a pair"),
+        ({"vary": [{"parameters": ["nope"], "factor": [1, 1]}]}, "data set 'sim': vary: 'nope' is no parameter"),
+        ({"vehicle": {**VEHICLE, "overrides": {"R_w": 0}}}, "R_w must be positive"),
+        ({"vehicle": {**VEHICLE, "overrides": 5}}, "overrides"),
+        ({"vehicle": {**VEHICLE, "parameter_set": True}}, "parameter set True"),
         ({"seed": -1}, "seed must be a whole number, zero or positive, not -1"),
         ({"vary": {"m": 1}}, "vary is a list of {parameters, factor}"),
         ({"vary": [{"parameters": ["m"], "factor": [2, 1]}]}, "vary: a range is a pair [lowest, highest] of scales, not [2, 1]"),

@@ -112,6 +112,7 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
 
 def _impossible_values(recording: Recording) -> list[Finding]:
     findings = []
+    spun = bool(dict(recording.provenance.get("flags") or {}).get("spun"))
     for name, samples in recording.channels.items():
         described = CHANNELS[name]
         outside = np.flatnonzero((samples < described.low) | (samples > described.high))
@@ -119,9 +120,11 @@ def _impossible_values(recording: Recording) -> list[Finding]:
             continue
         worst = outside[np.argmax(np.abs(samples[outside]))]
         hint = "is the column in degrees? then say so in its unit" if described.is_angular else "check its unit and its column"
+        if spun:
+            hint = "the simulated car spun here"
         findings.append(
             Finding(
-                "error",
+                "note" if spun else "error",
                 "impossible",
                 name,
                 f"{len(outside)} samples beyond what a vehicle can do, {samples[worst]:.6g} {described.unit} at "

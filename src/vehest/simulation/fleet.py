@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.parameters import Vehicle, library_parameters
+from vehest.simulation.parameters import REAR_TYRE, Vehicle, library_parameters, rear_tyre
 from vehest.simulation.sensor_levels import SensorLevel, SensorLevels
+from vehest.simulation.surface import is_number
 
 _STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
 
@@ -38,9 +39,13 @@ def variations_from_config(entries: Any) -> tuple[Variation, ...]:
         raise ConfigurationError(f"vary is a list of {{parameters, factor}}, not {entries}")
     variations = []
     for entry in entries:
-        if not isinstance(entry, Mapping) or set(entry) != {"parameters", "factor"} or isinstance(entry["parameters"], str):
+        named = isinstance(entry, Mapping) and set(entry) == {"parameters", "factor"} and isinstance(entry["parameters"], list | tuple)
+        if not named or not all(isinstance(name, str) for name in entry["parameters"]):
             raise ConfigurationError(f"vary: an entry is {{parameters: [m, m_s], factor: [0.9, 1.2]}}, not {entry}")
-        variations.append(Variation(tuple(str(name) for name in entry["parameters"]), _range(entry["factor"], "vary")))
+        factor = _range(entry["factor"], "vary")
+        if factor[0] == 0.0:
+            raise ConfigurationError(f"vary: a factor must be positive, not {entry['factor']}")
+        variations.append(Variation(tuple(entry["parameters"]), factor))
     return tuple(variations)
 
 
@@ -54,18 +59,23 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
         return vehicle
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     overrides = _deep(vehicle.overrides)
-    published = library_parameters(vehicle)
+    published, rear = library_parameters(vehicle), rear_tyre(vehicle)
+    scaled: dict[str, float] = {}
     for variation in variations:
         factor = float(generator.uniform(*variation.factor))
         for name in variation.parameters:
             *group, last = name.split(".")
-            holder, target = published, overrides
+            holder: Any = published
             for part in group:
-                holder, target = getattr(holder, part, None), target.setdefault(part, {})
+                holder = rear if part == REAR_TYRE else getattr(holder, part, None)
             value = getattr(holder, last, None)
             if not isinstance(value, int | float):
                 raise ConfigurationError(f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled")
-            target[last] = float(value) * factor
+            scaled[name] = scaled.get(name, float(value)) * factor
+            target = overrides
+            for part in group:
+                target = target.setdefault(part, {})
+            target[last] = scaled[name]
     return replace(vehicle, overrides=overrides)
 
 
@@ -106,7 +116,7 @@ class SensorVariation:
 
 
 def _range(value: Any, where: str) -> tuple[float, float]:
-    numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(isinstance(end, int | float) for end in value)
+    numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(is_number(end) for end in value)
     if not numbers or len(value) != 2 or not 0.0 <= value[0] <= value[1]:
         raise ConfigurationError(f"{where}: a range is a pair [lowest, highest] of scales, not {value}")
     return float(value[0]), float(value[1])

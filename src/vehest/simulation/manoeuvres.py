@@ -19,6 +19,7 @@ from vehest.simulation.cones import DoubleLaneChange, Slalom
 from vehest.simulation.laps import FastLap, Laps, SpeedLaps
 from vehest.simulation.manoeuvre import Manoeuvre
 from vehest.simulation.open_loop import RandomSteer, Spiral, StepSteer
+from vehest.simulation.surface import is_number
 
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
     made.name: made
@@ -33,18 +34,42 @@ def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
     Raises:
         ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
     """
-    values = dict(configuration)
+    values = {key: _tupled(value) for key, value in configuration.items()}
     name = values.pop("name", None)
-    if name not in MANOEUVRES:
+    if not isinstance(name, str) or name not in MANOEUVRES:
         raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(MANOEUVRES))}")
     known = {entry.name for entry in fields(MANOEUVRES[name])}
     unknown = sorted(set(values) - known)
     if unknown:
         raise ConfigurationError(f"manoeuvre '{name}': unknown keys {unknown}; it has {sorted(known)}")
-    try:
-        return MANOEUVRES[name](**{key: _tupled(value) for key, value in values.items()})
-    except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"manoeuvre '{name}': a value is of the wrong kind in {values}") from error
+    for entry in fields(MANOEUVRES[name]):
+        if entry.name in values and not _fits(values[entry.name], str(entry.type)):
+            shown = _KINDS.get(str(entry.type).removesuffix(" | None"), str(entry.type))
+            raise ConfigurationError(f"manoeuvre '{name}': {entry.name} must be {shown}, not {configuration[entry.name]}")
+    return MANOEUVRES[name](**values)
+
+
+_KINDS = {
+    "Range": "a number or a pair of numbers",
+    "float": "a number",
+    "int": "a whole number",
+    "bool": "true or false",
+    "str": "a name",
+    "tuple[float, float]": "a pair of numbers",
+    "tuple[float, ...]": "a list of numbers",
+}
+
+
+def _fits(value: Any, kind: str) -> bool:
+    """Whether a value is of a field's type, as the dataclass spells it."""
+    if kind.endswith(" | None"):
+        return value is None or _fits(value, kind.removesuffix(" | None"))
+    if kind in ("bool", "str"):
+        return isinstance(value, {"bool": bool, "str": str}[kind])
+    if isinstance(value, tuple):
+        pair = len(value) == 2 and kind in ("Range", "tuple[float, float]")
+        return (pair or (kind == "tuple[float, ...]" and len(value) > 0)) and all(is_number(entry) for entry in value)
+    return kind in ("Range", "float", "int") and is_number(value) and (kind != "int" or isinstance(value, int))
 
 
 def _tupled(value: Any) -> Any:

@@ -34,20 +34,24 @@ def _field_names(library_class: type) -> list[str]:
     return [entry.name for entry in fields(library_class)]
 
 
-_FRONT_TYRE, _REAR_TYRE = "tire", "tire_rear"
+_FRONT_TYRE, REAR_TYRE = "tire", "tire_rear"
 
 # The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre.
 SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
 LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
 TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
 MultiBodyValues = namedtuple(  # type: ignore[misc]
-    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name != "trailer"), _REAR_TYRE]
+    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name != "trailer"), REAR_TYRE]
 )
 
 GROUPS: Mapping[str, type] = MappingProxyType(
-    {"steering": SteeringValues, "longitudinal": LongitudinalValues, _FRONT_TYRE: TyreValues, _REAR_TYRE: TyreValues}
+    {"steering": SteeringValues, "longitudinal": LongitudinalValues, _FRONT_TYRE: TyreValues, REAR_TYRE: TyreValues}
 )
 """Fields of MultiBodyValues that are named tuples themselves."""
+
+
+POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_y_w", "T_f", "T_r", "R_w", "K_zt", "K_sf", "K_sr", "w")
+"""Parameters without which a car does not exist."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,13 @@ class Vehicle:
     driver: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        library_parameters(self)
+        for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
+            if not isinstance(mapping, Mapping):
+                raise ConfigurationError(f"vehicle '{self.name}': {name} must be a mapping, not {mapping!r}")
+        parameters = library_parameters(self)
+        for name in POSITIVE:
+            if not getattr(parameters, name) > 0.0:
+                raise ConfigurationError(f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}")
         rear_tyre(self)
         for name, value in self.driver.items():
             _require_number(f"vehicle '{self.name}': driver's value '{name}'", value)
@@ -88,19 +98,20 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
     missing = sorted({"name", "parameter_set"} - set(configuration))
     if unknown or missing:
         raise ConfigurationError(f"vehicle configuration: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
-    overrides, driver = (_plain(configuration.get(key) or {}) for key in ("overrides", "driver"))
-    return Vehicle(str(configuration["name"]), configuration["parameter_set"], overrides, driver)
+    overrides, driver = configuration.get("overrides") or {}, configuration.get("driver") or {}
+    return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver))
 
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
     """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh one at every call."""
-    if vehicle.parameter_set not in PUBLISHED_SETS:
+    number = vehicle.parameter_set
+    if isinstance(number, bool) or not isinstance(number, int) or number not in PUBLISHED_SETS:
         known = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
         raise ConfigurationError(
             f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
         )
     parameters = deepcopy(_published(vehicle.parameter_set))
-    known_to_library = {name: value for name, value in vehicle.overrides.items() if name != _REAR_TYRE}
+    known_to_library = {name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE}
     _override(parameters, known_to_library, vehicle.name, prefix="")
     return parameters
 
@@ -114,10 +125,10 @@ def _published(parameter_set: int) -> VehicleParameters:
 def rear_tyre(vehicle: Vehicle) -> TireParameters:
     """Parameters of the rear tyres: the front ones with the overrides of ``tire_rear`` in place."""
     tyre = library_parameters(vehicle).tire
-    overrides = vehicle.overrides.get(_REAR_TYRE, {})
+    overrides = vehicle.overrides.get(REAR_TYRE, {})
     if not isinstance(overrides, Mapping):
-        raise ConfigurationError(f"vehicle '{vehicle.name}': override '{_REAR_TYRE}' must be a mapping, not {overrides!r}")
-    _override(tyre, overrides, vehicle.name, prefix=f"{_REAR_TYRE}.")
+        raise ConfigurationError(f"vehicle '{vehicle.name}': override '{REAR_TYRE}' must be a mapping, not {overrides!r}")
+    _override(tyre, overrides, vehicle.name, prefix=f"{REAR_TYRE}.")
     return tyre
 
 
@@ -125,7 +136,7 @@ def compiled_parameters(vehicle: Vehicle) -> Any:
     """The same values as nested named tuples of floats (MultiBodyValues); absent ones are NaN."""
     parameters = library_parameters(vehicle)
     rear = _as_values(TyreValues, rear_tyre(vehicle))
-    return _as_values(MultiBodyValues, parameters, **{_REAR_TYRE: rear})
+    return _as_values(MultiBodyValues, parameters, **{REAR_TYRE: rear})
 
 
 def parameter_vector(parameters: Any) -> FloatArray:
@@ -136,8 +147,9 @@ def parameter_vector(parameters: Any) -> FloatArray:
     return np.array(values)
 
 
-def _plain(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _plain(value) if isinstance(value, Mapping) else value for name, value in mapping.items()}
+def _plain(value: Any) -> Any:
+    """Mappings as dictionaries, all else as it is."""
+    return {name: _plain(inner) for name, inner in value.items()} if isinstance(value, Mapping) else value
 
 
 def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str) -> None:

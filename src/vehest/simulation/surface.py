@@ -95,11 +95,28 @@ def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surfac
         if configuration not in SURFACES:
             raise ConfigurationError(f"there is no surface '{configuration}'; there are {', '.join(SURFACES)}")
         return SURFACES[configuration]
+    if not isinstance(configuration, Mapping):
+        raise ConfigurationError(
+            f"a surface is one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not {configuration!r}"
+        )
     known = {entry.name for entry in fields(Surface)}
     unknown = sorted(set(configuration) - known)
     if unknown:
         raise ConfigurationError(f"surface: unknown keys {unknown}; it has {sorted(known)}")
-    values = {"name": "own", **configuration}
-    if "patch_length" in values:
-        values["patch_length"] = tuple(float(length) for length in values["patch_length"])
+    values: dict[str, Any] = {"name": "own", **configuration}
+    name, seed, length = str(values["name"]), values.get("seed"), values.get("patch_length")
+    for key in ("friction", "patches"):
+        if key in values and not is_number(values[key]):
+            raise ConfigurationError(f"surface '{name}': {key} must be a number, not {values[key]!r}")
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+        raise ConfigurationError(f"surface '{name}': seed must be a whole number, zero or positive, not {seed!r}")
+    if length is not None:
+        if not isinstance(length, list | tuple) or len(length) != 2 or not all(is_number(end) for end in length):
+            raise ConfigurationError(f"surface '{name}': patch_length is a pair [shortest, longest] in metres, not {length!r}")
+        values["patch_length"] = (float(length[0]), float(length[1]))
     return Surface(**values)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

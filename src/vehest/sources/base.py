@@ -18,6 +18,15 @@ from vehest.data.splits import check_name
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
 
 
+SIMULATED = "simulated"
+"""Name of the source whose recordings never are real, whatever a configuration says."""
+
+
+def kind_of(dataset: Mapping[str, Any]) -> str:
+    """Whether a data set's recordings are ``real`` or ``simulated``."""
+    return "simulated" if dataset.get("source") == SIMULATED else str(dataset.get("kind") or "real")
+
+
 class Source(ABC):
     """Reads one data set.
 
@@ -44,6 +53,11 @@ class Source(ABC):
 
         if dataset.get("kind", "real") not in ("real", "simulated"):
             raise ConfigurationError(f"data set '{self.name}': kind '{dataset['kind']}' is not one of: real, simulated")
+        if dataset.get("source") == SIMULATED and dataset.get("kind", "simulated") != "simulated":
+            raise ConfigurationError(f"data set '{self.name}': what source '{SIMULATED}' makes is simulated; leave kind out")
+        accept = dataset.get("accept") or []
+        if isinstance(accept, str) or not isinstance(accept, Sequence):
+            raise ConfigurationError(f"data set '{self.name}': accept is a list of checks, such as [impossible], not {accept!r}")
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -49,16 +49,23 @@ class SimulatedSource(Source):
     slow = True
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
-        from vehest.simulation.fleet import SensorVariation, variations_from_config
+        from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
         from vehest.simulation.manoeuvres import manoeuvre_from_config
+        from vehest.simulation.parameters import vehicle_from_configuration
         from vehest.simulation.sensors import sensor_levels_from_config
         from vehest.simulation.surface import surface_from_config
 
         super().__init__(dataset)
         self.seed = _whole_number(dataset.get("seed", 0), f"data set '{self.name}': seed")
+        rate = dataset.get("rate_hz", 100.0)
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
+            raise ConfigurationError(f"data set '{self.name}': rate_hz must be a number between 1 and 1000, not {rate!r}")
+        self.rate_hz = float(rate)
         self.vehicles = self._vehicles()
         self.drives = self._drives()
         try:
+            for vehicle in self.vehicles.values():
+                varied(vehicle_from_configuration(vehicle), variations_from_config(dataset.get("vary") or []), 0)
             self.sensors = sensor_levels_from_config(dataset.get("sensors"))
             self.variations = variations_from_config(dataset.get("vary") or [])
             self.sensor_variation = SensorVariation.from_config(dataset.get("vary_sensors") or {})
@@ -92,7 +99,7 @@ class SimulatedSource(Source):
             vehicle=varied(vehicle_from_configuration(drive.vehicle), self.variations, drive.seed),
             manoeuvre=manoeuvre_from_config(drive.manoeuvre),
             seed=drive.seed,
-            rate_hz=float(self.dataset.get("rate_hz", 100.0)),
+            rate_hz=self.rate_hz,
             sensors=self.sensor_variation.applied(self.sensors, drive.seed),
             stability_control=drive.stability_control,
             surface=surface_from_config(drive.surface),
@@ -110,11 +117,16 @@ class SimulatedSource(Source):
 
     def _drives(self) -> dict[str, Drive]:
         drives: dict[str, Drive] = {}
-        for entry in self.dataset.get("drives") or []:
+        entries = self.dataset.get("drives") or []
+        if isinstance(entries, str) or not isinstance(entries, Sequence):
+            raise ConfigurationError(f"data set '{self.name}': drives is a list of mappings with an id and a manoeuvre, not {entries!r}")
+        for entry in entries:
             if not isinstance(entry, Mapping) or not {"id", "manoeuvre"} <= set(entry) or set(entry) - OPTIONS_OF_A_DRIVE:
                 known = ", ".join(sorted(OPTIONS_OF_A_DRIVE - {"id", "manoeuvre"}))
                 raise ConfigurationError(f"data set '{self.name}': a drive has an id, a manoeuvre and, if need be, {known}; not {entry}")
             where = f"data set '{self.name}': drive '{entry['id']}'"
+            if not isinstance(entry["id"], str | int) or isinstance(entry["id"], bool) or not 0 < len(str(entry["id"])) <= 100:
+                raise ConfigurationError(f"{where}: an id is a name of 1 to 100 characters")
             if not isinstance(entry["manoeuvre"], Mapping):
                 raise ConfigurationError(f"{where}: manoeuvre is a mapping with a name, such as {{name: laps}}, not {entry['manoeuvre']}")
             for drive_id in _ids_of(entry, where):
@@ -139,9 +151,9 @@ class SimulatedSource(Source):
 
     def _vehicle_of(self, entry: Mapping[str, Any], where: str) -> Mapping[str, Any]:
         name = entry.get("vehicle", next(iter(self.vehicles)) if len(self.vehicles) == 1 else None)
-        if name not in self.vehicles:
+        if not isinstance(name, str | int) or str(name) not in self.vehicles:
             raise ConfigurationError(f"{where}: vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
-        return self.vehicles[name]
+        return self.vehicles[str(name)]
 
 
 def _ids_of(entry: Mapping[str, Any], where: str) -> list[str]:

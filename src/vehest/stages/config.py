@@ -145,7 +145,8 @@ def _one_line(error: Exception, command: str) -> str:
     text = str(error).strip()
     unknown = re.search(r"Could not override '([^']+)'", text)
     if unknown:
-        return f"unknown option '{unknown.group(1)}'; 'vehest config {command}' prints the options there are"
+        name = unknown.group(1)
+        return f"unknown option '{name}'; 'vehest config {command}' prints the options there are; +{name}=… adds one"
     missing = re.search(r"You must specify '([^']+)'", text)
     if missing:
         return f"say which {missing.group(1)}: {missing.group(1)}=… (choices: {', '.join(choices(missing.group(1)))})"

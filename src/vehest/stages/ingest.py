@@ -99,6 +99,8 @@ def _make_side_by_side(
         else:
             made.append(end.outcome)
             report(len(made), len(ids), "")
+    if not any(parts.iterdir() if parts.is_dir() else ()):
+        remove(parts)
     stop.raise_if_requested()
     if failures:
         error = DataError(failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""))
@@ -106,7 +108,9 @@ def _make_side_by_side(
         raise error
     for recording_id in ids:
         name = _file_name(recording_id)
-        _link(parts / name, folder / name)
+        # Another run of the same ingest may have finished meanwhile and taken the parts away; what it made is the same.
+        part = parts / name if (parts / name).is_file() else plan.folder / name
+        _link(part, folder / name)
 
 
 def drop_parts(plan: StagePlan) -> None:
@@ -128,6 +132,7 @@ def _link(source: Path, target: Path) -> None:
 def _make_part(
     dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
 ) -> str:
+    parts.mkdir(parents=True, exist_ok=True)
     _make(open_source(dataset), recording_id, parts)
     return recording_id
 

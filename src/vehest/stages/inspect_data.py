@@ -14,7 +14,7 @@ from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
-from vehest.sources.base import open_source
+from vehest.sources.base import kind_of, open_source
 from vehest.sources.tabular import TabularSource
 from vehest.stages.artefacts import find
 from vehest.stages.config import compose_config
@@ -30,7 +30,7 @@ def dataset_rows() -> list[dict[str, str]]:
         rows.append(
             {
                 "dataset": name,
-                "kind": str(dataset.get("kind", "")),
+                "kind": kind_of(dataset),
                 "source": str(dataset.get("source", "")),
                 "here": _is_here(dataset),
                 "title": str(dataset.get("title", "")),

@@ -8,10 +8,9 @@ from typing import Any
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
+from vehest.sources.base import SIMULATED
 from vehest.stages.artefacts import Artefact
 from vehest.stages.config import Config, compose_config, key_of
-
-SOURCE = "simulated"
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,9 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     Raises:
         ConfigurationError: the data set is not simulated, or an override makes no sense.
     """
-    spelt_out = [f"dataset.{override}" if key_of(override) == "seed" else override for override in overrides]
+    spelt_out = [f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override for override in overrides]
     config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
-    if config["dataset"].get("source") != SOURCE:
+    if config["dataset"].get("source") != SIMULATED:
         raise ConfigurationError(f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'")
     return config
 

@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vehest.data.errors import MissingError
+from vehest.sources.base import kind_of
 from vehest.stages.artefacts import Artefact, StagePlan, find, provenance
 from vehest.stages.code_version import code_version
 from vehest.stages.config import Config
@@ -155,4 +156,4 @@ def _prose(dataset: Mapping[str, Any], key: str) -> str:
 
 
 def _kind(dataset: Mapping[str, Any]) -> str:
-    return str(dataset.get("kind", "real"))
+    return kind_of(dataset)

@@ -18,6 +18,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Catalogue, Split, split_from_config
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
+from vehest.sources.base import kind_of
 from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
 from vehest.stages.config import Config, compose_config
 from vehest.stages.console import Messages
@@ -124,7 +125,7 @@ class Workshop:
 
     def kinds_of(self, split: Split, config: Config) -> dict[str, str]:
         """Data set -> ``real`` or ``simulated``."""
-        return {name: str(self.dataset_config(name, config)["dataset"].get("kind", "real")) for name in split.datasets}
+        return {name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets}
 
     def run_groups(self, groups: Sequence[Group]) -> tuple[list[Member], list[tuple[str, Failure]]]:
         """Train and evaluate groups, side by side where there are cores; returns members and failures.

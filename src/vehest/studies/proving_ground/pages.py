@@ -165,6 +165,16 @@ def _beside_paper(page: VehiclePage, profile: Profile) -> list[Block]:
     return blocks
 
 
+def _how_alike(simulated: Tally, real: Tally) -> str:
+    ratio = {name: simulated.quantile(name, 0.99, absolute=True) / real.quantile(name, 0.99, absolute=True) for name in ("sideslip", "ay")}
+    size = "smaller" if ratio["sideslip"] < 1.0 else "larger"
+    return (
+        f"The 99 % quantile of |β| is {fixed(ratio['sideslip'], 2)} times the real one, that of |ay| {fixed(ratio['ay'], 2)} times: what "
+        f"an estimator has to find is that much {size} here than on the real car. The parameters "
+        f"were not fitted to the recording."
+    )
+
+
 def _beside_real(page: VehiclePage, profile: Profile, absent: Sequence[AbsentDataset]) -> list[Block]:
     heading = "## Beside the real recording"
     if not page.real or not page.simulated:
@@ -180,6 +190,7 @@ def _beside_real(page: VehiclePage, profile: Profile, absent: Sequence[AbsentDat
     blocks: list[Block] = [
         f"{heading}\n\nReal: {_recordings_in_words(real.dataset)}. Simulated: all drives of this page. Both {profile.preparation}.",
         Table(f"{page.name}_beside_real", "Statistics, real and simulated.", pd.DataFrame(rows), _REAL_AND_SIMULATED),
+        _how_alike(page.merged("simulated"), real.all),
     ]
     if not noise.comparable(page.samples):
         return [*blocks, "The two have not the same rate or channels, or are too short for spectra."]
