@@ -150,6 +150,14 @@ def test_report_names_command_budget_split_and_kind():
         assert "Student's t" in text
 
 
+def test_report_says_how_many_others_the_interval_of_the_chosen_one_covers():
+    keys = ("estimator.n_local",)
+    scores = {(2,): [0.4, 0.5], (3,): [0.9, 0.9], (4,): [2.0, 2.1], (5,): [1.0, 1.1]}  # half interval of the first: 12.7 times 0.05
+    jobs = jobs_of({values: {"validation": own, "test": own} for values, own in scores.items()}, keys)
+    text = "\n".join(block for block in build(artefacts_of(jobs, keys)).blocks if isinstance(block, str))
+    assert "2 of the other 3 combinations have a mean on the validation range within its interval" in text
+
+
 # The command
 
 

@@ -53,6 +53,7 @@ def heat_map(
     """
     import matplotlib
     from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap
 
     values = np.concatenate([panel.mean.ravel() for panel in panels])
     finite = values[np.isfinite(values)]
@@ -62,7 +63,8 @@ def heat_map(
     with paper_style():
         figure = new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows)))
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
-        colours = ScalarMappable(_scale(finite), matplotlib.colormaps["Blues"])
+        shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
+        colours = ScalarMappable(_scale(finite), shades)
         decimals = decimals_for(finite.tolist())
         for axes, panel in zip(grid.flat, panels, strict=False):
             _draw(axes, panel, colours, decimals)

@@ -249,7 +249,10 @@ def _run(groups: Mapping[int, Group], workshop: Workshop) -> tuple[list[Member],
     if alone:
         more, failed = workshop.run_groups(alone)
         members += more
-        failures |= {name: failure.message for name, failure in failed}
+        for name, failure in failed:
+            failures[name] = failure.message
+            if failure.detail:
+                workshop.messages.warn(f"{name}:\n{failure.detail}")
     return members, failures
 
 
@@ -272,7 +275,9 @@ def _job_table(
 
 
 def _reason(failures: Mapping[str, str], label: str, seed: Any) -> str:
-    return next((reason for name, reason in failures.items() if name in (label, f"{label} seed {seed}")), failures.get(label, ""))
+    """Why a job failed: alone, with its whole combination, or in a group that a defect ended."""
+    own = (label, f"{label} seed {seed}")
+    return next((reason for name, reason in failures.items() if name in own or name.startswith(f"{label} seeds ")), "")
 
 
 def _figures(member: Member | None, sets: Sequence[str]) -> dict[str, Any]:

@@ -232,7 +232,12 @@ def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
     words = f"Chosen on the validation range: **{row['title']}**" + (f" ({which})" if which else "")
     figures = [f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})" for name in artefacts.sets]
     seeds = int(row["n_seeds"])
-    return f"{words}, with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
+    words += f", with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
+    mean, half = float(row[f"{METRIC}.{VALIDATION}"]), float(row[f"{METRIC}_half.{VALIDATION}"])
+    if len(table) > 1 and math.isfinite(half):
+        close = int((table[f"{METRIC}.{VALIDATION}"] <= mean + half).sum()) - 1
+        words += f" {close} of the other {len(table) - 1} combinations have a mean on the validation range within its interval."
+    return words
 
 
 def _set_in_words(name: str) -> str:
