@@ -9,8 +9,10 @@ INSTALLED := $(VENV)/.installed
 TORCH ?= 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 JOBS ?= 2
+SPLIT ?= quickstart
+SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground bench-training bench-ingest bench-simulation
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sweep bench-training bench-ingest bench-simulation
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -58,6 +60,10 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml
+
+sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quickstart, simulated; SEEDS="range(3)")
+	$(BIN)/vehest sweep split=$(SPLIT) estimator=ksnn estimator.n_local=2,3,4,5,6 estimator.n_hidden=0,1,2,3 estimator.bias=true,false \
+	  'seed=$(SEEDS)' training.max_epochs=60 tracking=none
 
 bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
 	$(BIN)/python benchmarks/training.py

@@ -219,6 +219,9 @@ def overrides_of(given: Given) -> Iterator[tuple[str, list[str]]]:
                 yield "ingest", [f"dataset={first}", *given.overrides]
         case ("config",):
             yield first, given.overrides
+        case ("sweep",):
+            jobs = expand(given.overrides)
+            yield from (("eval", job) for job in (jobs[0], jobs[-1]))
         case ("train",) | ("eval",) | ("estimate",):
             yield given.command[0], given.overrides
 

@@ -20,6 +20,7 @@ from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.stages.config import Config
+    from vehest.stages.sweep import SweepOutcome
     from vehest.stages.workshop import Workshop
 
 app = typer.Typer(
@@ -319,6 +320,47 @@ def report(
     _run_pipeline(pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=1, only_report=True)
 
 
+@app.command(epilog=_offered("split", "estimator", "training", "tracking"))
+def sweep(
+    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Start of the folder's name; by default the estimators and the split.", show_default=False)
+    ] = None,
+    dry_run: DryRun = False,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    jobs: Jobs = None,
+) -> None:
+    """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
+
+    Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
+    on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
+    """
+    from vehest.stages.sweep import plan_sweep, run_sweep
+
+    planned = plan_sweep(overrides or [], name)
+    forced = {"train", "evaluate", "sweep"} if force else set()
+    with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True) as workshop:
+        outcome = run_sweep(planned, workshop)
+    table = json.loads(outcome.summary.to_json(orient="records"))
+    if as_json:
+        chosen = next((row for row in table if row["chosen"]), None)
+        failed = [{"jobs": what, "message": reason} for what, reason in outcome.failures.items()]
+        shown = {
+            "folder": str(outcome.folder.folder),
+            "skipped": outcome.folder.skipped,
+            "chosen": chosen,
+            "summary": table,
+            "failed": failed,
+        }
+        typer.echo(_json(shown))
+    else:
+        _print_sweep(outcome)
+    if not dry_run:
+        outcome.raise_failures()
+
+
 @app.command("config")
 def show_config(
     command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_complete_command)],
@@ -563,6 +605,19 @@ def _run_pipeline(
     typer.echo(f"report: {page}")
     if outcome.published is not None:
         typer.echo(f"published: {outcome.published}")
+
+
+def _print_sweep(outcome: SweepOutcome) -> None:
+    """One row a combination: settings, seeds, mean and half interval on validation and tests."""
+    from vehest.studies.sweep import table_of
+
+    header, rows = table_of(outcome.artefacts, outcome.summary)
+    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(outcome.artefacts.kinds.values()))
+    typer.echo(f"\n{outcome.artefacts.name}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data")
+    _table(header, rows)
+    if outcome.summary["chosen"].any():
+        typer.echo("* lowest mean on the validation range; tests choose nothing")
+    typer.echo(f"report: {outcome.folder.folder / 'report.md'}")
 
 
 def _compose(command: str, overrides: list[str]) -> Config:

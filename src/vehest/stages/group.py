@@ -46,17 +46,19 @@ class Group:
         jobs: in the order of the pipeline.
         evaluation: none if they are trained only.
         force: stages to run although their artefacts are there.
+        label: what its members have in common, for people; the estimator and its variant if empty.
     """
 
     jobs: Sequence[TrainJob]
     evaluation: Evaluation | None = None
     force: frozenset[str] = frozenset()
+    label: str = ""
 
     @property
     def name(self) -> str:
         """For people."""
         seeds = [str(job.seed) for job in self.jobs]
-        label = self.jobs[0].plan.label.rsplit("-seed", 1)[0]
+        label = self.label or self.jobs[0].plan.label.rsplit("-seed", 1)[0]
         return f"{label} seed {seeds[0]}" if len(seeds) == 1 else f"{label} seeds {', '.join(seeds)}"
 
 

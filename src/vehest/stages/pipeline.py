@@ -268,7 +268,7 @@ def run_pipeline(
         members=members,
         evaluation=evaluation,
         data_titles=titles,
-        training=[*_training_facts(configs), _resampling_fact(configs)],
+        training=[*training_facts(configs), resampling_fact(configs)],
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
     published = _publish(pipeline, report, overrides, workshop)
@@ -346,7 +346,7 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
     return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
 
 
-def _resampling_fact(configs: Sequence[Config]) -> str:
+def resampling_fact(configs: Sequence[Config]) -> str:
     """How recordings came to the rates that estimators work at."""
     rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(configs[0]["evaluation"]["rate_hz"])})
     options = configs[0]["downsample"]
@@ -363,7 +363,7 @@ def plain_resampling(config: Config) -> Config:
     return {**config, "downsample": {**config["downsample"], "transforms": []}}
 
 
-def _training_facts(configs: Sequence[Config]) -> list[str]:
+def training_facts(configs: Sequence[Config]) -> list[str]:
     """What each training scheme was allowed, a line each."""
     facts = []
     for config in configs:

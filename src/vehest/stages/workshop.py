@@ -6,7 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -144,7 +144,7 @@ class Workshop:
                     self._say_skipped(member)
             missing = [member.job for member in found if not is_finished(group, member)]
             if missing:
-                waiting.append(Group(missing, group.evaluation, group.force))
+                waiting.append(replace(group, jobs=missing))
         if self.dry_run and waiting:
             for group in waiting:
                 for job in group.jobs:

@@ -1,0 +1,122 @@
+"""A heat map over two keys, a panel for each value of a third, with the interval of each cell written into it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vehest.data.recording import FloatArray
+from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure, paper_style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+LOGARITHMIC_FROM = 20.0
+MOST_COLUMNS_SIDE_BY_SIDE = 6
+CELL_HEIGHT = 0.42  # in
+NO_VALUE = "#ececec"
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One panel of a heat map.
+
+    Args:
+        title: what it shows; may be empty.
+        mean: colour and first line of each cell, NaN where there is none; shape (R, C).
+        half: half the interval, NaN where there is none; shape (R, C).
+        marked: row and column of the cell with a frame.
+    """
+
+    title: str
+    mean: FloatArray
+    half: FloatArray
+    marked: tuple[int, int] | None = None
+
+
+def heat_map(
+    panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
+) -> MatplotlibFigure:
+    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest.
+
+    Args:
+        panels: of shape (R, C) each.
+        columns: ticks of the horizontal axis, C of them.
+        rows: ticks of the vertical axis from below, R of them.
+        column_label: of the horizontal axis.
+        row_label: of the vertical axis.
+        quantity: what the colours show, with its unit.
+    """
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap
+
+    values = np.concatenate([panel.mean.ravel() for panel in panels])
+    finite = values[np.isfinite(values)]
+    across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
+    down = math.ceil(len(panels) / across)
+    width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
+    with paper_style():
+        figure = new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows)))
+        grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+        shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
+        colours = ScalarMappable(_scale(finite), shades)
+        decimals = decimals_for(finite.tolist())
+        for axes, panel in zip(grid.flat, panels, strict=False):
+            _draw(axes, panel, colours, decimals)
+            axes.set_title(panel.title, loc="left")
+            axes.set_xticks(range(len(columns)), columns)
+            axes.set_yticks(range(len(rows)), rows)
+        for axes in list(grid.flat)[len(panels) :]:
+            axes.set_visible(False)
+        for axes in grid[-1]:
+            axes.set_xlabel(column_label)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(row_label)
+        if len(finite):
+            figure.colorbar(colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25).outline.set_visible(False)
+    return figure
+
+
+def _scale(finite: FloatArray) -> Any:
+    from matplotlib.colors import LogNorm, Normalize
+
+    if not len(finite):
+        return Normalize(0.0, 1.0)
+    low, high = float(finite.min()), float(finite.max())
+    if low > 0 and high / low > LOGARITHMIC_FROM:
+        return LogNorm(low, high)
+    return Normalize(low, high if high > low else low + 1.0)
+
+
+def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
+    from matplotlib.patches import Rectangle
+
+    for row, column in np.ndindex(panel.mean.shape):
+        mean = float(panel.mean[row, column])
+        colour = colours.to_rgba(mean) if math.isfinite(mean) else NO_VALUE
+        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8))
+        half = float(panel.half[row, column])
+        words = fixed(mean, decimals) if math.isfinite(mean) else MISSING
+        if math.isfinite(mean) and math.isfinite(half):
+            words += f"\n±{fixed(half, decimals)}"
+        ink = "white" if math.isfinite(mean) and _luminance(colour) < 0.45 else "#111111"
+        axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
+    if panel.marked is not None:
+        row, column = panel.marked
+        axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
+    n_rows, n_columns = panel.mean.shape
+    axes.set_xlim(-0.5, n_columns - 0.5)
+    axes.set_ylim(-0.5, n_rows - 0.5)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+
+
+def _luminance(colour: Any) -> float:
+    red, green, blue = colour[:3]
+    return float(0.2126 * red + 0.7152 * green + 0.0722 * blue)

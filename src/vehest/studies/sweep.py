@@ -1,0 +1,302 @@
+"""Tables and heat maps of a sweep: every combination of settings, over its seeds.
+
+`summary` has a row a combination, `build` makes the report. The mean over seeds comes with a 95 % confidence interval from
+Student's t distribution. The combination is chosen on the validation range; tests choose nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+
+from vehest.data.recording import FloatArray
+from vehest.data.splits import VALIDATION, Span, Split
+from vehest.evaluation.metrics import Protocol
+from vehest.report.document import Block, Column, Document, Figure, Table
+from vehest.report.heat_map import Panel, heat_map
+from vehest.report.style import decimals_for, fixed
+
+CONFIDENCE = 0.95
+METRIC = "rmse_sideslip"
+DONE, FAILED = "done", "failed"
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class SweepArtefacts:
+    """Everything that tables and figures of a sweep are made from.
+
+    Args:
+        name: name of the sweep.
+        command: the command that makes it.
+        keys: those that take several values, the seed aside, in the order of the command.
+        jobs: a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
+            ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`.
+        split: training, validation and test ranges.
+        protocol: how estimates are scored.
+        kinds: data set -> ``real`` or ``simulated``.
+        data_titles: data set -> title, for people.
+        facts: lines on how it was made: budget, resampling.
+        failures: what failed -> why.
+        patented: whether a KS-NN is among the estimators.
+    """
+
+    name: str
+    command: str
+    keys: Sequence[str]
+    jobs: pd.DataFrame
+    split: Split
+    protocol: Protocol
+    kinds: Mapping[str, str]
+    data_titles: Mapping[str, str]
+    facts: Sequence[str]
+    failures: Mapping[str, str] = field(default_factory=dict)
+    patented: bool = False
+
+    @property
+    def sets(self) -> list[str]:
+        """What is scored: the validation range, where there is one, and each test set."""
+        return [*([VALIDATION] if self.split.validation else []), *self.split.tests]
+
+
+def build(artefacts: SweepArtefacts) -> Document:
+    """The report of a sweep: what was chosen, how it was made, all combinations, what failed, heat maps."""
+    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
+    blocks: list[Block] = [_kind_sentence(artefacts), _chosen_sentence(artefacts, table), _how_it_was_made(artefacts)]
+    blocks += ["## Combinations", _table(artefacts, table)]
+    if artefacts.failures:
+        listed = "\n".join(f"- {name}: {reason}" for name, reason in artefacts.failures.items())
+        blocks.append(f"## What failed\n\n{listed}")
+    maps = heat_maps(artefacts, table)
+    if maps:
+        blocks += ["## Heat maps", *maps]
+    if artefacts.patented:
+        blocks.append(
+            "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
+            "the licence of this software grants none."
+        )
+    return Document(f"Sweep {artefacts.name}", blocks)
+
+
+def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.DataFrame:
+    """One row a combination, in the order of the jobs.
+
+    Columns: ``combination``, ``title``, the keys, ``n_parameters``, ``n_seeds`` (of the jobs that are done), ``n_failed``; for each set
+    ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed) [deg]; ``chosen``.
+    Chosen is the lowest mean on the validation range among the combinations of which no seed failed; none where nothing was validated.
+    """
+    rows = []
+    for number, own in jobs.groupby("combination", sort=False):
+        done = own[own["status"] == DONE]
+        row: dict[str, object] = {"combination": number, **{name: own.iloc[0][name] for name in ("title", *keys)}}
+        row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
+        row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
+        for name in sets:
+            row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(done[f"{METRIC}.{name}"].to_numpy(dtype=float))
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    table["chosen"] = False
+    if VALIDATION in sets:
+        mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
+        if np.isfinite(mean).any():
+            table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
+    return table
+
+
+def interval(values: FloatArray) -> tuple[float, float]:
+    """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t distribution with n - 1 degrees of freedom.
+
+    Args:
+        values: one a seed, shape (n,). One that is not finite makes the mean NaN: no seed is left out silently.
+
+    Returns:
+        Mean and half interval; NaN where there are no values, half NaN for one value.
+    """
+    from scipy.stats import t
+
+    n = len(values)
+    if n == 0 or not np.isfinite(values).all():
+        return math.nan, math.nan
+    mean = float(np.mean(values))
+    if n == 1:
+        return mean, math.nan
+    return mean, float(t.ppf(0.5 + CONFIDENCE / 2, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+
+
+def table_of(artefacts: SweepArtefacts, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """A summary as a terminal shows it: headers, and rows of cells; the chosen combination has a star."""
+    names = short_names(artefacts.keys)
+    header = ["", *(names.values() or ["estimator"]), "parameters", "seeds", *artefacts.sets]
+    decimals = {name: decimals_for(table[f"{METRIC}.{name}"].tolist()) for name in artefacts.sets}
+    rows = []
+    for row in table.to_dict("records"):
+        seeds = f"{row['n_seeds']} ({row['n_failed']} failed)" if row["n_failed"] else str(row["n_seeds"])
+        which = [shown_value(row[key]) for key in artefacts.keys] or [str(row["title"])]
+        scores = [mean_and_half(row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"], decimals[name]) for name in artefacts.sets]
+        rows.append(["*" if row["chosen"] else "", *which, fixed(row["n_parameters"], 0), seeds, *scores])
+    return header, rows
+
+
+def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
+    """A heat map for each set, where two numeric keys vary and any others are booleans; else none."""
+    varied = [key for key in artefacts.keys if table[key].nunique() > 1]
+    switches = [key for key in varied if all(isinstance(value, bool | np.bool_) for value in table[key])]
+    numeric = [key for key in varied if key not in switches and all(_is_number(value) for value in table[key])]
+    if len(numeric) != 2 or len(numeric) + len(switches) != len(varied):
+        return []
+    across, up = numeric
+    columns, rows = sorted(table[across].unique()), sorted(table[up].unique())
+    names = short_names(artefacts.keys)
+    maps = []
+    for name in artefacts.sets:
+        panels = [
+            _panel(own, key, name, [names[switch] for switch in switches], (across, columns), (up, rows))
+            for key, own in (table.groupby(switches, sort=False) if switches else [((), table)])
+        ]
+        where = "the validation range" if name == VALIDATION else f"test set `{name}`"
+        caption = (
+            f"RMSE(β) on {where} over {names[across]} and {names[up]} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
+            f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
+        )
+        ticks = [[str(value) for value in values] for values in (columns, rows)]
+        figure = heat_map(panels, ticks[0], ticks[1], names[across], names[up], f"RMSE(β), {name} [deg]")
+        maps.append(Figure(f"heat_map_{name.lower()}", caption, figure))
+    return maps
+
+
+def short_names(keys: Sequence[str]) -> dict[str, str]:
+    """Key -> its last part, or all of it where two keys share that."""
+    last = [key.rsplit(".", 1)[-1] for key in keys]
+    return {key: name if last.count(name) == 1 else key for key, name in zip(keys, last, strict=True)}
+
+
+def shown_value(value: object) -> str:
+    """A value as it is typed in an override."""
+    return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
+
+
+def _panel(
+    table: pd.DataFrame,
+    values: tuple[object, ...],
+    name: str,
+    switches: Sequence[str],
+    across: tuple[str, list[float]],
+    up: tuple[str, list[float]],
+) -> Panel:
+    mean, half = (np.full((len(up[1]), len(across[1])), np.nan) for _ in range(2))
+    marked = None
+    for row in table.to_dict("records"):
+        cell = up[1].index(row[up[0]]), across[1].index(row[across[0]])
+        mean[cell], half[cell] = row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"]
+        marked = cell if row["chosen"] else marked
+    title = ", ".join(f"{switch} = {shown_value(value)}" for switch, value in zip(switches, values, strict=True))
+    return Panel(title, mean, half, marked)
+
+
+# The words
+
+
+def _kinds(artefacts: SweepArtefacts, name: str) -> str:
+    spans = artefacts.split.validation if name == VALIDATION else artefacts.split.tests[name]
+    return " and ".join(sorted({_shouted(artefacts.kinds[span.dataset]) for span in spans}))
+
+
+def _shouted(kind: str) -> str:
+    """Simulated data must not be overlooked."""
+    return kind.upper() if kind == "simulated" else kind
+
+
+def _kind_sentence(artefacts: SweepArtefacts) -> str:
+    parts = "; ".join(f"{artefacts.data_titles[name]} ({_shouted(kind)})" for name, kind in artefacts.kinds.items())
+    kinds = set(artefacts.kinds.values())
+    if len(kinds) == 1:
+        return f"**{_shouted(kinds.pop())} data:** every number here comes from {parts}."
+    return f"**Real and SIMULATED data:** {parts}."
+
+
+def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
+    if not table["chosen"].any():
+        return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
+    row = table[table["chosen"]].iloc[0]
+    names = short_names(artefacts.keys)
+    which = ", ".join(f"{names[key]} = {shown_value(row[key])}" for key in artefacts.keys)
+    words = f"Chosen on the validation range: **{row['title']}**" + (f" ({which})" if which else "")
+    figures = [f"{_with_interval(row, name)} on {_set_in_words(name)} ({_kinds(artefacts, name)})" for name in artefacts.sets]
+    seeds = int(row["n_seeds"])
+    words += f", with RMSE(β) = {', '.join(figures)}; {seeds} seed{'' if seeds == 1 else 's'}."
+    mean, half = float(row[f"{METRIC}.{VALIDATION}"]), float(row[f"{METRIC}_half.{VALIDATION}"])
+    if len(table) > 1 and math.isfinite(half):
+        close = int((table[f"{METRIC}.{VALIDATION}"] <= mean + half).sum()) - 1
+        words += f" {close} of the other {len(table) - 1} combinations have a mean on the validation range within its interval."
+    return words
+
+
+def _set_in_words(name: str) -> str:
+    return "the validation range" if name == VALIDATION else f"test set `{name}`"
+
+
+def _with_interval(row: pd.Series, name: str) -> str:
+    mean, half = float(row[f"{METRIC}.{name}"]), float(row[f"{METRIC}_half.{name}"])
+    return mean_and_half(mean, half, decimals_for([mean])) + "°"
+
+
+def mean_and_half(mean: float, half: float, decimals: int) -> str:
+    """``0.312 ± 0.021``; the mean alone where there is no interval."""
+    return f"{fixed(mean, decimals)} ± {fixed(half, decimals)}" if math.isfinite(half) else fixed(mean, decimals)
+
+
+def _how_it_was_made(artefacts: SweepArtefacts) -> str:
+    jobs, protocol = artefacts.jobs, artefacts.protocol
+    done = jobs[jobs["status"] == DONE]
+    seeds = sorted({int(seed) for seed in jobs["seed"]})
+    epochs = done["epochs"][done["epochs"] > 0]
+    fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
+    took = f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs" if len(epochs) else ""
+    counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
+    split = artefacts.split
+    ranges = [_ranges("training", split.train), _ranges("validation", split.validation)]
+    ranges += [_ranges(f"test `{name}`", spans) for name, spans in split.tests.items()]
+    lines = [
+        f"Command: `{artefacts.command}`",
+        f"Budget: {counts}{took}",
+        *artefacts.facts,
+        f"Split `{split.name}`: {'; '.join(ranges)}",
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held; up to {protocol.warm_up_seconds:g} s of warm-up before a "
+        f"range, whose first {protocol.skip_seconds:g} s are not scored",
+        "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
+        "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
+        "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
+        "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
+    ]
+    return "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)
+
+
+def _ranges(role: str, spans: Sequence[Span]) -> str:
+    return f"{role} {', '.join(span.describe() for span in spans)}" if spans else f"no {role}"
+
+
+def _table(artefacts: SweepArtefacts, table: pd.DataFrame) -> Table:
+    names = short_names(artefacts.keys)
+    columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
+    columns |= {"n_parameters": Column("params", decimals=0), "n_seeds": Column("seeds"), "n_failed": Column("failed")}
+    for name in artefacts.sets:
+        decimals = decimals_for(table[f"{METRIC}.{name}"].tolist())
+        columns[f"{METRIC}.{name}"] = Column(f"RMSE(β), {name} [deg]", decimals=decimals)
+        columns[f"{METRIC}_half.{name}"] = Column("± [deg]", decimals=decimals)
+    frame = table.assign(chosen=["chosen" if chosen else "" for chosen in table["chosen"]])
+    for key in artefacts.keys:
+        if not all(_is_number(value) for value in frame[key]):
+            frame[key] = [shown_value(value) for value in frame[key]]
+        else:
+            columns[key] = Column(names[key], each=True)
+    caption = "All combinations in the order of the command: mean RMSE(β) over seeds, and half its 95 % confidence interval."
+    return Table("combinations", caption, frame, {**columns, "chosen": Column("on validation")})
