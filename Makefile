@@ -10,7 +10,7 @@ TORCH ?= 2.13.0
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 JOBS ?= 2
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground bench-training bench-ingest bench-simulation
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground bench-training bench-ksnn bench-ingest bench-simulation
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -61,6 +61,9 @@ proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real reco
 
 bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
 	$(BIN)/python benchmarks/training.py
+
+bench-ksnn: $(INSTALLED) ## 64 seeds of a KS-NN trained together against one after another in plain PyTorch
+	$(BIN)/python benchmarks/ksnn.py
 
 bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 columns against a bare pyarrow.csv.read_csv
 	$(BIN)/python benchmarks/ingest.py

@@ -72,7 +72,7 @@ class _Predict(torch.autograd.Function):
         members, _, n_local, width = ctx.jacobian.shape
         gradient = np.empty((members, n_local, width // LANES), ctx.jacobian.dtype)
         weights = upstream[0].contiguous().numpy()
-        over_members(lambda m, end: _weighted_sum(ctx.jacobian[m:end], weights[m:end], gradient[m:end]), members)
+        _weighted_sum(ctx.jacobian, weights, gradient)  # too little to share
         return torch.from_numpy(gradient), None, None, None, None, None, None
 
 
@@ -171,11 +171,11 @@ def _forward(theta, per_width, step, n_hidden, now, neurons, scratch, state):  #
                 neuron = neurons[(2 * side + i) * n_hidden + j]
                 _choose(theta, side, LINEAR + 3 * (i * n_hidden + j), now, neuron, scratch)
                 for lane in range(LANES):
+                    neuron[2 * LANES + lane] = tanh(neuron[lane] * now[ERROR + lane] + scratch[lane])
+                for lane in range(LANES):
                     beyond = now[POSITION + lane] - now[MODEL + lane]
                     phi = beyond if side == 1 else one - beyond
-                    h = tanh(neuron[lane] * now[ERROR + lane] + scratch[lane])
-                    neuron[2 * LANES + lane] = h
-                    value[lane] += phi * neuron[LANES + lane] * h
+                    value[lane] += phi * neuron[LANES + lane] * neuron[2 * LANES + lane]
     for lane in range(LANES):
         forced = now[2 * LANES + lane] * now[SLIP + lane] - now[YAW_RATE + lane] * now[F1 + lane]
         state[lane] = now[lane] * now[V + lane] + forced
@@ -200,7 +200,7 @@ def _choose(theta, side, column, now, neuron, offset):  # type: ignore[no-untype
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
 def _backward(theta, step, n_hidden, now, neurons, scratch, state, jacobian):  # type: ignore[no-untyped-def]
-    """The adjoint of one step; ``state`` holds the derivatives by v and û, ``jacobian`` (P, parameters · lanes) adds up those by parameters."""
+    """Adjoint of one step; ``state`` holds the derivatives by v and û, ``jacobian`` (P, parameters · lanes) adds up those by parameters."""
     n_local = theta.shape[0]
     one, zero = theta.dtype.type(1), theta.dtype.type(0)
     for lane in range(LANES):

@@ -10,17 +10,30 @@ from functools import cache
 import torch
 
 
+PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
+
+
 def over_members(work: Callable[[int, int], None], members: int) -> None:
     """Call ``work(first, end)`` on stretches of the members, side by side on as many threads as torch is allowed.
 
     A worker of the launcher, which is allowed one, stays on its own thread. What is computed does not depend on the number.
     """
     threads = max(min(torch.get_num_threads(), members), 1)
-    bounds = [members * part // threads for part in range(threads + 1)]
-    others = [_pool(threads - 1).submit(work, *bounds[part : part + 2]) for part in range(1, threads)]
-    work(*bounds[:2])
+    if threads == 1:
+        work(0, members)
+        return
+    pieces = min(PIECES * threads, members)
+    left = iter([(members * piece // pieces, members * (piece + 1) // pieces) for piece in range(pieces)])
+
+    def take() -> None:
+        for first, end in left:  # whoever is free takes the next
+            work(first, end)
+
+    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
+    take()
     for other in others:
-        other.result()
+        if not other.cancel():
+            other.result()
 
 
 @cache
