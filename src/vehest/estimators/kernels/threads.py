@@ -9,7 +9,6 @@ from functools import cache
 
 import torch
 
-
 PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
 
 
