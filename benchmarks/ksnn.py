@@ -25,7 +25,7 @@ import numpy as np
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "ksnn.json"
 SAMPLES, VALIDATION_SECONDS, WINDOW, BATCH = 6000, 30.0, 30, 64
-SEEDS, PLAIN_SEEDS, EPOCHS, ROUNDS = 64, 1, 4, 5
+SEEDS, PLAIN_SEEDS, EPOCHS, ROUNDS = 64, 1, 4, 3
 THREADS = 2
 STRUCTURES = {  # settings and the ratio that is asked for
     "no bias, (P, Q) = (2, 0)": ({"n_local": 2, "n_hidden": 0, "bias": False}, 100),
