@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sweep bench-training bench-ingest bench-simulation
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sweep bench-training bench-ingest bench-simulation bench-ksnn
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -67,6 +67,9 @@ sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quick
 
 bench-training: $(INSTALLED) ## compiled recursions and members against the plain ways
 	$(BIN)/python benchmarks/training.py
+
+bench-ksnn: $(INSTALLED) ## 64 seeds of a KS-NN trained together against one after another in plain PyTorch
+	$(BIN)/python benchmarks/ksnn.py
 
 bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 columns against a bare pyarrow.csv.read_csv
 	$(BIN)/python benchmarks/ingest.py

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from vehest.data.windows import windows_of
 from vehest.estimators.gru import Gru
 from vehest.estimators.kernels.activation import rational_tanh
 from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
+from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn, KsnnSettings
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.recurrent import RecurrentSettings
@@ -57,6 +60,56 @@ def test_compiled_recursion_equals_plain_one_in_value_and_gradient(estimator, dt
     scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
     assert (value - plain_value).abs().max() <= tolerance * scale
     assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_threads_do_not_change_a_bit_of_the_ksnn(dtype):
+    value_and_gradient = _problem(Ksnn(KsnnSettings(n_local=3, n_hidden=2, bias=True)), dtype, members=5)
+    alone = value_and_gradient(True)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        together = value_and_gradient(True)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
+
+
+def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
+    before = torch.get_num_threads()
+    try:
+        for threads, members in ((1, 1), (1, 5), (2, 1), (2, 64), (3, 5), (4, 2)):
+            torch.set_num_threads(threads)
+            times, workers = np.zeros(members, int), set()
+
+            def work(first, end, times=times, workers=workers):
+                times[first:end] += 1
+                workers.add(threading.get_ident())
+
+            over_members(work, members)
+            assert (times == 1).all()
+            assert len(workers) <= min(threads, members)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
+    """Yaw rates at centres, between them and beyond the last one; the lanes of a block are in different local models."""
+    estimator = Ksnn(KsnnSettings(n_local=4, n_hidden=2, bias=True))
+    drive = planar_drive()
+    network = estimator.new_network([drive]).double()
+    network.reset(torch.Generator().manual_seed(0))
+    network.yaw_rate_max.fill_(0.3)
+    series = torch.as_tensor(drive.stack(estimator.channels))
+    series[:, 0] = torch.tensor([0.0, 0.1, -0.2, 0.3, 0.05, -0.15, 0.29, 0.5, -0.7])[torch.arange(len(series)) % 9]
+    layout, starts = FlatParameters(network), torch.arange(65).unsqueeze(0)
+    flat = layout.pack([network]).requires_grad_()
+    values, gradients = [], []
+    for compiled in (True, False):
+        values.append(predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled))
+        gradients.append(torch.autograd.grad(values[-1].sum(), flat)[0])
+    assert torch.allclose(*values, rtol=0, atol=1e-12)
+    assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
 
 
 def test_gradient_of_the_ksnn_equals_finite_differences():

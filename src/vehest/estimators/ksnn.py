@@ -150,15 +150,14 @@ class KinematicsStructuredNetwork(nn.Module):
     def _packed(self, parameters: Mapping[str, Tensor]) -> Tensor:
         gamma = parameters["gamma"]
         bias = parameters.get("linear_bias", torch.zeros_like(gamma))
-        pieces = [parameters["linear_weight"].unsqueeze(-1)]
+        if self.settings.n_hidden and self.settings.bias:
+            bias = bias + parameters["output_bias"]
+        pieces = [gamma, parameters["beta"], torch.stack([parameters["linear_weight"], bias], dim=-1).flatten(-2)]
         if self.settings.n_hidden:
-            hidden_weight = parameters["hidden_weight"]
-            hidden_bias = parameters.get("hidden_bias", torch.zeros_like(hidden_weight))
-            bias = bias + parameters["output_bias"] if self.settings.bias else bias
-            pieces += [bias.unsqueeze(-1), hidden_weight, hidden_bias, parameters["output_weight"]]
-        else:
-            pieces.append(bias.unsqueeze(-1))
-        return torch.cat([gamma, parameters["beta"], torch.cat(pieces, dim=-1).flatten(-2)], dim=-1)
+            weight = parameters["hidden_weight"]
+            neurons = [weight, parameters.get("hidden_bias", torch.zeros_like(weight)), parameters["output_weight"]]
+            pieces.append(torch.stack(neurons, dim=-1).flatten(-3))
+        return torch.cat(pieces, dim=-1)
 
 
 class Ksnn(WindowedEstimator):

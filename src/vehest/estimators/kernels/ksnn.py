@@ -1,7 +1,10 @@
 """The KS-NN recursion, compiled: predictions and, in the same pass, their derivatives.
 
-Only the two local models that are active at a sample are evaluated. A row of local model p holds
-[γ₁, γ₂, β₁, β₂, (w₁, b, w₂…, b₂…, w₃…) of f₁, the same of f₂] in the notation of Da Lio et al. 2023, Eqs. 7 and 8.
+Windows lie side by side in lanes, so that loops over them become vector instructions. Of the local models only the active ones count: the
+parameters that enter linearly are blended before they are used, and the neurons are those of each lane's two active models.
+
+A row of local model p holds [γ₁, γ₂, β₁, β₂, w₁, b of f₁, w₁, b of f₂, then (w₂, b₂, w₃) of each neuron of f₁ and of f₂] in the notation of
+Da Lio et al. 2023, Eqs. 7 and 8.
 """
 
 from __future__ import annotations
@@ -14,13 +17,20 @@ import torch
 from torch import Tensor
 
 from vehest.estimators.kernels.activation import tanh
+from vehest.estimators.kernels.threads import over_members
+
+LANES = 64
+LINEAR = 8  # parameters of a local model besides its neurons
+ROWS = LINEAR + 11  # what the adjoint reads of a step: blended parameters, and the rows named below
+YAW_RATE, SPEED, SLIP, ERROR, V, U, THRUST, POSITION, MODEL, F1, F2 = range(LINEAR * LANES, ROWS * LANES, LANES)
+NEURON = 3  # rows of a neuron: w₂ and w₃ of the lane's local model, and its output
 
 
 def predict(theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_hidden: int, n_window: int) -> Tensor:
     """Lateral velocity one step after each window, differentiable in ``theta``.
 
     Args:
-        theta: parameters, (M, P, 4 + 2 (2 + 3 Q)).
+        theta: parameters, (M, P, 8 + 6 Q).
         series: measurements yaw_rate, vx, ay, ax, (T, 4).
         starts: first row of each window, (M, B).
         yaw_rate_max: centre of the last local model [rad/s].
@@ -40,112 +50,202 @@ class _Predict(torch.autograd.Function):
     def forward(
         ctx: Any, theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_hidden: int, n_window: int
     ) -> Tensor:
-        wanted = ctx.needs_input_grad[0]
-        members, batch = starts.shape
-        values = torch.empty(members, batch, dtype=theta.dtype)
-        jacobian = torch.zeros(members, batch if wanted else 0, *theta.shape[1:], dtype=theta.dtype)
-        scalar = np.dtype(str(theta.dtype).removeprefix("torch.")).type
-        _recursion(
-            theta.detach().contiguous().numpy(),
-            series.contiguous().numpy(),
-            starts.contiguous().numpy(),
-            scalar(yaw_rate_max),
-            scalar(step),
-            n_hidden,
-            n_window,
-            values.numpy(),
-            jacobian.numpy(),
-        )
-        ctx.save_for_backward(jacobian)
-        return values
+        rows, measured, first = theta.detach().contiguous().numpy(), series.contiguous().numpy(), starts.contiguous().numpy()
+        members, batch = first.shape
+        blocks = -(-batch // LANES)
+        wanted = bool(ctx.needs_input_grad[0])
+        values = np.empty((members, blocks * LANES), rows.dtype)
+        jacobian = np.empty((members, blocks if wanted else 0, rows.shape[1], rows.shape[2] * LANES), rows.dtype)
+        scalar = rows.dtype.type
+
+        def work(m: int, end: int) -> None:
+            _recursion(
+                rows[m:end], measured, first[m:end], scalar(yaw_rate_max), scalar(step), n_hidden, n_window, values[m:end], jacobian[m:end]
+            )
+
+        over_members(work, members)
+        ctx.jacobian = jacobian
+        return torch.from_numpy(values[:, :batch])
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (jacobian,) = ctx.saved_tensors
-        members, batch = upstream[0].shape
-        gradient = torch.bmm(upstream[0].unsqueeze(1), jacobian.view(members, batch, -1))
-        return gradient.view(members, *jacobian.shape[2:]), None, None, None, None, None, None
+        members, _, n_local, width = ctx.jacobian.shape
+        gradient = np.empty((members, n_local, width // LANES), ctx.jacobian.dtype)
+        weights = upstream[0].contiguous().numpy()
+        _weighted_sum(ctx.jacobian, weights, gradient)  # too little to share
+        return torch.from_numpy(gradient), None, None, None, None, None, None
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _recursion(theta, series, starts, yaw_rate_max, step, n_hidden, n_window, values, jacobian):  # type: ignore[no-untyped-def]
-    members, batch = starts.shape
-    n_local = theta.shape[1]
-    dtype = theta.dtype
-    one, zero = dtype.type(1), dtype.type(0)
-    wanted = jacobian.shape[1] > 0
-    last = dtype.type(n_local - 1)
-    per_width = last / yaw_rate_max
-    block = 2 + 3 * n_hidden
-    v_at, u_at = np.empty(n_window, dtype), np.empty(n_window, dtype)
-    hidden = np.empty((n_window, 2, 2, max(n_hidden, 1)), dtype)  # step, active model, feedback function, neuron
-    adjoint = np.empty(2, dtype)
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _weighted_sum(jacobian, weights, gradient):  # type: ignore[no-untyped-def]
+    members, blocks, n_local, width = jacobian.shape
+    row = np.empty(LANES, weights.dtype)
     for m in range(members):
-        for b in range(batch):
-            first = starts[m, b]
-            v, u = zero, series[first, 1]
+        gradient[m] = 0
+        for block in range(blocks):
+            used = min(LANES, weights.shape[1] - block * LANES)
+            row[:] = 0  # lanes without a window count for nothing
+            row[:used] = weights[m, block * LANES : block * LANES + used]
+            for p in range(n_local):
+                for c in range(width // LANES):
+                    derivative = jacobian[m, block, p, c * LANES : (c + 1) * LANES]
+                    total = row[0] * 0
+                    for lane in range(LANES):
+                        total += row[lane] * derivative[lane]
+                    gradient[m, p, c] += total
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _recursion(theta, series, starts, yaw_rate_max, step, n_hidden, n_window, values, jacobian):  # type: ignore[no-untyped-def]
+    members, n_local = theta.shape[:2]
+    dtype = theta.dtype
+    wanted = jacobian.shape[1] > 0
+    per_width = dtype.type(n_local - 1) / yaw_rate_max
+    kept = n_window if wanted else 1  # steps to remember
+    steps = np.empty((kept, ROWS * LANES), dtype)
+    neurons = np.empty((kept, 4 * n_hidden, NEURON * LANES), dtype)  # active model, feedback function, neuron
+    first = np.empty(LANES, np.int64)
+    state, scratch = np.empty(2 * LANES, dtype), np.empty(LINEAR * LANES, dtype)
+    for m in range(members):
+        for block in range(values.shape[1] // LANES):
+            for lane in range(LANES):  # lanes without a window repeat the last one
+                first[lane] = starts[m, min(block * LANES + lane, starts.shape[1] - 1)]
+                state[lane], state[LANES + lane] = 0, series[first[lane], 1]
             for k in range(n_window):
-                omega, speed, ay, ax = series[first + k, 0], series[first + k, 1], series[first + k, 2], series[first + k, 3]
-                v_at[k], u_at[k] = v, u
-                p, weight_next = _active(omega, per_width, last)
-                error = u - speed
-                slip = step * (ay - speed * omega)
-                thrust = step * (ax + v * omega)
-                v_next, u_next = zero, zero
-                for side in range(min(2, n_local)):
-                    phi = weight_next if side == 1 else one - weight_next
-                    row = theta[m, p + side]
-                    f1, f2 = row[4] * error + row[5], row[4 + block] * error + row[5 + block]
-                    for j in range(n_hidden):
-                        h1 = tanh(row[6 + j] * error + row[6 + n_hidden + j])
-                        h2 = tanh(row[6 + block + j] * error + row[6 + block + n_hidden + j])
-                        hidden[k, side, 0, j], hidden[k, side, 1, j] = h1, h2
-                        f1 += row[6 + 2 * n_hidden + j] * h1
-                        f2 += row[6 + block + 2 * n_hidden + j] * h2
-                    v_next += phi * (row[0] * v + row[2] * slip - omega * f1)
-                    u_next += phi * (row[1] * u + row[3] * thrust - f2)
-                v, u = v_next, u_next
-            values[m, b] = v
-            if not wanted:
-                continue
-            to_v, to_u = one, zero  # derivatives of the prediction by the states after step k
-            for k in range(n_window - 1, -1, -1):
-                omega, speed, ay, ax = series[first + k, 0], series[first + k, 1], series[first + k, 2], series[first + k, 3]
-                v, u = v_at[k], u_at[k]
-                p, weight_next = _active(omega, per_width, last)
-                error = u - speed
-                slip = step * (ay - speed * omega)
-                thrust = step * (ax + v * omega)
-                new_v, new_u = zero, zero
-                for side in range(min(2, n_local)):
-                    phi = weight_next if side == 1 else one - weight_next
-                    row, slot = theta[m, p + side], jacobian[m, b, p + side]
-                    local_v, local_u = phi * to_v, phi * to_u
-                    slot[0] += local_v * v
-                    slot[1] += local_u * u
-                    slot[2] += local_v * slip
-                    slot[3] += local_u * thrust
-                    new_v += row[0] * local_v + row[3] * step * omega * local_u
-                    new_u += row[1] * local_u
-                    adjoint[0], adjoint[1] = -omega * local_v, -local_u
-                    for i in range(2):
-                        base, a = 4 + i * block, adjoint[i]
-                        slot[base] += a * error
-                        slot[base + 1] += a
-                        new_u += a * row[base]
-                        for j in range(n_hidden):
-                            h = hidden[k, side, i, j]
-                            inner = a * row[base + 2 + 2 * n_hidden + j] * (one - h * h)
-                            slot[base + 2 + j] += inner * error
-                            slot[base + 2 + n_hidden + j] += inner
-                            slot[base + 2 + 2 * n_hidden + j] += a * h
-                            new_u += inner * row[base + 2 + j]
-                to_v, to_u = new_v, new_u
+                at = k if wanted else 0
+                _gather(series, first, k, steps[at], step)
+                _forward(theta[m], per_width, step, n_hidden, steps[at], neurons[at], scratch, state)
+            values[m, block * LANES : (block + 1) * LANES] = state[:LANES]
+            if wanted:
+                jacobian[m, block] = 0
+                state[:LANES], state[LANES:] = 1, 0  # derivatives of the prediction by v and û after the last step
+                for k in range(n_window - 1, -1, -1):
+                    _backward(theta[m], step, n_hidden, steps[k], neurons[k], scratch, state, jacobian[m, block])
 
 
-@numba.njit(inline="always")
-def _active(omega, per_width, last):  # type: ignore[no-untyped-def]
-    """First of the two active local models and the weight of the second; beyond the last centre the last one alone."""
-    position = min(abs(omega) * per_width, last)
-    p = max(min(int(position), int(last) - 1), 0)
-    return p, position - type(last)(p)
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _gather(series, first, k, now, step):  # type: ignore[no-untyped-def]
+    for lane in range(LANES):
+        t = first[lane] + k
+        omega, speed = series[t, 0], series[t, 1]
+        now[YAW_RATE + lane], now[SPEED + lane] = omega, speed
+        now[SLIP + lane] = step * (series[t, 2] - speed * omega)
+        now[THRUST + lane] = step * series[t, 3]
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _forward(theta, per_width, step, n_hidden, now, neurons, scratch, state):  # type: ignore[no-untyped-def]
+    """One step of all lanes; ``state`` holds v and û."""
+    n_local = theta.shape[0]
+    one, zero = theta.dtype.type(1), theta.dtype.type(0)
+    last, last_pair = theta.dtype.type(n_local - 1), theta.dtype.type(max(n_local - 2, 0))
+    for lane in range(LANES):
+        position = min(abs(now[YAW_RATE + lane]) * per_width, last)
+        now[POSITION + lane] = position
+        now[MODEL + lane] = min(np.floor(position), last_pair)
+        v, u = state[lane], state[LANES + lane]
+        now[V + lane], now[U + lane] = v, u
+        now[ERROR + lane] = u - now[SPEED + lane]
+        now[THRUST + lane] += step * v * now[YAW_RATE + lane]
+    now[: LINEAR * LANES] = zero
+    for q in range(n_local):
+        row, centre = theta[q], theta.dtype.type(q)
+        for lane in range(LANES):
+            phi = max(one - abs(now[POSITION + lane] - centre), zero)
+            now[lane] += phi * row[0]
+            now[LANES + lane] += phi * row[1]
+            now[2 * LANES + lane] += phi * row[2]
+            now[3 * LANES + lane] += phi * row[3]
+            now[4 * LANES + lane] += phi * row[4]
+            now[5 * LANES + lane] += phi * row[5]
+            now[6 * LANES + lane] += phi * row[6]
+            now[7 * LANES + lane] += phi * row[7]
+    for lane in range(LANES):
+        error = now[ERROR + lane]
+        now[F1 + lane] = now[4 * LANES + lane] * error + now[5 * LANES + lane]
+        now[F2 + lane] = now[6 * LANES + lane] * error + now[7 * LANES + lane]
+    for side in range(min(2, n_local) if n_hidden else 0):
+        for i in range(2):
+            value = now[F1 + i * LANES : F1 + (i + 1) * LANES]
+            for j in range(n_hidden):
+                neuron = neurons[(2 * side + i) * n_hidden + j]
+                _choose(theta, side, LINEAR + 3 * (i * n_hidden + j), now, neuron, scratch)
+                for lane in range(LANES):
+                    neuron[2 * LANES + lane] = tanh(neuron[lane] * now[ERROR + lane] + scratch[lane])
+                for lane in range(LANES):
+                    beyond = now[POSITION + lane] - now[MODEL + lane]
+                    phi = beyond if side == 1 else one - beyond
+                    value[lane] += phi * neuron[LANES + lane] * neuron[2 * LANES + lane]
+    for lane in range(LANES):
+        forced = now[2 * LANES + lane] * now[SLIP + lane] - now[YAW_RATE + lane] * now[F1 + lane]
+        state[lane] = now[lane] * now[V + lane] + forced
+        state[LANES + lane] = now[LANES + lane] * now[U + lane] + now[3 * LANES + lane] * now[THRUST + lane] - now[F2 + lane]
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _choose(theta, side, column, now, neuron, offset):  # type: ignore[no-untyped-def]
+    """w₂, b₂, w₃ of one neuron of the lanes' first (side 0) or second (side 1) active model."""
+    w2, b2, w3 = theta[side, column], theta[side, column + 1], theta[side, column + 2]
+    for lane in range(LANES):
+        neuron[lane], offset[lane], neuron[LANES + lane] = w2, b2, w3
+    for p in range(1, theta.shape[0] - 1):
+        w2, b2, w3 = theta[p + side, column], theta[p + side, column + 1], theta[p + side, column + 2]
+        model = theta.dtype.type(p)
+        for lane in range(LANES):
+            here = now[MODEL + lane] == model
+            neuron[lane] = w2 if here else neuron[lane]
+            offset[lane] = b2 if here else offset[lane]
+            neuron[LANES + lane] = w3 if here else neuron[LANES + lane]
+
+
+@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+def _backward(theta, step, n_hidden, now, neurons, scratch, state, jacobian):  # type: ignore[no-untyped-def]
+    """Adjoint of one step; ``state`` holds the derivatives by v and û, ``jacobian`` (P, parameters · lanes) adds up those by parameters."""
+    n_local = theta.shape[0]
+    one, zero = theta.dtype.type(1), theta.dtype.type(0)
+    for lane in range(LANES):
+        to_v, to_u = state[lane], state[LANES + lane]
+        omega, error = now[YAW_RATE + lane], now[ERROR + lane]
+        to_f1, to_f2 = -omega * to_v, -to_u
+        scratch[lane] = to_v * now[V + lane]
+        scratch[LANES + lane] = to_u * now[U + lane]
+        scratch[2 * LANES + lane] = to_v * now[SLIP + lane]
+        scratch[3 * LANES + lane] = to_u * now[THRUST + lane]
+        scratch[4 * LANES + lane] = to_f1 * error
+        scratch[5 * LANES + lane] = to_f1
+        scratch[6 * LANES + lane] = to_f2 * error
+        scratch[7 * LANES + lane] = to_f2
+        state[lane] = now[lane] * to_v + now[3 * LANES + lane] * step * omega * to_u
+        state[LANES + lane] = now[LANES + lane] * to_u + now[4 * LANES + lane] * to_f1 + now[6 * LANES + lane] * to_f2
+    for q in range(n_local):
+        slot, centre = jacobian[q], theta.dtype.type(q)
+        for lane in range(LANES):
+            phi = max(one - abs(now[POSITION + lane] - centre), zero)
+            slot[lane] += phi * scratch[lane]
+            slot[LANES + lane] += phi * scratch[LANES + lane]
+            slot[2 * LANES + lane] += phi * scratch[2 * LANES + lane]
+            slot[3 * LANES + lane] += phi * scratch[3 * LANES + lane]
+            slot[4 * LANES + lane] += phi * scratch[4 * LANES + lane]
+            slot[5 * LANES + lane] += phi * scratch[5 * LANES + lane]
+            slot[6 * LANES + lane] += phi * scratch[6 * LANES + lane]
+            slot[7 * LANES + lane] += phi * scratch[7 * LANES + lane]
+    for side in range(min(2, n_local) if n_hidden else 0):
+        for i in range(2):
+            to_f = scratch[(5 + 2 * i) * LANES : (6 + 2 * i) * LANES]
+            for j in range(n_hidden):
+                neuron = neurons[(2 * side + i) * n_hidden + j]
+                for lane in range(LANES):
+                    beyond = now[POSITION + lane] - now[MODEL + lane]
+                    a = to_f[lane] * (beyond if side == 1 else one - beyond)
+                    h = neuron[2 * LANES + lane]
+                    inner = a * neuron[LANES + lane] * (one - h * h)
+                    state[LANES + lane] += inner * neuron[lane]
+                    scratch[lane], scratch[LANES + lane] = inner, a * h
+                column = (LINEAR + 3 * (i * n_hidden + j)) * LANES
+                for p in range(max(n_local - 1, 1)):
+                    slot, model = jacobian[p + side, column : column + 3 * LANES], theta.dtype.type(p)
+                    for lane in range(LANES):
+                        here = one if now[MODEL + lane] == model else zero
+                        slot[lane] += here * scratch[lane] * now[ERROR + lane]
+                        slot[LANES + lane] += here * scratch[lane]
+                        slot[2 * LANES + lane] += here * scratch[LANES + lane]

@@ -1,0 +1,172 @@
+"""Training speed of many seeds: 64 of one KS-NN trained together against one after another by a plain PyTorch loop, in the same run.
+
+Writes results/benchmarks/ksnn.json. Both ways train on the same random numbers in the shape of five minutes at 20 Hz (the time does not
+depend on values), in float32, batches of 64 windows, with the validation loss after every epoch. The plain loop is the readable module with
+autograd and Adam, one network at a time; it is timed on one epoch of one seed, and 64 seeds take 64 times as long. Both ways are allowed
+two threads, the seeds together are timed from the end of the first epoch, each way runs in a process of its own, after a warm-up, and the
+ways take turns; a figure is the best of the rounds, for both alike, memory the peak of the process so far. The first epoch's validation
+losses are compared.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import resource
+import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "ksnn.json"
+SAMPLES, VALIDATION_SECONDS, WINDOW, BATCH = 6000, 30.0, 30, 64
+SEEDS, PLAIN_SEEDS, EPOCHS, ROUNDS = 64, 1, 4, 3
+THREADS = 2
+STRUCTURES = {  # settings and the ratio that is asked for
+    "no bias, (P, Q) = (2, 0)": ({"n_local": 2, "n_hidden": 0, "bias": False}, 100),
+    "bias, (P, Q) = (2, 0)": ({"n_local": 2, "n_hidden": 0, "bias": True}, 100),
+    "no bias, (P, Q) = (3, 2)": ({"n_local": 3, "n_hidden": 2, "bias": False}, 30),
+    "bias, (P, Q) = (3, 2)": ({"n_local": 3, "n_hidden": 2, "bias": True}, 30),
+}
+Figures = tuple[float, float, list[float]]
+
+
+def drives() -> tuple[Any, Any]:
+    """What is learnt from and what is validated on."""
+    from vehest.data.recording import Recording
+
+    generator = np.random.default_rng(0)
+    scales = {"yaw_rate": 0.2, "vx": 1.0, "ay": 3.0, "ax": 1.0, "vy_ref": 0.5}
+    channels = {name: scale * generator.standard_normal(SAMPLES) + 25.0 * (name == "vx") for name, scale in scales.items()}
+    drive = Recording("random", "none", 20.0, 0.0, channels, "simulated")
+    return drive, drive.cut(0.0, VALIDATION_SECONDS)
+
+
+def together(config: dict[str, Any]) -> Figures:
+    """Training steps · seeds a second of all seeds together, peak memory [MB], first validation losses."""
+    import torch
+
+    from vehest.estimators.base import FitData
+    from vehest.estimators.ksnn import Ksnn
+    from vehest.training.context import FitContext
+    from vehest.training.settings import SupervisedSettings
+
+    torch.set_num_threads(THREADS)
+    train, validation = drives()
+
+    def fit(epochs: int) -> tuple[float, list[float]]:
+        members = [Ksnn.from_config(config) for _ in range(SEEDS)]
+        for seed, member in enumerate(members):
+            member.seed(seed)
+        ends: list[float] = []
+        settings = SupervisedSettings(max_epochs=epochs, patience=epochs, batch_size=BATCH)
+        context = FitContext(on_progress=lambda progress: ends.append(time.perf_counter()))
+        records = Ksnn.fit_members(members, FitData([train], [validation]), settings, context)
+        return ends[-1] - ends[0], [float(record.history["validation_loss"][0]) for record in records]
+
+    seconds, losses = fit(EPOCHS + 1)  # from the end of the first epoch to that of the last
+    return EPOCHS * SEEDS * _steps() / seconds, _peak(), losses
+
+
+def plain(config: dict[str, Any]) -> Figures:
+    """The same for a few seeds one after another."""
+    import torch
+
+    torch.set_num_threads(THREADS)
+    plain_epoch(config, 0, batches=10)
+    started = time.perf_counter()
+    losses = [plain_epoch(config, seed) for seed in range(PLAIN_SEEDS)]
+    return PLAIN_SEEDS * _steps() / (time.perf_counter() - started), _peak(), losses
+
+
+def plain_epoch(config: dict[str, Any], seed: int, batches: int | None = None) -> float:
+    """Train one network for an epoch as one would write it down; its validation loss [m²/s²]."""
+    import torch
+
+    from vehest.data.windows import windows_of
+    from vehest.estimators.ksnn import Ksnn
+    from vehest.training.supervised import _shuffle_seed
+
+    estimator = Ksnn.from_config(config)
+    train, validation = drives()
+    network = estimator.new_network([train])
+    network.reset(torch.Generator().manual_seed(seed))
+    optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
+    learnt, held_out = (windows_of([part], estimator.channels, "vy_ref", WINDOW) for part in (train, validation))
+    series, targets, starts = (torch.as_tensor(values) for values in (learnt.series, learnt.targets, learnt.starts))
+    series, targets, rows = series.float(), targets.float(), torch.arange(WINDOW)
+    order = torch.randperm(len(starts), generator=torch.Generator().manual_seed(_shuffle_seed(seed)))
+    for batch in order.split(BATCH)[:batches]:
+        optimiser.zero_grad()
+        loss = (network(series[starts[batch].unsqueeze(-1) + rows]) - targets[batch]).square().mean()
+        loss.backward()
+        optimiser.step()
+        with torch.no_grad():
+            network.constrain(dict(network.named_parameters()))
+    with torch.no_grad():
+        windows = torch.as_tensor(held_out.series).float()[torch.as_tensor(held_out.starts).unsqueeze(-1) + rows]
+        return float((network(windows).double() - torch.as_tensor(held_out.targets)).square().mean())
+
+
+def _steps() -> int:
+    """Training steps of one seed in an epoch."""
+    return -(-(SAMPLES - WINDOW) // BATCH)
+
+
+def _peak() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def measured(config: dict[str, Any], pools: list[ProcessPoolExecutor]) -> list[Figures]:
+    """Best rounds of the plain loop and of all seeds together."""
+    rounds = [[pool.submit(way, config).result() for pool, way in zip(pools, (plain, together), strict=True)] for _ in range(ROUNDS)]
+    ways = zip(*rounds, strict=True)
+    return [(max(run[0] for run in way), max(run[1] for run in way), way[0][2]) for way in ways]
+
+
+def main() -> None:
+    """Measure, write, print the ratios."""
+    from vehest.stages.artefacts import library_versions
+
+    with ExitStack() as stack:
+        pools = [stack.enter_context(ProcessPoolExecutor(1, mp_context=get_context("spawn"))) for _ in range(2)]
+        figures = {structure: measured(config, pools) for structure, (config, _) in STRUCTURES.items()}
+    cases = []
+    for structure, (baseline, ours) in figures.items():
+        least = STRUCTURES[structure][1]
+        difference = max(abs(one - other) / other for one, other in zip(ours[2], baseline[2], strict=False))
+        assert difference < 1e-4, f"the two ways learn different things: {difference}"
+        steps = SEEDS * _steps()
+        cases.append(
+            {
+                "case": f"ksnn {structure}: one epoch of {SEEDS} seeds, plain PyTorch one after another against together",
+                "baseline_seconds": round(steps / baseline[0], 4),
+                "ours_seconds": round(steps / ours[0], 4),
+                "ratio": round(ours[0] / baseline[0], 2),
+                "least_ratio": least,
+                "baseline_steps_per_second": round(baseline[0], 1),
+                "ours_steps_per_second": round(ours[0], 1),
+                "baseline_mb": round(baseline[1], 1),
+                "ours_mb": round(ours[1], 1),
+                "relative_difference_of_losses": float(f"{difference:.1e}"),
+            }
+        )
+        entry = cases[-1]
+        print(
+            f"{entry['ratio']:6.1f} x (at least {least})  {entry['case']}  "
+            f"({baseline[0]:.0f} -> {ours[0]:.0f} steps a second, {ours[1]:.0f} MB, losses differ by {difference:.1e})",
+            flush=True,
+        )
+    machine = {"processor": platform.processor() or platform.machine(), "system": platform.system(), "cores_used": THREADS}
+    machine["cores"] = os.cpu_count() or 1
+    RESULT.parent.mkdir(parents=True, exist_ok=True)
+    RESULT.write_text(json.dumps({"cases": cases, "versions": library_versions(), "machine": machine}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""Members on several threads: compiled loops that let go of Python's lock, each thread on its own members."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import torch
+
+PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
+
+
+def over_members(work: Callable[[int, int], None], members: int) -> None:
+    """Call ``work(first, end)`` on stretches of the members, side by side on as many threads as torch is allowed.
+
+    A worker of the launcher, which is allowed one, stays on its own thread. What is computed does not depend on the number.
+    """
+    threads = max(min(torch.get_num_threads(), members), 1)
+    if threads == 1:
+        work(0, members)
+        return
+    pieces = min(PIECES * threads, members)
+    left = iter([(members * piece // pieces, members * (piece + 1) // pieces) for piece in range(pieces)])
+
+    def take() -> None:
+        for first, end in left:  # whoever is free takes the next
+            work(first, end)
+
+    others = [_pool(threads - 1).submit(take) for _ in range(threads - 1)]
+    take()
+    for other in others:
+        if not other.cancel():
+            other.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="vehest-members")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process does not inherit the threads
