@@ -65,6 +65,20 @@ DATASET = {
 }
 
 
+def run_vehest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command."""
+    former, code = sys.argv, 0
+    sys.argv = ["vehest", *arguments]
+    try:
+        main()
+    except SystemExit as leave:
+        code = int(leave.code or 0)
+    finally:
+        sys.argv = former
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
 class Place:
     """A working folder with data, configuration and a pipeline of its own."""
 
@@ -88,16 +102,7 @@ class Place:
 
     def __call__(self, *arguments: str) -> tuple[int, str, str]:
         """Exit code, standard output and standard error of a command."""
-        former, code = sys.argv, 0
-        sys.argv = ["vehest", *arguments]
-        try:
-            main()
-        except SystemExit as leave:
-            code = int(leave.code or 0)
-        finally:
-            sys.argv = former
-        out, err = self._capsys.readouterr()
-        return code, out, err
+        return run_vehest(self._capsys, *arguments)
 
     def refused(self, *arguments: str) -> tuple[int, str]:
         """Exit code and the one line of a command that must fail and leave nothing behind."""

@@ -23,7 +23,7 @@ import pooch
 import pytest
 import yaml
 
-from vehest.cli import main
+from place import run_vehest
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.store import read_recording
 from vehest.sources.base import open_source
@@ -661,16 +661,7 @@ class Place:
             (self.folder / "conf" / "dataset" / f"{name}.yaml").write_text(text)
 
     def __call__(self, *arguments: str) -> tuple[int, str, str]:
-        former, code = sys.argv, 0
-        sys.argv = ["vehest", *arguments]
-        try:
-            main()
-        except SystemExit as leave:
-            code = int(leave.code or 0)
-        finally:
-            sys.argv = former
-        out, err = self._capsys.readouterr()
-        return code, out, err
+        return run_vehest(self._capsys, *arguments)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from vehest.simulation.cones import DoubleLaneChange, Slalom
 from vehest.simulation.laps import FastLap, Laps, SpeedLaps
 from vehest.simulation.manoeuvre import Manoeuvre
 from vehest.simulation.open_loop import RandomSteer, Spiral, StepSteer
-from vehest.simulation.surface import is_number
+from vehest.simulation.parameters import is_number
 
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
     made.name: made

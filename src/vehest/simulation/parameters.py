@@ -168,8 +168,13 @@ def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, 
         setattr(parameters, name, float(value))
 
 
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def _require_number(where: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if not is_number(value):
         raise ConfigurationError(f"{where} must be a finite number, not {value!r}")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.data.errors import ConfigurationError
+from vehest.simulation.parameters import is_number
 
 FloatArray = NDArray[np.float64]
 
@@ -115,8 +116,3 @@ def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surfac
             raise ConfigurationError(f"surface '{name}': patch_length is a pair [shortest, longest] in metres, not {length!r}")
         values["patch_length"] = (float(length[0]), float(length[1]))
     return Surface(**values)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

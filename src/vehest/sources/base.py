@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import vehest.sources as package
-from vehest.data.errors import ConfigurationError, MissingError
-from vehest.data.recording import Recording
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Kind, Recording
 from vehest.data.splits import check_name
 
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
@@ -22,9 +22,9 @@ SIMULATED = "simulated"
 """Name of the source whose recordings never are real, whatever a configuration says."""
 
 
-def kind_of(dataset: Mapping[str, Any]) -> str:
+def kind_of(dataset: Mapping[str, Any]) -> Kind:
     """Whether a data set's recordings are ``real`` or ``simulated``."""
-    return "simulated" if dataset.get("source") == SIMULATED else str(dataset.get("kind") or "real")
+    return "simulated" if SIMULATED in (dataset.get("source"), dataset.get("kind")) else "real"
 
 
 class Source(ABC):
@@ -58,6 +58,11 @@ class Source(ABC):
         accept = dataset.get("accept") or []
         if isinstance(accept, str) or not isinstance(accept, Sequence):
             raise ConfigurationError(f"data set '{self.name}': accept is a list of checks, such as [impossible], not {accept!r}")
+
+    @property
+    def kind(self) -> Kind:
+        """``real`` or ``simulated``."""
+        return kind_of(self.dataset)
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
@@ -132,6 +137,29 @@ def existing_folder(path: Any, dataset: str) -> Path:
     if not folder.is_dir():
         raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
     return folder
+
+
+def matching_files(dataset: Mapping[str, Any], default: str) -> list[Path]:
+    """Files in a data set's ``path`` that match its ``files``, in alphabetical order; their stems are recordings' names.
+
+    Args:
+        dataset: its configuration.
+        default: pattern if it names none.
+
+    Raises:
+        MissingError: there is no folder, or no file matches.
+        DataError: two files have the same stem.
+    """
+    name = str(dataset.get("name", "unnamed"))
+    folder, pattern = existing_folder(dataset.get("path"), name), str(dataset.get("files", default))
+    files = sorted(file for file in folder.glob(pattern) if file.is_file())
+    if not files:
+        raise MissingError(f"data set '{name}': no file in '{folder}' matches '{pattern}'")
+    stems = [file.stem for file in files]
+    doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if doubled:
+        raise DataError(f"data set '{name}': two files are called '{doubled[0]}', a recording's name must be unique")
+    return files
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:

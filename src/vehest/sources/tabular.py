@@ -18,7 +18,7 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
 from vehest.data.store import is_stored_recording, read_recording
-from vehest.sources.base import Source, existing_folder, require_files
+from vehest.sources.base import Source, matching_files, require_files
 from vehest.sources.columns import Clock, Column, columns_from_config, identity_columns, time_column_from_config, uniform_clock
 
 
@@ -62,7 +62,7 @@ class TabularSource(Source):
 
     def inputs(self) -> dict[str, str | Path]:
         """The tables."""
-        return {file.name: file for file in self._files()}
+        return {file.name: file for file in matching_files(self.dataset, "*.csv")}
 
     def read(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
@@ -131,7 +131,7 @@ class TabularSource(Source):
                 rate_hz=clock.rate_hz,
                 start_time=clock.start_time,
                 channels=channels,
-                kind=self.dataset.get("kind", "real"),
+                kind=self.kind,
                 gappy=self.gappy,
                 provenance={"dataset": self.name, "source": "tabular", "file": file.name} | ({} if run is None else {"run": run}),
             )
@@ -149,9 +149,9 @@ class TabularSource(Source):
     def _found(self) -> dict[str, tuple[Path, int | None]]:
         """Names of the recordings: where each stands."""
         if self.runs is None:
-            return {_name_of(file, None): (file, None) for file in self._files()}
-        require_files(self._files(), self.name)
-        return {_name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
+            return {_name_of(file, None): (file, None) for file in matching_files(self.dataset, "*.csv")}
+        require_files(matching_files(self.dataset, "*.csv"), self.name)
+        return {_name_of(file, run): (file, run) for file in matching_files(self.dataset, "*.csv") for run in self._runs_of(file)}
 
     def _runs_of(self, file: Path) -> dict[int, slice]:
         """Number of each run in a table: its rows."""
@@ -180,18 +180,6 @@ class TabularSource(Source):
                 raise DataError(f"'{file}': run {run} begins again in data row {start + 1}; a run is uninterrupted, sort the rows")
             runs[run] = slice(start, stop)
         return runs
-
-    def _files(self) -> list[Path]:
-        folder = existing_folder(self.dataset.get("path"), self.name)
-        pattern = str(self.dataset.get("files", "*.csv"))
-        files = sorted(file for file in folder.glob(pattern) if file.is_file())
-        if not files:
-            raise MissingError(f"data set '{self.name}': no file in '{folder}' matches '{pattern}'")
-        stems = [file.stem for file in files]
-        doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
-        if doubled:
-            raise DataError(f"data set '{self.name}': two files are called '{doubled[0]}', a recording's name must be unique")
-        return files
 
 
 def _require_options(dataset: Mapping[str, Any], name: str) -> None:

@@ -17,7 +17,7 @@ from vehest.data.channels import channel
 from vehest.data.checks import checks_of_clock
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import FloatArray, Recording
-from vehest.sources.base import Source, existing_folder, require_files
+from vehest.sources.base import Source, matching_files, require_files
 from vehest.sources.columns import Column, columns_from_config, uniform_clock
 from vehest.sources.mdf.files import Signal, Wanted, read_measurement
 from vehest.sources.unit_spellings import require_unit
@@ -90,11 +90,11 @@ class MdfSource(Source):
 
     def ids(self) -> list[str]:
         """Stems of the files, in alphabetical order."""
-        return [file.stem for file in self._files()]
+        return [file.stem for file in matching_files(self.dataset, "*.mf4")]
 
     def inputs(self) -> dict[str, str | Path]:
         """The measurements."""
-        return {file.name: file for file in self._files()}
+        return {file.name: file for file in matching_files(self.dataset, "*.mf4")}
 
     def read(self, recording_id: str) -> Recording:
         """Read one measurement by its stem.
@@ -103,7 +103,7 @@ class MdfSource(Source):
             MissingError: there is none of that name, or asammdf is not installed.
             DataError: it is damaged, lacks a signal, or its signals cannot be brought to one clock.
         """
-        for file in self._files():
+        for file in matching_files(self.dataset, "*.mf4"):
             if file.stem == recording_id:
                 return self._read_file(file)
         raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {', '.join(self.ids())})")
@@ -125,7 +125,7 @@ class MdfSource(Source):
                 rate_hz=grid.rate_hz,
                 start_time=float(grid.times[0]),
                 channels=channels,
-                kind=self.dataset.get("kind", "real"),
+                kind=self.kind,
                 gappy=self.gappy,
                 provenance={
                     "dataset": self.name,
@@ -202,18 +202,6 @@ class MdfSource(Source):
             if name not in self.channels:
                 raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")
         return frozenset(names)
-
-    def _files(self) -> list[Path]:
-        folder = existing_folder(self.dataset.get("path"), self.name)
-        pattern = str(self.dataset.get("files", "*.mf4"))
-        files = sorted(file for file in folder.glob(pattern) if file.is_file())
-        if not files:
-            raise MissingError(f"{self.where}: no file in '{folder}' matches '{pattern}'")
-        stems = [file.stem for file in files]
-        doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
-        if doubled:
-            raise DataError(f"{self.where}: two files are called '{doubled[0]}', a recording's name must be unique")
-        return files
 
 
 def _channels_from_config(entries: Any, dataset: str) -> dict[str, MdfChannel]:

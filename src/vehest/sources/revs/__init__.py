@@ -104,7 +104,7 @@ class RevsSource(Source):
                 rate_hz=rate_hz,
                 start_time=start_time,
                 channels=channels,
-                kind=self.dataset.get("kind", "real"),
+                kind=self.kind,
                 gappy=self.gappy,
                 provenance=provenance,
             )

@@ -91,7 +91,7 @@ class RosbagSource(Source):
                 rate_hz=self.rate_hz,
                 start_time=float(grid[0]),
                 channels=channels,
-                kind=self.dataset.get("kind", "real"),
+                kind=self.kind,
                 provenance=self._provenance(path, bag, series),
             )
         except DataError as error:
