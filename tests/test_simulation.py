@@ -82,7 +82,14 @@ def recording() -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("name", "shortest", "longest"), [("handling", 2380, 2420), ("vairano_like", 2480, 2520), ("palm_beach_like", 3250, 3300)]
+    ("name", "shortest", "longest"),
+    [
+        ("handling", 2380, 2420),
+        ("vairano_like", 2480, 2520),
+        ("palm_beach_like", 3250, 3300),
+        ("fast_circuit", 3780, 3820),
+        ("hill_circuit", 3660, 3700),
+    ],
 )
 def test_courses_are_closed_and_as_long_as_stated(name: str, shortest: float, longest: float) -> None:
     course = course_by_name(name)
@@ -103,7 +110,7 @@ def test_courses_do_not_come_near_themselves(name: str) -> None:
     assert np.minimum(apart, len(places) - apart).max() < 60  # samples, a metre each: neighbours along the road only
 
 
-@pytest.mark.parametrize(("name", "n_radii"), [("handling", 3), ("vairano_like", 3), ("palm_beach_like", 3)])
+@pytest.mark.parametrize(("name", "n_radii"), [("handling", 3), ("vairano_like", 3), ("palm_beach_like", 3), ("fast_circuit", 3), ("hill_circuit", 3)])
 def test_courses_turn_both_ways_at_several_radii(name: str, n_radii: int) -> None:
     for side in (1.0, -1.0):
         curvature = side * course_by_name(name).curvature

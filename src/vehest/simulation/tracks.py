@@ -108,5 +108,58 @@ six tenths of a mile and the one corner with 6° of bank are as drivers describe
 heights of an almost level country are assumed.
 """
 
-LAYOUTS: dict[str, Layout] = {"handling": HANDLING, "vairano_like": VAIRANO_LIKE, "palm_beach_like": PALM_BEACH_LIKE}
+FAST_CIRCUIT = Layout(
+    (
+        Straight(909.0),
+        right(90.0, 100.0, 40.0, banking=2.0),
+        Straight(141.0),
+        left(150.0, 60.0, 45.0),
+        Straight(57.0),
+        right(60.0, 130.0, 30.0, banking=1.0),
+        Straight(392.0),
+        left(45.0, 70.0, 22.0),
+        right(80.0, 80.0, 30.0),
+        Straight(291.0),
+        right(200.0, 70.0, 50.0, banking=3.0),
+        Straight(449.0),
+        left(110.0, 40.0, 30.0),
+        right(70.0, 150.0, 35.0, banking=2.0),
+        Straight(159.0),
+    ),
+    crossfall=math.radians(1.0),
+    heights=((0.0, 0.0), (0.25, 6.0), (0.55, -4.0), (0.8, 3.0)),
+)
+"""A clockwise race circuit of 3.8 km for fast cars, like no particular one; all values are assumed."""
+
+HILL_CIRCUIT = Layout(
+    (
+        Straight(681.0),
+        left(75.0, 80.0, 30.0, banking=4.0),
+        Straight(53.0),
+        left(180.0, 50.0, 45.0, banking=1.0),
+        Straight(230.0),
+        right(55.0, 100.0, 25.0, banking=1.0),
+        Straight(31.0),
+        left(100.0, 110.0, 40.0, banking=3.0),
+        Straight(371.0),
+        left(52.0, 140.0, 28.0, banking=2.0),
+        Straight(230.0),
+        right(130.0, 45.0, 40.0),
+        Straight(390.0),
+        right(230.0, 30.0, 40.0),
+        Straight(158.0),
+        left(65.0, 155.0, 30.0, banking=2.0),
+        Straight(181.0),
+    ),
+    heights=((0.0, 0.0), (0.2, 12.0), (0.5, -8.0), (0.75, 5.0)),
+)
+"""An anticlockwise race circuit of 3.7 km up and down a hill, like no particular one; all values are assumed."""
+
+LAYOUTS: dict[str, Layout] = {
+    "handling": HANDLING,
+    "vairano_like": VAIRANO_LIKE,
+    "palm_beach_like": PALM_BEACH_LIKE,
+    "fast_circuit": FAST_CIRCUIT,
+    "hill_circuit": HILL_CIRCUIT,
+}
 """Layouts by name."""
