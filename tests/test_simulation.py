@@ -110,12 +110,14 @@ def test_courses_do_not_come_near_themselves(name: str) -> None:
     assert np.minimum(apart, len(places) - apart).max() < 60  # samples, a metre each: neighbours along the road only
 
 
-@pytest.mark.parametrize(("name", "n_radii"), [("handling", 3), ("vairano_like", 3), ("palm_beach_like", 3), ("fast_circuit", 3), ("hill_circuit", 3)])
+@pytest.mark.parametrize(
+    ("name", "n_radii"), [("handling", 3), ("vairano_like", 3), ("palm_beach_like", 3), ("fast_circuit", 3), ("hill_circuit", 3)]
+)
 def test_courses_turn_both_ways_at_several_radii(name: str, n_radii: int) -> None:
     for side in (1.0, -1.0):
         curvature = side * course_by_name(name).curvature
         tops = curvature[1:-1][(curvature[1:-1] > 1e-6) & (curvature[1:-1] >= curvature[:-2]) & (curvature[1:-1] >= curvature[2:])]
-        assert len(np.unique(np.round(1.0 / tops))) >= n_radii
+        assert len(np.unique(np.round(1.0 / tops))) >= 3
 
 
 def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile() -> None:
