@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sweep bench-training bench-ingest bench-simulation bench-ksnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -60,6 +60,12 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml
+
+sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHEST_DATA
+	$(BIN)/vehest run pipelines/sim_to_real.yaml
+
+pretrained: sim_to_real ## the model for cars that nobody has trained on, from the study before
+	$(BIN)/python docs/make_pretrained.py
 
 sweep: $(INSTALLED) ## KS-NN over P and Q with intervals over seeds (SPLIT=quickstart, simulated; SEEDS="range(3)")
 	$(BIN)/vehest sweep split=$(SPLIT) estimator=ksnn estimator.n_local=2,3,4,5,6 estimator.n_hidden=0,1,2,3 estimator.bias=true,false \

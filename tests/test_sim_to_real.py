@@ -156,7 +156,9 @@ def overview(document: Document) -> pd.DataFrame:
 
 def test_validation_cars_choose_first_even_where_the_real_car_says_otherwise(artefacts):
     table = overview(build_parts(artefacts))
-    assert table.loc["rough", "chosen"] == "first", "the lowest error on validation cars of those laid down beforehand, the highest on the real"
+    assert table.loc["rough", "chosen"] == "first", (
+        "the lowest error on validation cars of those laid down beforehand, the highest on the real"
+    )
     assert table.loc["level", "validation_rmse_vy"] < table.loc["rough", "validation_rmse_vy"]
     assert table.loc["level", "added"], "added later, and so not for the first choice"
     assert table.loc["rough", "fvu_median"] > table.loc["one", "fvu_median"]

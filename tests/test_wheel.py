@@ -41,7 +41,7 @@ def test_wheel_holds_configuration_pipelines_and_templates(installed):
         for file in (ROOT / folder).rglob("*.yaml")
     }
     assert shipped <= names
-    assert {"report/templates/page.css", "py.typed"} <= names
+    assert {"report/templates/page.css", "py.typed", "pretrained/model.safetensors", "pretrained/model.yaml"} <= names
     assert not any("tests" in name or name.endswith(".parquet") for name in names)
 
 
@@ -58,6 +58,10 @@ def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_pat
     assert result.returncode == 0, result.stderr
     assert "would" in result.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"outputs"}
+    (recording,) = (tmp_path / "outputs" / "ingest").glob("*/drive_3.parquet")
+    result = _vehest(installed, tmp_path, "estimate", str(recording), "--json")
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["model"] == "pretrained"
     code = "import vehest, pathlib; print(pathlib.Path(vehest.__file__).parent)"
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     where = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -17,16 +17,17 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model as _load_model
-from vehest.stages.estimate import estimate_recording, find_model, preparation_of, read_table, write_estimate_table
+from vehest.stages.estimate import PRETRAINED, estimate_recording, find_model, preparation_of, read_table, write_estimate_table
 
 __all__ = ["Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate"]
 
 
-def load_model(model: str | Path, output: str | Path | None = None) -> Estimator:
+def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:
     """Load a fitted estimator.
 
     Args:
-        model: its folder, or the start of its name in the output root.
+        model: its folder, or the start of its name in the output root; by default the one that comes with vehest, which was trained on
+            simulated cars and not on yours.
         output: the output root; by default VEHEST_OUTPUT, or ``outputs``.
 
     Raises:

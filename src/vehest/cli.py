@@ -82,6 +82,12 @@ def _complete_model(incomplete: str) -> list[str]:
     return [folder.name for folder in sorted((output / "train").glob(f"{Path(incomplete).name}*")) if not folder.name.startswith(".")]
 
 
+def _complete_model_or_file(incomplete: str) -> list[str]:
+    before = incomplete[: incomplete.rfind("/") + 1]
+    files = [f"{before}{file.name}" for file in sorted(Path(before).glob("*")) if file.suffix.lower() in (".csv", ".parquet")]
+    return _complete_model(incomplete) + [file for file in files if file.startswith(incomplete)]
+
+
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would run and what would be skipped; run nothing.")]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome is there already.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
@@ -254,40 +260,64 @@ def evaluate(
 
 @app.command()
 def estimate(
-    model: Annotated[str, typer.Argument(help="A model's folder, or the start of its name.", autocompletion=_complete_model)],
-    recording: Annotated[Path, typer.Argument(help="CSV or Parquet file; needs no reference channels.")],
+    model: Annotated[
+        str,
+        typer.Argument(
+            metavar="[MODEL]",
+            help="A model's folder, or the start of its name; left out, the pre-trained one that comes with vehest.",
+            autocompletion=_complete_model_or_file,
+        ),
+    ],
+    recording: Annotated[
+        str | None, typer.Argument(metavar="FILE", help="CSV or Parquet file; needs no reference channels.", show_default=False)
+    ] = None,
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet or .csv.")] = Path("estimate.parquet"),
     as_json: AsJson = False,
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
+    For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv`.
+
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
     from vehest.estimators.model_files import load_model
     from vehest.stages.estimate import (
+        PRETRAINED,
         SUFFIXES,
         estimate_recording,
         find_model,
         preparation_of,
+        pretrained_note,
         read_table,
         summary_of,
         write_estimate_table,
     )
 
+    words = [word for word in (model, recording, *(overrides or [])) if word is not None]
+    n_names = 2 if len(words) > 1 and _is_file_name(words[1]) else 1
+    name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
+    if n_names == 1 and file.is_dir():
+        raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
     if out.suffix.lower() not in SUFFIXES:
         raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
-    config = _compose("estimate", overrides or [])
-    folder = find_model(model, Path(config["output"]))
+    config = _compose("estimate", overrides)
+    folder = find_model(name, Path(config["output"]))
     fitted = load_model(folder)
     downsample = config["downsample"] if _names("downsample", overrides) else preparation_of(folder)
     if out.is_dir():
         raise ConfigurationError(f"'{out}' is a folder; name a file")
-    if out.exists() and recording.exists() and out.samefile(recording):
+    if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
-    result = estimate_recording(fitted, read_table(recording, overrides or []), downsample)
+    result = estimate_recording(fitted, read_table(file, overrides), downsample)
     write_estimate_table(result, out)
-    _say(as_json, {"out": str(out), **summary_of(result)})
+    note = {"note": pretrained_note()} if name == PRETRAINED else {}
+    _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **note})
+
+
+def _is_file_name(word: str) -> bool:
+    """Whether a word is no override; a file that is there may have an ``=`` in its name."""
+    return ("=" not in word and not word.startswith("~")) or Path(word).is_file()
 
 
 @app.command()

@@ -24,10 +24,28 @@ from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
 
 SUFFIXES = (".parquet", ".csv")
+PRETRAINED = "pretrained"
+"""Name of the model that comes with vehest, for cars that nobody has trained on."""
+
+
+def pretrained_folder() -> Path:
+    """Where the model that comes with vehest lies."""
+    return Path(__file__).resolve().parents[1] / PRETRAINED
+
+
+def pretrained_note() -> str:
+    """What people should know of an estimate by the model that comes with vehest.
+
+    Raises:
+        MissingError: it is not installed.
+        DataError: its description is damaged.
+    """
+    about = read_description(pretrained_folder())["about"]
+    return " ".join(str(about["note"]).split())
 
 
 def find_model(name: str, output: Path) -> Path:
-    """A model's folder, by path or by the start of its name in the output root.
+    """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
 
     Raises:
         MissingError: there is none.
@@ -36,6 +54,8 @@ def find_model(name: str, output: Path) -> Path:
     given = Path(name)
     if given.is_dir():
         return given
+    if name == PRETRAINED:
+        return pretrained_folder()
     found = sorted(folder for folder in (output / "train").glob(f"{given.name}*") if folder.is_dir() and not folder.name.startswith("."))
     if not found:
         known = sorted(folder.name for folder in (output / "train").glob("[!.]*"))
