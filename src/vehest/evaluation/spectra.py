@@ -45,7 +45,9 @@ class Periodogram:
             DataError: the frequency lies outside the lines above 0.
         """
         if not self.frequency[1] <= hz <= self.frequency[-1]:
-            raise DataError(f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz says nothing of {hz:g} Hz")
+            raise DataError(
+                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz says nothing of {hz:g} Hz"
+            )
         inside = (self.frequency >= hz / THIRD_OCTAVE) & (self.frequency <= hz * THIRD_OCTAVE)
         inside[np.argmin(np.abs(self.frequency - hz))] = True
         return float(self.density[inside].mean())
