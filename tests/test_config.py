@@ -79,7 +79,7 @@ def test_sweeps_expand_to_every_combination():
 
 
 def test_shipped_pipeline_of_the_ferrari_has_31_jobs(elsewhere):
-    configs = pipeline_configs(read_pipeline("ferrari_drive"), [])
+    configs = pipeline_configs(read_pipeline("ferrari_drive"), [])[""]
     names = [config["estimator"]["name"] for config in configs]
     assert {name: names.count(name) for name in set(names)} == {"luenberger": 1, "ksnn": 20, "gru": 5, "lstm": 5}
     assert all(config["evaluation"]["rate_hz"] == 20 for config in configs)
@@ -87,10 +87,10 @@ def test_shipped_pipeline_of_the_ferrari_has_31_jobs(elsewhere):
 
 
 def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
-    configs = pipeline_configs(read_pipeline("quickstart"), ["training.learning_rate=0.01"])
+    configs = pipeline_configs(read_pipeline("quickstart"), ["training.learning_rate=0.01"])[""]
     rates = {config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs}
     assert rates == {"luenberger": None, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
-    seeds = [c["seed"] for c in pipeline_configs(read_pipeline("quickstart"), ["seed=7"])]
+    seeds = [c["seed"] for c in pipeline_configs(read_pipeline("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
     with pytest.raises(ConfigurationError, match=r"suits no sweep"):
         pipeline_configs(read_pipeline("quickstart"), ["training.momentum=0.9"])
@@ -99,7 +99,7 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("study: x\n", "it needs study, report, split and sweeps"),
+        ("study: x\n", "it needs study, report and one of: split and sweeps"),
         ("[1, 2", "cannot be read"),
         ("study: x\nreport: drive\nsplit: quickstart\nsweeps: [estimator=gru]\n", "sweeps must be a list of lists"),
         ("study: x\nreport: no_such\nsplit: quickstart\nsweeps: [[estimator=gru]]\n", "no study module 'no_such'"),

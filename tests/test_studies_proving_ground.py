@@ -321,7 +321,7 @@ def test_overrides_reach_the_data_sets_that_have_their_key(survey_place):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"split": "mine"}, "and no split or sweeps"),
+        ({"split": "mine"}, "one of: split and sweeps; parts"),
         ({"datasets": []}, "must name some"),
         ({"datasets": "mine"}, "must be a list of names"),
         ({"datasets": ["other"]}, "none of them twice"),

@@ -218,10 +218,10 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`.
     """
     from vehest.stages.artefacts import find, read_artefact
+    from vehest.stages.comparison import plain_resampling
     from vehest.stages.estimate import find_model, preparation_of
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
     from vehest.stages.group import Evaluation
-    from vehest.stages.pipeline import plain_resampling
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
@@ -570,7 +570,7 @@ def _run_pipeline(
     pipeline = read_pipeline(name)
     configs = pipeline_configs(pipeline, overrides)
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
-    with _workshop(configs[0], force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+    with _workshop(next(iter(configs.values()))[0], force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
         outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
     page = outcome.report.folder / "report.html"
     if as_json:

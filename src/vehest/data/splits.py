@@ -176,6 +176,13 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
     )
 
 
+def dataset_names(config: Mapping[str, Any]) -> list[str]:
+    """Names of the data sets that a split's plain values draw on, sorted; `split_from_config` says what is wrong with the values."""
+    roles = [config.get("train"), config.get("validation"), *dict(config.get("tests") or {}).values()]
+    entries = [entry for entries in roles for entry in entries or [] if isinstance(entry, Mapping)]
+    return sorted({str(entry.get("dataset", config.get("dataset"))) for entry in entries})
+
+
 class _Ranges:
     """Turns the ranges of a configuration into spans.
 

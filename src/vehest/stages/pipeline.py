@@ -1,6 +1,7 @@
 """A pipeline: sweeps of trainings, the evaluations they feed, and the study that draws tables and figures from them.
 
-Or data sets alone, and the study that draws tables and figures from their recordings.
+Or several such comparisons, each on a split of its own, as parts of one study. Or data sets alone, and the study that draws tables
+and figures from their recordings.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,22 +17,45 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.splits import check_name
 from vehest.stages.artefacts import Artefact
+from vehest.stages.comparison import Compared, compare, raise_failures
 from vehest.stages.config import Config, compose_config, expand, has_key, key_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
-from vehest.stages.evaluate import protocol_from_config
-from vehest.stages.group import Evaluation, Group, existing, is_finished
-from vehest.stages.report import ReportJob, leaderboard_of, plan_report, publish, write_report
-from vehest.stages.survey import SurveyJob, ingest_all, lost_by_publishing, overview_of, plan_survey, write_survey
+from vehest.stages.parts import AbsentPart, PartsJob, plan_parts, write_parts
+from vehest.stages.report import ReportJob, leaderboard_of, overview_of, plan_report, publish, shown_in, write_report
+from vehest.stages.survey import SurveyJob, ingest_all, plan_survey, write_survey
 from vehest.stages.tracking import Tracker
-from vehest.stages.train import TrainJob, new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
 
-COMPARISON = {"split", "sweeps", "evaluation"}
+COMPARISON = {"split", "sweeps"}
 SURVEY = {"datasets", "optional_datasets"}
-KEYS = {"study", "title", "about", "report", "publish", *COMPARISON, *SURVEY}
+KEYS = {"study", "title", "about", "report", "publish", "evaluation", "parts", *COMPARISON, *SURVEY}
+PART_KEYS = {*COMPARISON, "title", "optional"}
+FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
+
+Configs = Mapping[str, Sequence[Config]]
+"""Part of a pipeline -> configuration of its jobs; the one part of a pipeline without parts is called ``""``."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One comparison of a study.
+
+    Args:
+        name: short, ``""`` where it is the only one.
+        title: for people.
+        split: conf/split it works on.
+        sweeps: overrides of each sweep, several values allowed.
+        optional: whether the study goes on without it where its raw files are not here.
+    """
+
+    name: str
+    title: str
+    split: str
+    sweeps: tuple[tuple[str, ...], ...]
+    optional: bool = False
 
 
 @dataclass(frozen=True)
@@ -43,12 +67,11 @@ class Pipeline:
         title: for people.
         about: a paragraph on what is compared and why.
         report: module of `vehest.studies` that draws it.
-        split: conf/split it works on.
-        sweeps: overrides of each sweep, several values allowed.
+        parts: what is compared; none where it compares no estimators.
         evaluation: overrides of conf/eval.yaml's ``evaluation``.
         publish: whether its outcome also goes to results/<study>.
         file: where it was read from.
-        datasets: conf/dataset whose recordings it shows, where it compares no estimators; split and sweeps are empty then.
+        datasets: conf/dataset whose recordings it shows, where it compares no estimators.
         optional_datasets: further ones, that it goes on without where their raw files are not here.
     """
 
@@ -56,13 +79,17 @@ class Pipeline:
     title: str
     about: str
     report: str
-    split: str
-    sweeps: tuple[tuple[str, ...], ...]
+    parts: tuple[Part, ...]
     evaluation: tuple[str, ...]
     publish: bool
     file: Path
     datasets: tuple[str, ...] = ()
     optional_datasets: tuple[str, ...] = ()
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether the file names parts, be it a single one."""
+        return bool(self.parts) and self.parts[0].name != ""
 
 
 @dataclass(frozen=True)
@@ -71,9 +98,9 @@ class PipelineOutcome:
 
     Args:
         report: artefact of the report stage.
-        leaderboard: its table, one row an estimator and test set; empty where it compares none.
+        leaderboard: its table, one row an estimator and test set; empty where there is an overview.
         published: folder in results/, if it was published.
-        overview: table of a study of recordings alone.
+        overview: table of a study in parts, or of recordings alone.
     """
 
     report: Artefact
@@ -101,31 +128,21 @@ def read_pipeline(name: str) -> Pipeline:
     if not isinstance(content, dict) or set(content) - KEYS:
         reason = f"unknown key '{min(set(content) - KEYS)}'" if isinstance(content, dict) else "it holds no keys"
         raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
-    survey = bool(SURVEY & set(content))
-    needed = {"study", "report", "datasets"} if survey else {"study", "report", "split", "sweeps"}
-    if not needed <= set(content) or (survey and COMPARISON & set(content)):
-        raise ConfigurationError(
-            f"'{file}' is not a pipeline: it needs study, report, split and sweeps; or study, report and datasets, and no split or sweeps"
-        )
-    sweeps = content.get("sweeps", [])
-    if not isinstance(sweeps, list) or not all(isinstance(sweep, list) and sweep for sweep in sweeps):
-        raise ConfigurationError(f"'{file}': sweeps must be a list of lists of overrides")
+    form = _form_of(content, file)
     datasets, optional = (_names_in(content.get(key, []), f"'{file}': {key}") for key in ("datasets", "optional_datasets"))
-    if survey and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
+    if form == "datasets" and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
         raise ConfigurationError(f"'{file}': datasets must name some, and none of them twice")
-    if importlib.util.find_spec(f"vehest.studies.{content['report']}") is None:
-        raise ConfigurationError(f"'{file}': there is no study module '{content['report']}' in vehest.studies")
-    if not hasattr(importlib.import_module(f"vehest.studies.{content['report']}"), "documents" if survey else "build"):
-        takes = "split and sweeps" if survey else "datasets"
-        raise ConfigurationError(f"'{file}': the study module '{content['report']}' draws its report from {takes}")
+    parts = {"datasets": {}, "parts": content.get("parts"), "split": {"": {key: content.get(key) for key in COMPARISON}}}[form]
+    if not isinstance(parts, dict) or (form == "parts" and not parts):
+        raise ConfigurationError(f"'{file}': parts must be names, each with its split and sweeps")
+    _check_module(str(content["report"]), form, file)
     check_name(str(content["study"]), f"'{file}': study")
     return Pipeline(
         study=str(content["study"]),
         title=str(content.get("title", content["study"])),
         about=" ".join(str(content.get("about", "")).split()),
         report=str(content["report"]),
-        split=str(content.get("split", "")),
-        sweeps=tuple(tuple(str(override) for override in sweep) for sweep in sweeps),
+        parts=tuple(_part(str(name), part, file) for name, part in parts.items()),
         evaluation=tuple(f"evaluation.{key}={value}" for key, value in (content.get("evaluation") or {}).items()),
         publish=bool(content.get("publish", False)),
         file=file,
@@ -134,20 +151,73 @@ def read_pipeline(name: str) -> Pipeline:
     )
 
 
+def _form_of(content: Mapping[str, Any], file: Path) -> str:
+    """Which of the three forms a pipeline has, by the key that tells: ``split``, ``parts`` or ``datasets``."""
+    forms = [form for form, own in (("split", COMPARISON), ("parts", {"parts"}), ("datasets", SURVEY)) if own & set(content)]
+    whole = {"study", "report"} <= set(content) and len(forms) == 1
+    whole = whole and (forms != ["split"] or set(content) >= COMPARISON) and (forms != ["datasets"] or "evaluation" not in content)
+    if not whole or (forms == ["datasets"] and "datasets" not in content):
+        raise ConfigurationError(f"'{file}' is not a pipeline: {FORMS}")
+    return forms[0]
+
+
+def _part(name: str, content: Any, file: Path) -> Part:
+    where = f"'{file}': part '{name}'" if name else f"'{file}'"
+    if not isinstance(content, dict) or set(content) - PART_KEYS or not set(content) >= COMPARISON:
+        raise ConfigurationError(f"{where} needs split and sweeps, and may have title and optional")
+    if name:
+        check_name(name, f"'{file}': part")
+    sweeps = content["sweeps"]
+    if not isinstance(sweeps, list) or not sweeps or not all(isinstance(sweep, list) and sweep for sweep in sweeps):
+        raise ConfigurationError(f"{where}: sweeps must be a list of lists of overrides")
+    return Part(
+        name=name,
+        title=str(content.get("title", name)),
+        split=str(content["split"]),
+        sweeps=tuple(tuple(str(override) for override in sweep) for sweep in sweeps),
+        optional=bool(content.get("optional", False)),
+    )
+
+
+def _check_module(name: str, form: str, file: Path) -> None:
+    if importlib.util.find_spec(f"vehest.studies.{name}") is None:
+        raise ConfigurationError(f"'{file}': there is no study module '{name}' in vehest.studies")
+    module = importlib.import_module(f"vehest.studies.{name}")
+    takes = {"build": "split and sweeps", "build_parts": "parts", "documents": "datasets"}
+    wanted = {"split": "build", "parts": "build_parts", "datasets": "documents"}[form]
+    if not hasattr(module, wanted):
+        known = " or ".join(words for function, words in takes.items() if hasattr(module, function))
+        raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {known or 'something else'}")
+
+
 def _names_in(content: Any, where: str) -> tuple[str, ...]:
     if not isinstance(content, list) or not all(isinstance(name, str) for name in content):
         raise ConfigurationError(f"{where} must be a list of names in conf/dataset")
     return tuple(content)
 
 
-def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Config]:
+def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
     """The configuration of every job; further overrides apply to the sweeps, or data sets, that have their key.
 
     Raises:
         ConfigurationError: an override that suits none of them.
     """
     if pipeline.datasets:
-        return _survey_configs(pipeline, overrides)
+        return {"": _survey_configs(pipeline, overrides)}
+    if any(key_of(override) == "split" for override in overrides):
+        raise ConfigurationError(
+            f"the split belongs to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change it there"
+        )
+    used: set[str] = set()
+    configs = {part.name: _part_configs(part, pipeline.evaluation, overrides, used) for part in pipeline.parts}
+    for override in overrides:
+        if override not in used:
+            raise ConfigurationError(f"'{override}' suits no sweep of '{pipeline.file.name}': none has an option '{key_of(override)}'")
+    return configs
+
+
+def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str], used: set[str]) -> list[Config]:
+    """The configuration of every job of a part; the overrides that suit any of them join ``used``."""
     composed: dict[tuple[str, ...], Config] = {}
 
     def config_of(job: tuple[str, ...]) -> Config:
@@ -155,14 +225,9 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
             composed[job] = compose_config("eval", job)
         return composed[job]
 
-    if any(key_of(override) == "split" for override in overrides):
-        raise ConfigurationError(
-            f"the split belongs to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change it there"
-        )
-    used: set[str] = set()
     configs: list[Config] = []
-    for sweep in pipeline.sweeps:
-        for job in expand([f"split={pipeline.split}", *pipeline.evaluation, *sweep]):
+    for sweep in part.sweeps:
+        for job in expand([f"split={part.split}", *evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
             shared = tuple(override for override in job if override not in seeds)
             base = config_of(shared)
@@ -174,9 +239,6 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Confi
                 config["seed"] = compose_seed(seeds[-1])
             if config not in configs:
                 configs.append(config)
-    for override in overrides:
-        if override not in used:
-            raise ConfigurationError(f"'{override}' suits no sweep of '{pipeline.file.name}': none has an option '{key_of(override)}'")
     return configs
 
 
@@ -210,7 +272,7 @@ def compose_seed(override: str) -> Any:
 
 
 def run_pipeline(
-    pipeline: Pipeline, configs: Sequence[Config], overrides: Sequence[str], workshop: Workshop, *, only_report: bool = False
+    pipeline: Pipeline, configs: Configs, overrides: Sequence[str], workshop: Workshop, *, only_report: bool = False
 ) -> PipelineOutcome:
     """Run every stage of a pipeline; what is there is skipped. What overrides changed is not published in results/.
 
@@ -228,51 +290,71 @@ def run_pipeline(
         Stopped: a signal came.
     """
     if pipeline.datasets:
-        return _run_survey(pipeline, configs, overrides, workshop, only_report=only_report)
-    first = configs[0]
+        return _run_survey(pipeline, configs[""], overrides, workshop, only_report=only_report)
+    first = next(iter(configs.values()))[0]
     workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn)
     workshop.tags = {"vehest.study": pipeline.study}
-    try:
-        groups = _groups(configs, workshop)
-    except NotThereYet:
-        for config in configs:
-            estimator = new_estimator(config["estimator"])
-            workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
-        workshop.messages.line("plan", "report", pipeline.study)
-        raise
-    if only_report:
-        for group in groups:
-            for member in existing(group):
-                if not is_finished(group, member):
-                    raise MissingError(
-                        f"{member.job.plan.label} has not been trained and evaluated; run 'vehest run {pipeline.file}' first"
-                    )
-    members, failures = workshop.run_groups(groups)
-    if failures:
-        listed = "; ".join(f"{name}: {failure.message}" for name, failure in failures)
-        for name, failure in failures:
-            if failure.detail:
-                workshop.messages.warn(f"{name}:\n{failure.detail}")
-        raise JobsFailedError(f"{len(failures)} of {len(groups)} groups of jobs failed, the others are kept; {listed}")
-    order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
-    members.sort(key=lambda member: order[member.job.plan.key])
-    evaluation = groups[0].evaluation
-    assert evaluation is not None
-    titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
-    job = ReportJob(
+    compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
+    raise_failures(compared.values(), workshop)
+    jobs = {name: _report_job(pipeline, own, overrides) for name, own in compared.items()}
+    if not pipeline.in_parts:
+        (job,) = jobs.values()
+        report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
+        return PipelineOutcome(report, leaderboard_of(job), _publish(pipeline, report, overrides, workshop))
+    whole = PartsJob(
         study=pipeline.study,
         title=pipeline.title,
         about=pipeline.about,
         command=_command(pipeline, overrides),
         module=pipeline.report,
-        members=members,
-        evaluation=evaluation,
-        data_titles=titles,
-        training=[*training_facts(configs), resampling_fact(configs)],
+        titles={part.name: part.title for part in pipeline.parts},
+        parts=jobs,
+        absent=absent,
     )
-    report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
-    published = _publish(pipeline, report, overrides, workshop)
-    return PipelineOutcome(report, leaderboard_of(job), published)
+    report = workshop.ensure(plan_parts(whole, workshop.output), lambda folder: write_parts(whole, folder))
+    published = _publish(pipeline, report, overrides, workshop, absent={part.name: f"part '{part.name}'" for part in absent})
+    return PipelineOutcome(report, pd.DataFrame(), published, overview_of(report))
+
+
+def _run_parts(
+    pipeline: Pipeline, configs: Configs, workshop: Workshop, *, only_report: bool
+) -> tuple[dict[str, Compared], list[AbsentPart]]:
+    """Every part, one after another, those left out whose raw files are not here though the study can go on without them."""
+    compared: dict[str, Compared] = {}
+    absent: list[AbsentPart] = []
+    waits = False
+    for part in pipeline.parts:
+        try:
+            if part.optional:
+                workshop.look_for_files(configs[part.name][0])
+            compared[part.name] = compare(configs[part.name], workshop, f"vehest run {pipeline.file}", only_report=only_report)
+        except MissingError as error:
+            if not part.optional or only_report:
+                raise
+            workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
+            absent.append(AbsentPart(part.name, part.title))
+        except NotThereYet:
+            waits = True
+    if waits:
+        workshop.messages.line("plan", "report", pipeline.study)
+        raise NotThereYet
+    if not compared:
+        raise MissingError(f"nothing that '{pipeline.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
+    return compared, absent
+
+
+def _report_job(pipeline: Pipeline, compared: Compared, overrides: Sequence[str]) -> ReportJob:
+    return ReportJob(
+        study=pipeline.study,
+        title=pipeline.title,
+        about=pipeline.about,
+        command=_command(pipeline, overrides),
+        module=pipeline.report,
+        members=compared.members,
+        evaluation=compared.evaluation,
+        data_titles=compared.data_titles,
+        training=compared.facts,
+    )
 
 
 def _run_survey(
@@ -294,13 +376,8 @@ def _run_survey(
         absent=absent,
     )
     report = workshop.ensure(plan_survey(job, workshop.output), lambda folder: write_survey(job, folder))
-    published = None
-    lost = lost_by_publishing(absent, _results_of(pipeline)) if pipeline.publish else []
-    if lost:
-        workshop.messages.warn(f"not published: '{_results_of(pipeline)}' shows data set '{lost[0]}', and this run could not read it")
-    else:
-        published = _publish(pipeline, report, overrides, workshop)
-    return PipelineOutcome(report, pd.DataFrame(), published, overview_of(report))
+    names = {dataset.name: f"data set '{dataset.name}'" for dataset in absent}
+    return PipelineOutcome(report, pd.DataFrame(), _publish(pipeline, report, overrides, workshop, absent=names), overview_of(report))
 
 
 def _command(pipeline: Pipeline, overrides: Sequence[str]) -> str:
@@ -311,66 +388,21 @@ def _results_of(pipeline: Pipeline) -> Path:
     return Path("results") / pipeline.study
 
 
-def _publish(pipeline: Pipeline, report: Artefact, overrides: Sequence[str], workshop: Workshop) -> Path | None:
-    """Publish a study as it is written: not what overrides changed."""
+def _publish(
+    pipeline: Pipeline, report: Artefact, overrides: Sequence[str], workshop: Workshop, absent: Mapping[str, str] | None = None
+) -> Path | None:
+    """Publish a study as it is written: not what overrides changed, nor without what the published one shows.
+
+    Args:
+        absent: name of what the study went on without -> what it is, for people.
+    """
     if not pipeline.publish or workshop.dry_run or overrides:
         return None
     published = _results_of(pipeline)
+    lost = [words for name, words in (absent or {}).items() if name in shown_in(published)]
+    if lost:
+        workshop.messages.warn(f"not published: '{published}' shows {lost[0]}, and this run could not read it")
+        return None
     if publish(report, published):
         workshop.messages.line("done", "publish", str(published))
     return published
-
-
-def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
-    """Jobs that fit one batch, with the data they need, which is made on the way."""
-    groups: dict[tuple[Any, ...], list[TrainJob]] = {}
-    evaluations: dict[tuple[Any, ...], Evaluation] = {}
-    labels: dict[str, str] = {}
-    for config in configs:
-        for key in ("split", "evaluation", "downsample"):
-            if config[key] != configs[0][key]:
-                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
-        split = workshop.split(config)
-        if not any(split.tests.values()):
-            raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
-        protocol = protocol_from_config(config["evaluation"])
-        data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
-        references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-        job = plan_train(config, split, data)
-        if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
-            raise ConfigurationError(
-                f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
-            )
-        groups.setdefault(job.group, []).append(job)
-        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
-    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
-
-
-def resampling_fact(configs: Sequence[Config]) -> str:
-    """How recordings came to the rates that estimators work at."""
-    rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(configs[0]["evaluation"]["rate_hz"])})
-    options = configs[0]["downsample"]
-    how = {
-        "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
-        "decimate": "by plain decimation",
-    }[options["method"]]
-    first = f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
-    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
-
-
-def plain_resampling(config: Config) -> Config:
-    """The configuration for references: resampled like everything, but never filtered further."""
-    return {**config, "downsample": {**config["downsample"], "transforms": []}}
-
-
-def training_facts(configs: Sequence[Config]) -> list[str]:
-    """What each training scheme was allowed, a line each."""
-    facts = []
-    for config in configs:
-        training = config["training"]
-        options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
-        names = sorted({c["estimator"]["name"] for c in configs if c["training"] == training})
-        fact = f"{', '.join(names)}: {training['name']} ({options})" if options else f"{', '.join(names)}: nothing is trained"
-        if fact not in facts:
-            facts.append(fact)
-    return facts

@@ -25,6 +25,7 @@ from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefa
 STAGE = "report"
 PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
+OVERVIEW = "tables/overview.csv"
 
 
 @dataclass(frozen=True)
@@ -82,9 +83,7 @@ def write_report(job: ReportJob, folder: Path) -> None:
     artefacts.metrics.to_csv(folder / METRICS, index=False, lineterminator="\n")
     about = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command, "kinds": dict(job.evaluation.kinds)}
-    about["recordings"] = {
-        f"{span.dataset}/{span.recording}": _digest(job, span.dataset, span.recording) for span in scored_spans(job.evaluation.split)
-    }
+    about["recordings"] = recording_digests(job)
     (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
@@ -152,8 +151,27 @@ def publish(report: Artefact, folder: Path) -> bool:
     return True
 
 
-def _digest(job: ReportJob, dataset: str, recording: str) -> str:
-    return job.evaluation.references[dataset].outputs[f"{recording}.parquet"]
+def recording_digests(job: ReportJob) -> dict[str, str]:
+    """Data set and recording -> digest, of every recording that is scored, at the evaluation rate."""
+    references = job.evaluation.references
+    return {
+        f"{span.dataset}/{span.recording}": references[span.dataset].outputs[f"{span.recording}.parquet"]
+        for span in scored_spans(job.evaluation.split)
+    }
+
+
+def overview_of(report: Artefact) -> pd.DataFrame:
+    """The overview of a study that has one, as the report shows it."""
+    return pd.read_csv(report.folder / OVERVIEW, float_precision="round_trip")
+
+
+def shown_in(folder: Path) -> set[str]:
+    """Data sets and parts that a published study shows; none where nothing is published."""
+    try:
+        about = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+        return {*about.get("kinds", {}), *about.get("parts", [])}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return set()
 
 
 def _module(job: ReportJob) -> Any:

@@ -9,8 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from vehest.data.errors import MissingError
 from vehest.sources.base import kind_of
 from vehest.stages.artefacts import Artefact, StagePlan, find, provenance
@@ -20,8 +18,6 @@ from vehest.stages.ingest import plan_ingest
 from vehest.stages.report import PROVENANCE, STAGE
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
-
-OVERVIEW = "tables/overview.csv"
 
 
 @dataclass(frozen=True)
@@ -121,20 +117,6 @@ def write_survey(job: SurveyJob, folder: Path) -> None:
         f"{artefact.label}/{Path(name).stem}": digest for artefact in job.ingested for name, digest in artefact.outputs.items()
     }
     (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def overview_of(report: Artefact) -> pd.DataFrame:
-    """The study's overview, as the report shows it."""
-    return pd.read_csv(report.folder / OVERVIEW, float_precision="round_trip")
-
-
-def lost_by_publishing(absent: Sequence[AbsentDataset], folder: Path) -> list[str]:
-    """Data sets that a published study shows and one that lacks ``absent`` would not."""
-    try:
-        shown = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["kinds"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
-    return [dataset.name for dataset in absent if dataset.name in shown]
 
 
 def _artefacts(job: SurveyJob) -> SurveyArtefacts:

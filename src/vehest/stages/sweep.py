@@ -14,10 +14,11 @@ from vehest.data.errors import ConfigurationError, JobsFailedError, VehestError
 from vehest.data.splits import VALIDATION, Split, check_name
 from vehest.stages.artefacts import Artefact, StagePlan
 from vehest.stages.code_version import code_version
+from vehest.stages.comparison import plain_resampling, resampling_fact, training_facts
 from vehest.stages.config import Config, compose_config, expand, key_of, parse
 from vehest.stages.evaluate import METRICS, protocol_from_config
 from vehest.stages.group import Evaluation, Group, Member
-from vehest.stages.pipeline import compose_seed, content_overrides, plain_resampling, resampling_fact, training_facts
+from vehest.stages.pipeline import compose_seed, content_overrides
 from vehest.stages.train import new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, Value, build, short_names, shown_value, summary

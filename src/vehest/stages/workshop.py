@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.data.recording import Recording
-from vehest.data.splits import VALIDATION, Catalogue, Split, split_from_config
+from vehest.data.splits import VALIDATION, Catalogue, Split, dataset_names, split_from_config
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import kind_of
@@ -96,6 +96,15 @@ class Workshop:
             for role, kept in split.kept.items():
                 self.messages.line("done", "split", f"{split.name}, {role}", f"keeps {kept.describe()}")
         return self._splits[key]
+
+    def look_for_files(self, config: Config) -> None:
+        """Make sure that the raw files of every data set that a split draws on are here; read nothing.
+
+        Raises:
+            MissingError: some are not.
+        """
+        for name in dataset_names(config["split"]):
+            plan_ingest(self.dataset_config(name, config))
 
     def _catalogue(self, config: Config) -> Catalogue:
         def recordings_of(name: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:

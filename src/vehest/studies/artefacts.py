@@ -106,6 +106,35 @@ class StudyArtefacts:
 
 
 @dataclass(frozen=True)
+class PartsArtefacts:
+    """Everything that a study in parts may look at.
+
+    Args:
+        study: name of the study.
+        title: its title.
+        about: a paragraph on what is compared, from the pipeline file.
+        command: the command that makes this report.
+        titles: part -> title, of all there are in the pipeline file.
+        parts: part -> what was compared in it.
+        absent: parts whose raw files were not here.
+    """
+
+    study: str
+    title: str
+    about: str
+    command: str
+    titles: Mapping[str, str]
+    parts: Mapping[str, StudyArtefacts]
+    absent: Sequence[str]
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """Metrics of all parts, `METRIC_COLUMNS`; ``trained_on`` is followed by the part: ``sim_two_cars/scheme_1``."""
+        tables = [part.metrics.assign(trained_on=part.metrics["trained_on"].fillna("") + f"/{name}") for name, part in self.parts.items()]
+        return pd.concat(tables, ignore_index=True)
+
+
+@dataclass(frozen=True)
 class StoredDataset:
     """A data set in the store.
 

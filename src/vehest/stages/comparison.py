@@ -1,0 +1,146 @@
+"""A comparison of estimators on one split: sweeps of trainings and the evaluations they feed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
+from vehest.stages.config import Config
+from vehest.stages.evaluate import protocol_from_config
+from vehest.stages.group import Evaluation, Group, Member, existing, is_finished
+from vehest.stages.launcher import Failure
+from vehest.stages.train import TrainJob, new_estimator, plan_train
+from vehest.stages.workshop import NotThereYet, Workshop
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A comparison that has been run.
+
+    Args:
+        members: trained and evaluated, in the order of the pipeline.
+        evaluation: split, references and protocol.
+        data_titles: data set -> title, for people.
+        facts: how recordings were prepared and what each training scheme was allowed, a line each.
+        n_groups: groups of jobs there were.
+        failures: name of a group that failed, and why; its members are missing.
+    """
+
+    members: Sequence[Member]
+    evaluation: Evaluation
+    data_titles: dict[str, str]
+    facts: Sequence[str]
+    n_groups: int
+    failures: Sequence[tuple[str, Failure]]
+
+
+def compare(configs: Sequence[Config], workshop: Workshop, command: str, *, only_report: bool = False) -> Compared:
+    """Train and evaluate every job; what is there is skipped, and what fails keeps no other from running.
+
+    Args:
+        configs: its jobs, which agree in split, evaluation and downsampling.
+        workshop: where stages run.
+        command: the command that would train what is missing, for messages.
+        only_report: take what is there, train and evaluate nothing.
+
+    Raises:
+        ConfigurationError: the jobs do not fit one comparison.
+        MissingError: ``only_report`` and something is missing, or raw files are not here.
+        NotThereYet: in a dry run.
+        Stopped: a signal came.
+    """
+    first = configs[0]
+    try:
+        groups = _groups(configs, workshop)
+    except NotThereYet:
+        for config in configs:
+            estimator = new_estimator(config["estimator"])
+            workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
+        raise
+    if only_report:
+        for group in groups:
+            for member in existing(group):
+                if not is_finished(group, member):
+                    raise MissingError(f"{member.job.plan.label} has not been trained and evaluated; run '{command}' first")
+    members, failures = workshop.run_groups(groups)
+    order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
+    members.sort(key=lambda member: order[member.job.plan.key])
+    evaluation = groups[0].evaluation
+    assert evaluation is not None
+    titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
+    facts = [*training_facts(configs), resampling_fact(configs)]
+    return Compared(members, evaluation, titles, facts, len(groups), failures)
+
+
+def raise_failures(compared: Iterable[Compared], workshop: Workshop) -> None:
+    """Say in full what failed, then end with one line.
+
+    Raises:
+        JobsFailedError: anything failed.
+    """
+    counted = list(compared)
+    failures = [failure for own in counted for failure in own.failures]
+    if not failures:
+        return
+    for name, failure in failures:
+        if failure.detail:
+            workshop.messages.warn(f"{name}:\n{failure.detail}")
+    listed = "; ".join(f"{name}: {failure.message}" for name, failure in failures)
+    raise JobsFailedError(f"{len(failures)} of {sum(own.n_groups for own in counted)} groups of jobs failed, the others are kept; {listed}")
+
+
+def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
+    """Jobs that fit one batch, with the data they need, which is made on the way."""
+    groups: dict[tuple[Any, ...], list[TrainJob]] = {}
+    evaluations: dict[tuple[Any, ...], Evaluation] = {}
+    labels: dict[str, str] = {}
+    for config in configs:
+        for key in ("split", "evaluation", "downsample"):
+            if config[key] != configs[0][key]:
+                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
+        split = workshop.split(config)
+        if not any(split.tests.values()):
+            raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
+        protocol = protocol_from_config(config["evaluation"])
+        data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
+        references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
+        job = plan_train(config, split, data)
+        if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
+            raise ConfigurationError(
+                f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
+            )
+        groups.setdefault(job.group, []).append(job)
+        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
+    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
+
+
+def resampling_fact(configs: Sequence[Config]) -> str:
+    """How recordings came to the rates that estimators work at."""
+    rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(configs[0]["evaluation"]["rate_hz"])})
+    options = configs[0]["downsample"]
+    how = {
+        "polyphase": "anti-aliased by a zero-phase polyphase filter (offline: it looks ahead; the estimators themselves are causal)",
+        "decimate": "by plain decimation",
+    }[options["method"]]
+    first = f", after {len(options['transforms'])} further transforms" if options["transforms"] else ""
+    return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
+
+
+def plain_resampling(config: Config) -> Config:
+    """The configuration for references: resampled like everything, but never filtered further."""
+    return {**config, "downsample": {**config["downsample"], "transforms": []}}
+
+
+def training_facts(configs: Sequence[Config]) -> list[str]:
+    """What each training scheme was allowed, a line each."""
+    facts = []
+    for config in configs:
+        training = config["training"]
+        options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
+        names = sorted({c["estimator"]["name"] for c in configs if c["training"] == training})
+        fact = f"{', '.join(names)}: {training['name']} ({options})" if options else f"{', '.join(names)}: nothing is trained"
+        if fact not in facts:
+            facts.append(fact)
+    return facts

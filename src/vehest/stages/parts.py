@@ -1,0 +1,92 @@
+"""Report of a study in parts: several comparisons, each on a split of its own, drawn as one."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from vehest.stages.artefacts import StagePlan, provenance
+from vehest.stages.code_version import code_version
+from vehest.stages.evaluate import METRICS
+from vehest.stages.report import PROVENANCE, STAGE, ReportJob, plan_report, recording_digests, study_artefacts
+from vehest.studies.artefacts import PartsArtefacts
+
+
+@dataclass(frozen=True)
+class AbsentPart:
+    """A part that a study goes on without, since its raw files are not here.
+
+    Args:
+        name: in the pipeline file.
+        title: for people.
+    """
+
+    name: str
+    title: str
+
+
+@dataclass(frozen=True)
+class PartsJob:
+    """A report to draw.
+
+    Args:
+        study: name of the study.
+        title: its title.
+        about: a paragraph on it.
+        command: the command that makes it.
+        module: module of `vehest.studies`.
+        titles: part -> title, of all there are in the pipeline file.
+        parts: part -> what was compared.
+        absent: parts that the study goes on without.
+    """
+
+    study: str
+    title: str
+    about: str
+    command: str
+    module: str
+    titles: Mapping[str, str]
+    parts: Mapping[str, ReportJob]
+    absent: Sequence[AbsentPart]
+
+
+def plan_parts(job: PartsJob, output: Path) -> StagePlan:
+    """What a report is made from."""
+    plans = {name: plan_report(part, output) for name, part in job.parts.items()}
+    config: dict[str, Any] = {key: getattr(job, key) for key in ("study", "title", "about", "command", "module")}
+    config |= {"titles": dict(job.titles), "absent": [asdict(part) for part in job.absent]}
+    return StagePlan(
+        stage=STAGE,
+        label=job.study,
+        config={**config, "parts": {name: plan.config for name, plan in plans.items()}},
+        inputs={f"{name}: {label}": digest for name, plan in plans.items() for label, digest in plan.inputs.items()},
+        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
+        output=output,
+    )
+
+
+def write_parts(job: PartsJob, folder: Path) -> None:
+    """Draw the study into ``folder``: report.md, report.html, metrics.csv, tables, figures, provenance."""
+    from vehest.report.document import write_document
+
+    artefacts = PartsArtefacts(
+        study=job.study,
+        title=job.title,
+        about=job.about,
+        command=job.command,
+        titles=job.titles,
+        parts={name: study_artefacts(part) for name, part in job.parts.items()},
+        absent=[part.name for part in job.absent],
+    )
+    module = importlib.import_module(f"vehest.studies.{job.module}")
+    write_document(module.build_parts(artefacts), folder)
+    artefacts.metrics.to_csv(folder / METRICS, index=False, lineterminator="\n")
+    about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
+    about |= {"study": job.study, "command": job.command, "parts": list(job.parts), "absent": artefacts.absent}
+    about["kinds"] = {name: kind for part in job.parts.values() for name, kind in part.evaluation.kinds.items()}
+    about["recordings"] = {name: digest for part in job.parts.values() for name, digest in recording_digests(part).items()}
+    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
