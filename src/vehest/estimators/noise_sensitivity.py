@@ -61,6 +61,10 @@ class NoiseSensitivity:
         """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse response."""
         return replace(self, memory=n_window)
 
+    def endless(self) -> NoiseSensitivity:
+        """The recursion's own, whatever window an estimator sees."""
+        return replace(self, memory=None)
+
     @property
     def poles(self) -> ComplexArray:
         """Poles of the recursion, the larger first."""
