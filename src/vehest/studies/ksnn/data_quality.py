@@ -13,7 +13,7 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.evaluation.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure, paper_style
-from vehest.studies.ksnn.subjects import car_colours, car_title, kinds_of, legend_above, listed
+from vehest.studies.ksnn.subjects import car_colours, car_title, kinds_of, legend_above, listed, plain_frequencies
 
 NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
@@ -191,7 +191,7 @@ def _figure_4(
             axes.set_ylabel("density [(m/s²)²/Hz]")
             axes.set_xlim(hz[0], HIGHEST_HZ)
         panels[-1].set_xlabel("frequency [Hz]")
-        _plain_frequencies(panels[-1])
+        plain_frequencies(panels[-1])
         legend_above(figure, panels[0], columns=2)
     segments = listed([f"{noise.n_segments} segments ({car_title(vehicle)})" for (vehicle, _), (_, noise) in spectra.items()])
     caption = (
@@ -199,14 +199,6 @@ def _figure_4(
         f"of {1.0 / next(iter(spectra.values()))[0].frequency[1]:.1f} s, {segments}; shaded where signal and noise differ."
     )
     return Figure("process_noise", caption, figure)
-
-
-def _plain_frequencies(axes: object) -> None:
-    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
-
-    axes.xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0, 2.0, 5.0]))  # type: ignore[attr-defined]
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))  # type: ignore[attr-defined]
-    axes.xaxis.set_minor_formatter(NullFormatter())  # type: ignore[attr-defined]
 
 
 def _noise_in_words(

@@ -90,6 +90,15 @@ def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None
     figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
 
 
+def plain_frequencies(axes: Any) -> None:
+    """Marks of a logarithmic axis in plain numbers, from 0.1 Hz."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+    axes.xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0, 2.0, 5.0]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
 def listed(words: Sequence[str]) -> str:
     """``a``, ``a and b``, ``a, b and c``."""
     return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
