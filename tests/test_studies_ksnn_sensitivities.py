@@ -73,8 +73,8 @@ def test_words_compare_the_right_way_round():
     band = {(row["estimator"], row["channel"]): row["band"] for row in frame[frame["yaw_rate"] == 0.2].to_dict("records")}
     more = band["KS-NN, seed 3", "ay"] / band["Luenberger", "ay"] - 1.0
     assert more > 0
-    assert f"{100 * more:.0f} % more of ay" in text
-    assert "less of ax" in text
+    assert f"{100 * more:.0f} % more of a_y" in text
+    assert "less of a_x" in text
 
 
 def test_observer_that_is_reset_is_said_to_be():
