@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.report.document import Block, Column, Document, Table
 from vehest.report.style import fixed, percent_below
-from vehest.studies.artefacts import EvaluatedModel, PartsArtefacts, StudyArtefacts
-from vehest.studies.ksnn import paper, scatter, tables
+from vehest.studies.artefacts import PartsArtefacts
+from vehest.studies.ksnn import analyses, paper, scatter, tables
 from vehest.studies.ksnn.candidates import chosen_by_category, runs_of, seeds_like
+from vehest.studies.ksnn.reading import words_of_kinds
 from vehest.studies.sweep import interval, mean_and_half
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
@@ -44,8 +43,11 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         *_headline(artefacts, runs),
         overview(artefacts, runs),
         *_how_it_was_made(artefacts),
+        "## The data",
+        *analyses.of_the_data(artefacts),
         "## The candidates",
         tables.instances(whole),
+        *analyses.of_activation(artefacts, runs),
         "## On the car trained on and on the other one",
         *_schemes(artefacts, runs),
         "## Sideslip angle, beside Kalman filter and factor graph",
@@ -54,29 +56,15 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     if "one_vehicle" in runs:
         blocks += ["## Without cross-vehicle regularisation", tables.regularisation(runs["scheme_2"], runs["one_vehicle"])]
     blocks += _other_cars(artefacts, runs)
+    blocks += ["## How acceleration noise comes through", *analyses.of_sensitivities(artefacts, runs)]
+    blocks += ["## What is left of the lateral velocity", *analyses.of_residuals(artefacts, runs)]
     blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), NOTE]
     data = {f"candidates_{name}": tables.candidates(runs[name], list(tables.SETS)) for name in SCHEMES}
     return Document(artefacts.title, blocks, data)
 
 
-def recordings_of(part: StudyArtefacts, spans: Iterable[Span]) -> list[Recording]:
-    """The scored ranges of a part at the evaluation rate, references included."""
-    return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
-
-
-def model_of(part: StudyArtefacts, run: pd.Series) -> EvaluatedModel:
-    """The model of a run."""
-    key = (run["estimator"], run["variant"], run["seed"])
-    return next(model for model in part.models if (model.estimator, model.variant, model.seed) == key)
-
-
-def kinds_in(part: StudyArtefacts) -> str:
-    """``real``, ``simulated`` or both, of all that a part draws on."""
-    return " and ".join(sorted({part.kinds[name] for name in part.split.datasets}))
-
-
 def _headline(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
-    kinds = {name: kinds_in(part) for name, part in artefacts.parts.items()}
+    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
     schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
     others = [f"{artefacts.titles[name]}: {kind}" for name, kind in kinds.items() if name not in SCHEMES]
     words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
@@ -123,7 +111,7 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
         [
             {
                 "part": artefacts.titles[name],
-                "kind": kinds_in(part),
+                "kind": words_of_kinds(part),
                 "train": _spans_in_words(part.split.train),
                 "validation": _spans_in_words(part.split.validation),
                 **{"tests": "; ".join(f"{test}: {_spans_in_words(spans)}" for test, spans in part.split.tests.items())},
@@ -150,7 +138,7 @@ def _spans_in_words(spans: Sequence[Span]) -> str:
 
 
 def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
-    kind = kinds_in(artefacts.parts["scheme_1"]).upper()
+    kind = words_of_kinds(artefacts.parts["scheme_1"]).upper()
     columns = [scatter.Scheme(artefacts.titles[name], runs[name], *known) for name, known in SCHEMES.items()]
     caption = (
         f"The candidates on the two test sets (Figure 6 of the paper), ours on {kind} cars: filled marks, the seed that validation chooses "
@@ -164,8 +152,8 @@ def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> lis
         learnt = " and ".join(dict.fromkeys(span.recording for span in part.split.train))
         caption = (
             f"Most general models per category, {artefacts.titles[name].lower()} (Table {number} of the paper): learnt on the car of "
-            f"{tables.SETS[own]} ({learnt}), stopped and chosen on the other. Ours: {kinds_in(part).upper()}. `seeds` is the mean over all "
-            f"seeds of that structure."
+            f"{tables.SETS[own]} ({learnt}), stopped and chosen on the other. Ours: {words_of_kinds(part).upper()}. "
+            f"`seeds` is the mean over all seeds of that structure."
         )
         blocks += [tables.most_general(runs[name], published, f"table_{4 if name == 'scheme_1' else 5}", caption)]
         blocks += [tables.order_in_words(runs[name], published, other)]
