@@ -72,6 +72,15 @@ def test_linearisation_is_the_tangent_of_nonlinear_feedback():
         np.testing.assert_allclose(model.weight * at + model.bias, models.feedback(np.array(at)), atol=1e-12)
 
 
+def test_gain_in_force_is_the_slope_of_the_chord_from_zero():
+    """It matters at e = 0 too, where the parts of e cancel and each of them is still fed back."""
+    linear, nonlinear = (LocalModels.of(ksnn_with_weights(2, n_hidden, True)) for n_hidden in (0, 2))
+    np.testing.assert_allclose(linear.secant(np.array([0.0, 1e-9, -0.3])), np.broadcast_to(linear.weight, (3, 2, 2)), rtol=1e-9)
+    np.testing.assert_allclose(nonlinear.secant(np.array(0.0)), nonlinear.slope(np.array(0.0)))
+    rise = nonlinear.feedback(np.array(0.5)) - nonlinear.feedback(np.array(0.0))
+    np.testing.assert_allclose(nonlinear.secant(np.array(0.5)) * 0.5, rise)
+
+
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_sub_models_add_up_to_the_network_along_a_drive(structure):
     estimator = ksnn_with_weights(*structure)

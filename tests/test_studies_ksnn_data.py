@@ -49,11 +49,18 @@ def test_planted_bias_is_told_beside_the_papers():
     assert "0.10 m/s²" in text.split("\n- ")[2]
 
 
-@pytest.mark.parametrize(("slide", "claim"), [(2.0, "As in the paper"), (0.5, "here it does not")])
+@pytest.mark.parametrize(
+    ("slide", "claim"), [(2.0, "of the simulated cars here it does."), (0.5, "of the simulated cars here it does not.")]
+)
 def test_words_on_the_cars_follow_the_drives(slide, claim):
     """The Ferrari's lateral velocity is made twice or half that of the Corvette at the same lateral acceleration."""
     text = _text(data_quality({"F-1": [_drive("ferrari", slide=slide)], "C-1": [_drive("corvette")]}, "made up"))
     assert claim in text
+
+
+def test_real_car_is_not_compared_with_a_simulated_one():
+    real = replace(_drive("ferrari"), kind="real")
+    assert "of the" not in _text(data_quality({"F-1": [real], "C-1": [_drive("corvette")]}, "made up")).split("Median")[1]
 
 
 def test_every_car_and_kind_has_a_panel_and_the_same_bytes_each_time(tmp_path):

@@ -12,6 +12,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.estimators.ksnn_linear import LocalModels
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.luenberger import Luenberger, LuenbergerSettings
+from vehest.estimators.noise_sensitivity import ksnn_sensitivity
 from vehest.estimators.recurrent import RecurrentSettings
 from vehest.report.document import Figure, Table
 from vehest.studies.ksnn.sensitivities import injected, sensitivities, sensitivity_of
@@ -73,8 +74,8 @@ def test_words_compare_the_right_way_round():
     band = {(row["estimator"], row["channel"]): row["band"] for row in frame[frame["yaw_rate"] == 0.2].to_dict("records")}
     more = band["KS-NN, seed 3", "ay"] / band["Luenberger", "ay"] - 1.0
     assert more > 0
-    assert f"{100 * more:.0f} % more of ay" in text
-    assert "less of ax" in text
+    assert f"{100 * more:.0f} % more of a_y" in text
+    assert "less of a_x" in text
 
 
 def test_observer_that_is_reset_is_said_to_be():
@@ -83,9 +84,13 @@ def test_observer_that_is_reset_is_said_to_be():
     assert "At |ω| = 0.4 rad/s the KS-NN passes" in text
 
 
-def test_nonlinear_network_is_shown_linearised_and_says_so():
-    figure = sensitivities([_pair(n_hidden=2)], n_samples=6000)[0]
-    assert "its linearisation at û = u_m" in figure.caption
+@pytest.mark.parametrize("error", [0.0, -0.4])
+def test_nonlinear_network_is_shown_linearised_where_it_is_told_and_says_so(error):
+    figure = sensitivities([_pair(n_hidden=2)], n_samples=6000, error=error)[0]
+    assert f"its linearisation at û − u_m = {error:g} m/s" in figure.caption
+    drawn = figure.static.axes[0].lines[0]
+    closed = ksnn_sensitivity(LocalModels.of(ksnn_with_weights(2, 2, False)).linearised(error), 0.2)
+    np.testing.assert_allclose(drawn.get_ydata(), np.abs(closed.response(drawn.get_xdata())[0]))
 
 
 def test_other_estimators_are_refused():

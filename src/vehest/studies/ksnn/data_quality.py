@@ -153,7 +153,7 @@ def _spectra(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]
 def _figure_4(
     groups: Mapping[tuple[str, str], Sequence[Recording]], spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]], source: str
 ) -> Figure:
-    colours = car_colours(vehicle for vehicle, _ in groups)
+    colours = car_colours(groups)
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN * 0.75, 0.6 + 1.75 * len(groups))
         panels = figure.subplots(len(groups), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -167,7 +167,7 @@ def _figure_4(
                 above,
                 below,
                 where=above >= below,
-                color=colours[vehicle],
+                color=colours[vehicle, kind],
                 alpha=0.16,
                 linewidth=0,
                 interpolate=True,
@@ -184,16 +184,16 @@ def _figure_4(
                 interpolate=True,
                 label="noise above signal",
             )
-            axes.loglog(hz, above, color=colours[vehicle], label="$\\dot{v}$")
+            axes.loglog(hz, above, color=colours[vehicle, kind], label="$\\dot{v}$")
             axes.loglog(hz, below, color=NOISE_COLOUR, linestyle="dashed", label="process noise $\\dot{v} - (a_y - \\omega u_m)$")
-            axes.set_title(f"{car_title(vehicle)}, {kind}", loc="left", color=colours[vehicle], fontweight="bold")
+            axes.set_title(f"{car_title(vehicle)}, {kind}", loc="left", color=colours[vehicle, kind], fontweight="bold")
             axes.set_title(f"mean bias {fixed(mean_bias(groups[vehicle, kind]), 3)} m/s²", loc="right")
             axes.set_ylabel("density [(m/s²)²/Hz]")
             axes.set_xlim(hz[0], HIGHEST_HZ)
         panels[-1].set_xlabel("frequency [Hz]")
         plain_frequencies(panels[-1])
         legend_above(figure, panels[0], columns=2)
-    segments = listed([f"{noise.n_segments} segments ({car_title(vehicle)})" for (vehicle, _), (_, noise) in spectra.items()])
+    segments = listed([f"{noise.n_segments} segments ({car_title(vehicle)}, {kind})" for (vehicle, kind), (_, noise) in spectra.items()])
     caption = (
         f"Periodograms of v̇ and of the process noise v̇ − (a_y − ωu_m), Figure 4 of the paper. Data: {source}. Welch's method, Hann windows "
         f"of {1.0 / next(iter(spectra.values()))[0].frequency[1]:.1f} s, {segments}; shaded where signal and noise differ."
@@ -217,7 +217,7 @@ def _noise_in_words(
 
 
 def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str) -> Figure:
-    colours = car_colours(vehicle for vehicle, _ in groups)
+    colours = car_colours(groups)
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN * 0.75, 3.4)
         axes = figure.add_subplot()
@@ -226,7 +226,7 @@ def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str
             ay, velocity = (np.concatenate([own[name] for own in recordings]) for name in ("ay", "vy_ref"))
             kept = np.linspace(0, len(ay) - 1, min(len(ay), MOST_POINTS)).round().astype(int)
             points.append(np.stack([ay[kept], velocity[kept]]))
-            point_colours += [colours[vehicle]] * len(kept)
+            point_colours += [colours[vehicle, kind]] * len(kept)
             centres, medians = _medians(ay, velocity)
             label = f"{car_title(vehicle)}, {kind}"
             marker = ("o", "s", "^", "D")[position % 4]
@@ -237,7 +237,7 @@ def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str
                 "markersize": 4.5,
                 "linewidth": 1.4,
             }
-            axes.plot(centres, medians, color=colours[vehicle], label=label, zorder=3, **looks)
+            axes.plot(centres, medians, color=colours[vehicle, kind], label=label, zorder=3, **looks)
             reach = max(reach, float(np.quantile(np.abs(velocity), 0.9995)))
         order = np.random.default_rng(0).permutation(len(point_colours))  # so that no car hides another
         scattered = np.concatenate(points, axis=1)[:, order]
@@ -273,9 +273,12 @@ def _handling_in_words(groups: Mapping[tuple[str, str], Sequence[Recording]]) ->
         for (vehicle, kind), size in sizes.items()
     ]
     text = f"Median |v| at |a_y| between {COMPARED_AY - 0.5:g} and {COMPARED_AY + 0.5:g} m/s²: {listed(words)}."
-    cars = {name: [size for (vehicle, _), size in sizes.items() if name in vehicle.lower()] for name in ("ferrari", "corvette")}
-    if not all(len(own) == 1 and np.isfinite(own[0]) for own in cars.values()):
-        return text
-    if cars["ferrari"][0] > cars["corvette"][0]:
-        return f"{text} As in the paper, the Ferrari reaches the larger lateral velocities for the same lateral acceleration."
-    return f"{text} In the paper the Ferrari reaches the larger lateral velocities; here it does not."
+    for kind in sorted({kind for _, kind in sizes}):
+        cars = {
+            name: [size for (vehicle, own), size in sizes.items() if own == kind and name in vehicle.lower()] for name in PUBLISHED_BIAS
+        }
+        if all(len(own) == 1 and np.isfinite(own[0]) for own in cars.values()):
+            larger = cars["ferrari"][0] > cars["corvette"][0]
+            text += " In the paper the Ferrari reaches the larger lateral velocities for the same lateral acceleration; "
+            text += f"of the {kind} cars here it {'does' if larger else 'does not'}."
+    return text

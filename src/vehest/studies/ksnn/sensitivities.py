@@ -24,7 +24,7 @@ YAW_RATES = (0.2, 0.4)
 """As in the paper: about the median of |ω| in its drives, and twice that [rad/s]."""
 LOWEST_HZ, HIGHEST_HZ = 0.01, 10.0
 CHANNELS = ("ay", "ax")
-INJECTED_SAMPLES = 60_000
+INJECTED_SAMPLES = 200_000
 INJECTED_SIZE = 0.5
 """Standard deviation of the injected noise [m/s²]."""
 SPEED = 25.0
@@ -46,20 +46,22 @@ class Injected:
     scatter: float
 
 
-def sensitivity_of(estimator: Estimator, yaw_rate: float) -> NoiseSensitivity:
-    """Closed form of an estimator at constant yaw rate: a KS-NN's by its windows, linearised at û = u_m where it is not linear.
+def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
+    """Closed form of an estimator at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
 
     Raises:
         ConfigurationError: it is neither a KS-NN nor a Luenberger observer.
     """
     if isinstance(estimator, Ksnn):
-        return ksnn_sensitivity(LocalModels.of(estimator).linearised(), yaw_rate).truncated(estimator.settings.window)
+        return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(estimator.settings.window)
     if isinstance(estimator, Luenberger):
         return luenberger_sensitivity(estimator, yaw_rate)
     raise ConfigurationError(f"noise sensitivities are known of 'ksnn' and 'luenberger', not of '{estimator.name}'")
 
 
-def injected(estimator: Estimator, yaw_rate: float, channel: str, *, n_samples: int = INJECTED_SAMPLES, seed: int = 0) -> Injected:
+def injected(
+    estimator: Estimator, yaw_rate: float, channel: str, *, n_samples: int = INJECTED_SAMPLES, seed: int = 0, error: float = 0.0
+) -> Injected:
     """Run an estimator through a steady turn with and without white noise in one acceleration.
 
     Args:
@@ -68,6 +70,7 @@ def injected(estimator: Estimator, yaw_rate: float, channel: str, *, n_samples: 
         channel: ``ay`` or ``ax``.
         n_samples: length of the turn, of which the first `SETTLING_SAMPLES` do not count.
         seed: of the noise.
+        error: û - u_m at which the closed form, from which the scatter comes, linearises a nonlinear network [m/s].
     """
     constants = {"yaw_rate": yaw_rate, "vx": SPEED, "ay": yaw_rate * SPEED, "ax": 0.0}
     clean = {name: np.full(n_samples, constants[name]) for name in estimator.channels}
@@ -75,33 +78,34 @@ def injected(estimator: Estimator, yaw_rate: float, channel: str, *, n_samples: 
     rate_hz = estimator.settings.rate_hz
     runs = estimator.estimate([Recording("turn", "none", rate_hz, 0.0, channels, "simulated") for channels in (clean, noisy)])
     added = (runs[1]["vy"] - runs[0]["vy"])[SETTLING_SAMPLES:]
-    response = sensitivity_of(estimator, yaw_rate).whole_impulse_responses()[CHANNELS.index(channel)]
+    response = sensitivity_of(estimator, yaw_rate, error).whole_impulse_responses()[CHANNELS.index(channel)]
     energy = float(np.sum(response**2))
     n_correlated = float(np.sum((np.correlate(response, response, mode="full") / energy) ** 2)) if energy else 0.0
     return Injected(float(np.sqrt(np.mean(added**2))) / INJECTED_SIZE, math.sqrt(n_correlated / (2 * len(added))))
 
 
-def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES) -> list[Block]:
+def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES, error: float = 0.0) -> list[Block]:
     """Magnitudes of H_Y and H_X, a column a training vehicle, with the check by injection.
 
     Args:
         columns: a KS-NN (linear, without bias, in the paper) and a Luenberger observer trained on the same data, by vehicle.
         n_samples: length of the turns into which noise is injected.
+        error: û - u_m at which nonlinear networks are linearised, 0 or what is typical of a drive [m/s].
 
     Raises:
         ConfigurationError: an estimator is of another kind.
     """
-    frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples)]) for pair in columns]
-    return [_figure(columns), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
+    frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)]) for pair in columns]
+    return [_figure(columns, error), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
 
 
-def _rows(own: Trained, n_samples: int) -> list[dict[str, object]]:
-    rows = []
+def _rows(own: Trained, n_samples: int, error: float) -> list[dict[str, object]]:
+    rows: list[dict[str, object]] = []
     for yaw_rate in YAW_RATES:
-        closed = sensitivity_of(own.estimator, yaw_rate)
+        closed = sensitivity_of(own.estimator, yaw_rate, error)
         for position, channel in enumerate(CHANNELS):
             gain, band = closed.white_noise_gains()[position], closed.band_gains(HIGHEST_HZ)[position]
-            found = injected(own.estimator, yaw_rate, channel, n_samples=n_samples)
+            found = injected(own.estimator, yaw_rate, channel, n_samples=n_samples, seed=len(rows), error=error)
             rows.append(
                 {
                     "trained_on": own.trained_on,
@@ -136,13 +140,13 @@ def _table(frame: pd.DataFrame, n_samples: int) -> Table:
     }
     caption = (
         "Closed form against injected noise: standard deviation of v̂ for white noise of 1 m/s² a sample in one acceleration, in a "
-        f"steady turn at {SPEED:g} m/s ({n_samples} samples, simulated, σ = {INJECTED_SIZE:g} m/s², seed 0). Estimators of different "
-        "rates are compared by the last column: noise of density 1 (m/s²)/√Hz from 0 to 10 Hz in either."
+        f"steady turn at {SPEED:g} m/s ({fixed(n_samples, 0)} samples, simulated, σ = {INJECTED_SIZE:g} m/s², seeds 0 to 3). "
+        "Estimators of different rates are compared by the last column: noise of density 1 (m/s²)/√Hz from 0 to 10 Hz in either."
     )
     return Table("noise_injection", caption, frame, columns)
 
 
-def _figure(columns: Sequence[tuple[Trained, Trained]]) -> Figure:
+def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
     frequency = np.geomspace(LOWEST_HZ, HIGHEST_HZ, 400)
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 4.4)
@@ -151,12 +155,12 @@ def _figure(columns: Sequence[tuple[Trained, Trained]]) -> Figure:
             for own in pair:
                 line = line_of(own.estimator.name, own.estimator.variant)
                 for yaw_rate, dash in zip(YAW_RATES, DASHES, strict=False):
-                    windowed = sensitivity_of(own.estimator, yaw_rate)
-                    endless = windowed.endless()
+                    windowed = sensitivity_of(own.estimator, yaw_rate, error)
+                    strong = windowed.endless() if _settles(windowed) else windowed
                     label = f"{own.estimator.title}, |ω| = {yaw_rate:g} rad/s"
-                    for axes, response, cut in zip(column, endless.response(frequency), windowed.response(frequency), strict=True):
+                    for axes, response, cut in zip(column, strong.response(frequency), windowed.response(frequency), strict=True):
                         axes.loglog(frequency, np.abs(response), color=line.colour, linestyle=dash, label=label)
-                        if windowed.memory is not None:
+                        if strong is not windowed and windowed.memory is not None:
                             axes.loglog(frequency, np.abs(cut), color=line.colour, linestyle=dash, linewidth=0.6, alpha=0.75)
             column[0].set_title(f"trained on {pair[0].trained_on}", loc="left")
             column[1].set_xlabel("frequency [Hz]")
@@ -167,13 +171,29 @@ def _figure(columns: Sequence[tuple[Trained, Trained]]) -> Figure:
         grid[0, 0].set_xlim(LOWEST_HZ, HIGHEST_HZ)
         legend_above(figure, grid[0, 0], columns=2)
     nonlinear = [own for own, _ in columns if isinstance(own.estimator, Ksnn) and own.estimator.settings.n_hidden]
-    linearised = " The KS-NN is nonlinear: shown is its linearisation at û = u_m." if nonlinear else ""
-    models = listed([own.described for pair in columns for own in pair])
+    linearised = f" The KS-NN is nonlinear: shown is its linearisation at û − u_m = {error:g} m/s." if nonlinear else ""
+    unstable = [
+        (own, yaw_rate)
+        for pair in columns
+        for own in pair
+        for yaw_rate in YAW_RATES
+        if not _settles(sensitivity_of(own.estimator, yaw_rate, error))
+    ]
+    growing = "".join(
+        f" The recursion of {own.described} does not settle at {yaw_rate:g} rad/s, where Appendix B says nothing: its window is shown."
+        for own, yaw_rate in unstable
+    )
+    models = "; ".join(own.described for pair in columns for own in pair)
     caption = (
         f"Sensitivities of v̂ to noise of the lateral and of the longitudinal acceleration, Figure 7 of the paper. Models: {models}. Strong "
-        f"lines: closed form of Appendix B; thin lines: of the windows that the network really sees, which forget.{linearised}"
+        f"lines: closed form of Appendix B; thin lines: of the windows that the network really sees, which forget.{linearised}{growing}"
     )
     return Figure("noise_sensitivities", caption, figure)
+
+
+def _settles(sensitivity: NoiseSensitivity) -> bool:
+    """Whether the recursion's own response to noise ends."""
+    return float(np.abs(sensitivity.poles[0])) < 1.0
 
 
 def _in_words(columns: Sequence[tuple[Trained, Trained]], frames: Sequence[pd.DataFrame]) -> str:
@@ -186,7 +206,7 @@ def _in_words(columns: Sequence[tuple[Trained, Trained]], frames: Sequence[pd.Da
             if not any(other):
                 words.append(f"At |ω| = {yaw_rate:g} rad/s the Luenberger observer is reset and passes nothing.")
                 continue
-            compared = [f"{_compared(*sizes)} of {channel}" for channel, *sizes in zip(CHANNELS, own, other, strict=True)]
+            compared = [f"{_compared(*sizes)} of a_{channel[1]}" for channel, *sizes in zip(CHANNELS, own, other, strict=True)]
             words.append(f"At |ω| = {yaw_rate:g} rad/s the KS-NN passes {listed(compared)} than the Luenberger observer.")
         sentences.append(f"**Trained on {ksnn.trained_on}.** {' '.join(words)}")
     everything = pd.concat(frames)

@@ -15,7 +15,12 @@ from vehest.studies.artefacts import EvaluatedModel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
-CAR_COLOURS = {"corvette": "#0b4f9c", "ferrari": "#c2182b"}
+CAR_COLOURS = {
+    ("corvette", "real"): "#0b4f9c",
+    ("corvette", "simulated"): "#2f9bc4",
+    ("ferrari", "real"): "#b3122a",
+    ("ferrari", "simulated"): "#ee8a4c",
+}
 OTHER_CARS = ("#00876c", "#a6761d", "#5b8c00", "#6d4c41")
 CAR_TITLES = {
     "corvette_grand_sport": "Corvette Grand Sport",
@@ -67,13 +72,19 @@ def car_title(vehicle: str) -> str:
     return CAR_TITLES.get(vehicle, vehicle.replace("_", " "))
 
 
-def car_colours(vehicles: Iterable[str]) -> dict[str, str]:
-    """A colour a car: blue for the Corvette, red for the Ferrari, others in the order of their names."""
+def car_colours(groups: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
+    """A colour a car and kind: blues for the Corvette, red and orange for the Ferrari, others in the order of their names.
+
+    Args:
+        groups: vehicle, and ``real`` or ``simulated``.
+    """
     others = iter(OTHER_CARS * 8)
-    known = {
-        vehicle: next((own for name, own in CAR_COLOURS.items() if name in vehicle.lower()), None) for vehicle in sorted(set(vehicles))
-    }
-    return {vehicle: colour or next(others) for vehicle, colour in known.items()}
+    known = {(vehicle, kind): CAR_COLOURS.get((_make(vehicle), kind)) for vehicle, kind in sorted(set(groups))}
+    return {group: colour or next(others) for group, colour in known.items()}
+
+
+def _make(vehicle: str) -> str:
+    return next((make for make, _ in CAR_COLOURS if make in vehicle.lower()), "")
 
 
 def kinds_of(recordings: Sequence[Recording]) -> str:
