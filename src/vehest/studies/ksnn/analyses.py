@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import pandas as pd
 
 from vehest.data.recording import Recording
@@ -13,11 +14,13 @@ from vehest.studies.ksnn import paper
 from vehest.studies.ksnn.activation import activation
 from vehest.studies.ksnn.candidates import chosen_by_category
 from vehest.studies.ksnn.data_quality import data_quality
+from vehest.studies.ksnn.interpretation import interpretation
 from vehest.studies.ksnn.reading import recordings_of, words_of_kinds
 from vehest.studies.ksnn.residuals import Panel, Residuals, residuals
 from vehest.studies.ksnn.sensitivities import sensitivities
 from vehest.studies.ksnn.subjects import Trained
 
+STRETCH_SECONDS = 30.0
 TRAINED_ON = {"scheme_1": "Corvette C-1", "scheme_2": "Ferrari F-1"}
 TESTED_ON = {"scheme_1": ("Ferrari F-2", "f2"), "scheme_2": ("Corvette C-2", "c2")}
 """Part -> the test set of the car that it does not train on."""
@@ -79,6 +82,24 @@ def of_residuals(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
             own.append(Residuals(model.estimator, model.variant, f"{model.title}{seed}", part.scored(model, test)))
         panels.append(Panel(title, TRAINED_ON[name], words_of_kinds(part), own, part.protocol.rate_hz))
     return residuals(panels) if panels else []
+
+
+def of_interpretation(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
+    """Section IV: networks of both schemes, and how an estimate comes about where a test drive slides most."""
+    picked = {name: chosen_by_category(runs[name]) for name in TRAINED_ON}
+    linear, nonlinear = (
+        [_trained(artefacts.parts[name], own[category], name) for name, own in picked.items() if category in own]
+        for category in (paper.LINEAR, paper.NONLINEAR)
+    )
+    if not linear:
+        return []
+    part = artefacts.parts["scheme_1"]
+    title, test = TESTED_ON["scheme_1"]
+    drive = recordings_of(part, part.split.tests[test])[0]
+    n = min(round(STRETCH_SECONDS * drive.rate_hz), len(drive))
+    first = int(np.convolve(np.square(drive["vy_ref"]), np.ones(n), mode="valid").argmax())
+    stretch = (float(drive.time[first]), float(drive.time[first + n - 1]))
+    return interpretation(linear, nonlinear, drive, stretch, f"{title}, {words_of_kinds(part)}, recording {drive.id}")
 
 
 def model_of(part: StudyArtefacts, run: pd.Series) -> EvaluatedModel:

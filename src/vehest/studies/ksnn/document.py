@@ -15,6 +15,7 @@ from vehest.studies.artefacts import PartsArtefacts
 from vehest.studies.ksnn import analyses, paper, scatter, tables
 from vehest.studies.ksnn.candidates import chosen_by_category, runs_of, seeds_like
 from vehest.studies.ksnn.reading import words_of_kinds
+from vehest.studies.ksnn.tilted import tilted
 from vehest.studies.sweep import interval, mean_and_half
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
@@ -50,6 +51,7 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         *analyses.of_activation(artefacts, runs),
         "## On the car trained on and on the other one",
         *_schemes(artefacts, runs),
+        *tilted(artefacts, runs, SCHEMES),
         "## Sideslip angle, beside Kalman filter and factor graph",
         tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole")),
     ]
@@ -58,6 +60,7 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     blocks += _other_cars(artefacts, runs)
     blocks += ["## How acceleration noise comes through", *analyses.of_sensitivities(artefacts, runs)]
     blocks += ["## What is left of the lateral velocity", *analyses.of_residuals(artefacts, runs)]
+    blocks += ["## What the networks have learnt", *analyses.of_interpretation(artefacts, runs)]
     blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), NOTE]
     data = {f"candidates_{name}": tables.candidates(runs[name], list(tables.SETS)) for name in SCHEMES}
     return Document(artefacts.title, blocks, data)
