@@ -42,11 +42,11 @@ STEADY_YAW_RATE = 0.4
 def interpretation(
     linear: Sequence[Trained], nonlinear: Sequence[Trained], drive: Recording, stretch: tuple[float, float], source: str
 ) -> list[Block]:
-    """Everything of Section IV: gains, sub-models of the first linear network along a drive, feedback functions.
+    """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions.
 
     Args:
-        linear: linear KS-NNs, one a training vehicle.
-        nonlinear: nonlinear KS-NNs.
+        linear: linear KS-NNs, one a training vehicle; may be empty.
+        nonlinear: nonlinear KS-NNs; may be empty.
         drive: at the networks' rate, with ``vy_ref``.
         stretch: of the drive, that is drawn [s].
         source: what the drive is, with real or simulated, for captions.
@@ -55,7 +55,9 @@ def interpretation(
         ConfigurationError: an estimator is no KS-NN of its kind.
         DataError: the drive lacks a channel, has another rate or no samples in the stretch.
     """
-    blocks = gain_curves(linear) + sub_models(linear[0], drive, stretch, source)
+    blocks = gain_curves(linear) if linear else []
+    for own in (*linear, *nonlinear)[:1]:
+        blocks += sub_models(own, drive, stretch, source)
     names = [f"feedback_{number}" for number in range(1, len(nonlinear) + 1)] if len(nonlinear) > 1 else ["feedback"]
     for name, own in zip(names, nonlinear, strict=False):
         blocks += feedback_functions(own, drive, source, name=name)
