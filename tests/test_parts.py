@@ -76,6 +76,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     for target in re.findall(r"\]\(([^)]+)\)", report):
         assert (results / target).is_file(), target
 
+    assert place("report", "both", "tracking=none")[0] == 0
     made = place.files()
     code, again, err = place("run", "both", "--jobs", "1", "--json", "tracking=none")
     assert json.loads(again)["overview"] == json.loads(out)["overview"]

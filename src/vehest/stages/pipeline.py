@@ -341,15 +341,15 @@ def _run_parts(
     absent: list[AbsentPart] = []
     waits = False
     for part in pipeline.parts:
-        try:
-            if part.optional:
+        if part.optional:
+            try:
                 workshop.look_for_files(configs[part.name][0])
+            except MissingError as error:
+                workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
+                absent.append(AbsentPart(part.name, part.title))
+                continue
+        try:
             compared[part.name] = compare(configs[part.name], workshop, f"vehest run {pipeline.file}", only_report=only_report)
-        except MissingError as error:
-            if not part.optional or only_report:
-                raise
-            workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
-            absent.append(AbsentPart(part.name, part.title))
         except NotThereYet:
             waits = True
     if waits:
