@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from vehest.filters.definiteness import factorised
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Filtered, Gaussian, stacked, symmetric
 from vehest.filters.sigma_points import SigmaRule
 
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -95,7 +95,7 @@ def unscented_filter(
         after = model.transition(points, u.unsqueeze(-2))
         mean = rule.mean(after)
         deviations = after - mean.unsqueeze(-2)
-        covariance = _symmetric(rule.covariance(deviations, deviations) + model.process_noise(state.mean, u))
+        covariance = symmetric(rule.covariance(deviations, deviations) + model.process_noise(state.mean, u))
         return _Predicted(Gaussian(model.possible(mean), covariance), repaired)
 
     def update(state: Gaussian[Tensor], y: Tensor, u: Tensor) -> _Updated:
@@ -133,7 +133,7 @@ def extended_filter(
 
     def predict(state: Gaussian[Tensor], u: Tensor) -> _Predicted:
         mean, slope = _linearised(model.transition, state.mean, u)
-        covariance = _symmetric(slope @ state.covariance @ slope.mT + model.process_noise(state.mean, u))
+        covariance = symmetric(slope @ state.covariance @ slope.mT + model.process_noise(state.mean, u))
         return _Predicted(Gaussian(model.possible(mean), covariance), torch.zeros_like(mean[..., 0], dtype=torch.bool))
 
     def update(state: Gaussian[Tensor], y: Tensor, u: Tensor) -> _Updated:
@@ -166,10 +166,10 @@ def _conditioned(
     noise = model.observation_noise(state.mean, u)
     noise = torch.where(measured.unsqueeze(-1) & measured.unsqueeze(-2), noise, identity)
     innovation = torch.where(measured, torch.where(measured, y, zero) - expected, zero)
-    covariance, factor, lost = factorised(_symmetric(own + noise), repair=repair)
+    covariance, factor, lost = factorised(symmetric(own + noise), repair=repair)
     gain = torch.cholesky_solve(cross.mT, factor).mT
     mean = model.possible(state.mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1))
-    posterior = Gaussian(mean, _symmetric(state.covariance - gain @ covariance @ gain.mT))
+    posterior = Gaussian(mean, symmetric(state.covariance - gain @ covariance @ gain.mT))
     whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False).squeeze(-1)
     determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     count = measured.sum(-1, dtype=y.dtype)
@@ -209,8 +209,8 @@ def _filtered(
         state = own.state
     axis = len(batch)
     steps = Filtered(
-        _stacked(predictions, axis),
-        _stacked([own.state for own in updates], axis),
+        stacked(predictions, axis),
+        stacked([own.state for own in updates], axis),
         torch.stack([own.innovation for own in updates], axis),
         torch.stack([own.innovation_covariance for own in updates], axis),
         ~torch.isnan(measurements),
@@ -225,11 +225,3 @@ def _linearised(function: Function, state: Tensor, u: Tensor) -> tuple[Tensor, T
     slope = torch.func.vmap(torch.func.jacfwd(function))(flat_state, flat_u)
     value = function(state, u)
     return value, slope.reshape(*value.shape, state.shape[-1])
-
-
-def _stacked(states: list[Gaussian[Tensor]], axis: int) -> Gaussian[Tensor]:
-    return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
-
-
-def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.mT)
