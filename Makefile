@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -57,6 +57,9 @@ docs: $(INSTALLED) ## write the reference pages that are made from the code
 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
+
+ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: about an hour
+	$(BIN)/vehest run pipelines/ksnn.yaml
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml

@@ -1,4 +1,4 @@
-"""Write the pages that are made from the code: docs/reference.md, docs/channels.md, docs/manoeuvres.md, and the leaderboard in README.md.
+"""Write the pages that are made from the code: docs/reference.md, docs/channels.md, docs/manoeuvres.md, and two tables in README.md.
 
 Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
 """
@@ -21,6 +21,9 @@ MADE = "<!-- Made by docs/make_reference.py (make docs); changes belong in the c
 BOARD_START = "<!-- leaderboard: made by docs/make_reference.py from results/ferrari_drive -->"
 BOARD_END = "<!-- end of leaderboard -->"
 BOARD_SOURCE = "results/ferrari_drive/tables/leaderboard_test.csv"
+ACROSS_START = "<!-- across vehicles: made by docs/make_reference.py from results/ksnn -->"
+ACROSS_END = "<!-- end of across vehicles -->"
+ACROSS_SOURCE = "results/ksnn/tables/overview.csv"
 
 ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
 TABLED = ("estimator", "training", "tracking")
@@ -35,7 +38,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
         root / "docs" / "reference.md": reference_page(root),
         root / "docs" / "channels.md": channels_page(),
         root / "docs" / "manoeuvres.md": manoeuvres_page(root),
-        readme: with_leaderboard(readme.read_text(encoding="utf-8"), root / BOARD_SOURCE),
+        readme: with_overview(with_leaderboard(readme.read_text(encoding="utf-8"), root / BOARD_SOURCE), root / ACROSS_SOURCE),
     }
 
 
@@ -247,9 +250,29 @@ def with_leaderboard(readme: str, source: Path) -> str:
         for row in rows
     ]
     table = _table(("estimator", "parameters", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"), lines, right=5)
-    before, rest = readme.split(BOARD_START)
-    after = rest.split(BOARD_END)[1]
-    return f"{before}{BOARD_START}\n{table}\n{BOARD_END}{after}"
+    return _between(readme, BOARD_START, BOARD_END, table)
+
+
+def with_overview(readme: str, source: Path) -> str:
+    """The README with what the study across vehicles came to; as it is where there are no results."""
+    if not source.is_file():
+        return readme
+    with open(source, newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    lines = []
+    for model in dict.fromkeys(row["model"] for row in rows):
+        own = [row for row in rows if row["model"] == model]
+        lines.append((model, *(f"{float(row[key]):.3f}" for row in own for key in ("paper_fvu_other", "fvu_other"))))
+    header = (
+        "estimator",
+        *(f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")),
+    )
+    return _between(readme, ACROSS_START, ACROSS_END, _table(header, lines, right=len(header) - 1))
+
+
+def _between(text: str, start: str, end: str, content: str) -> str:
+    before, rest = text.split(start)
+    return f"{before}{start}\n{content}\n{end}{rest.split(end)[1]}"
 
 
 def _commands() -> Iterable[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -185,6 +186,18 @@ def test_doctor_finds_this_machine_fit(place):
     code, out, _ = place("doctor", "--json")
     assert code == 0
     assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
+
+
+def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "gtsam" else find(name, *rest))
+    code, out, _ = place("doctor", "--json")
+    assert code == 0
+    (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
+    assert (extras["level"], extras["message"]) == (
+        "warning",
+        "factor graphs need 'vehest[factor-graph]': pip install it where you need it",
+    )
 
 
 def test_help_shows_choices_and_answers_quickly(place):

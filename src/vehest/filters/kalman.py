@@ -8,7 +8,7 @@ from typing import Generic, NamedTuple
 import torch
 from torch import Tensor
 
-from vehest.filters.gaussian import Array, Filtered, Gaussian
+from vehest.filters.gaussian import Array, Filtered, Gaussian, stacked, symmetric
 
 
 class LinearModel(NamedTuple, Generic[Array]):
@@ -75,8 +75,8 @@ def kalman_filter(model: LinearModel[Tensor], measurements: Tensor, initial: Gau
         state = update.state
     axis = len(batch)
     return Filtered(
-        _stacked(predicted, axis),
-        _stacked([update.state for update in updates], axis),
+        stacked(predicted, axis),
+        stacked([update.state for update in updates], axis),
         torch.stack([update.innovation for update in updates], axis),
         torch.stack([update.innovation_covariance for update in updates], axis),
         ~torch.isnan(measurements),
@@ -103,7 +103,7 @@ def predict(state: Gaussian[Tensor], transition: Tensor, offset: Tensor, noise: 
         noise: Q, (..., n, n).
     """
     mean = _times(transition, state.mean) + offset
-    return Gaussian(mean, _symmetric(transition @ state.covariance @ transition.mT + noise))
+    return Gaussian(mean, symmetric(transition @ state.covariance @ transition.mT + noise))
 
 
 def condition_on(state: Gaussian[Tensor], measurement: Tensor, observation: Tensor, offset: Tensor, noise: Tensor) -> Update:
@@ -125,13 +125,13 @@ def condition_on(state: Gaussian[Tensor], measurement: Tensor, observation: Tens
     noise = torch.where(measured.unsqueeze(-1) & measured.unsqueeze(-2), noise, identity)
     innovation = torch.where(measured, measurement, zero) - _times(observation, state.mean) - torch.where(measured, offset, zero)
     cross = observation @ state.covariance
-    covariance = _symmetric(cross @ observation.mT + noise)
+    covariance = symmetric(cross @ observation.mT + noise)
     factor = torch.linalg.cholesky(covariance)
     gain = torch.cholesky_solve(cross, factor).mT
     kept = torch.eye(state.mean.shape[-1], dtype=measurement.dtype, device=measurement.device) - gain @ observation
     posterior = Gaussian(
         state.mean + _times(gain, innovation),
-        _symmetric(kept @ state.covariance @ kept.mT + gain @ noise @ gain.mT),
+        symmetric(kept @ state.covariance @ kept.mT + gain @ noise @ gain.mT),
     )
     whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False).squeeze(-1)
     determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -165,10 +165,10 @@ def smooth(model: LinearModel[Tensor], filtered: Filtered[Tensor]) -> Gaussian[T
         gain = torch.cholesky_solve(transition[..., k, :, :] @ own, torch.linalg.cholesky(expected.covariance)).mT
         state = Gaussian(
             means[..., k, :] + _times(gain, state.mean - expected.mean),
-            _symmetric(own + gain @ (state.covariance - expected.covariance) @ gain.mT),
+            symmetric(own + gain @ (state.covariance - expected.covariance) @ gain.mT),
         )
         states.append(state)
-    return _stacked(states[::-1], means.dim() - 2)
+    return stacked(states[::-1], means.dim() - 2)
 
 
 def shapes_of(n: int, m: int) -> tuple[tuple[int, ...], ...]:
@@ -194,13 +194,5 @@ def _expand(name: str, part: Tensor, shape: tuple[int, ...]) -> Tensor:
         raise ValueError(f"{name} of shape {tuple(part.shape)} does not fit {shape}") from None
 
 
-def _stacked(states: list[Gaussian[Tensor]], axis: int) -> Gaussian[Tensor]:
-    return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
-
-
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
-
-
-def _symmetric(matrix: Tensor) -> Tensor:
-    return 0.5 * (matrix + matrix.mT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import platform
 import shutil
@@ -13,6 +14,9 @@ from typing import Literal
 
 from vehest.stages.artefacts import library_versions
 from vehest.stages.config_files import packaged_conf, packaged_pipelines
+
+EXTRAS = {"ros": ("rosbags", "ROS 2 bags"), "mdf": ("asammdf", "MDF files"), "factor-graph": ("gtsam", "factor graphs")}
+"""Extra -> the package it brings, and what needs it."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class Item:
 
 def examine() -> list[Item]:
     """Look at everything that vehest relies on."""
-    return [look() for look in (_python, _configuration, _torch, _kernels, _compiler, _data, _output, _disk, _cores, _graphics)]
+    looks = (_python, _configuration, _torch, _kernels, _compiler, _extras, _data, _output, _disk, _cores, _graphics)
+    return [look() for look in looks]
 
 
 def _python() -> Item:
@@ -68,6 +73,13 @@ def _compiler() -> Item:
     if not headers.is_file():
         return Item("warning", "C++ compiler", f"{compiler}, but Python's headers are missing; torch.compile is not available")
     return Item("ok", "C++ compiler", compiler)
+
+
+def _extras() -> Item:
+    absent = [f"{what} need 'vehest[{extra}]'" for extra, (package, what) in EXTRAS.items() if importlib.util.find_spec(package) is None]
+    if absent:
+        return Item("warning", "extras", f"{'; '.join(absent)}: pip install it where you need it")
+    return Item("ok", "extras", f"{', '.join(EXTRAS)} are there")
 
 
 def _data() -> Item:

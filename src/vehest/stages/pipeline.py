@@ -31,7 +31,7 @@ from vehest.stages.workshop import NotThereYet, Workshop
 
 COMPARISON = {"split", "sweeps"}
 SURVEY = {"datasets", "optional_datasets"}
-KEYS = {"study", "title", "about", "report", "publish", "evaluation", "parts", *COMPARISON, *SURVEY}
+KEYS = {"study", "title", "about", "report", "publish", "evaluation", "parts", "based_on", *COMPARISON, *SURVEY}
 PART_KEYS = {*COMPARISON, "title", "optional"}
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
 
@@ -116,18 +116,7 @@ def read_pipeline(name: str) -> Pipeline:
         MissingError: there is none of that name.
         ConfigurationError: the file is not a pipeline.
     """
-    file = find_pipeline(name)
-    if file is None:
-        close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
-        hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
-        raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict) or set(content) - KEYS:
-        reason = f"unknown key '{min(set(content) - KEYS)}'" if isinstance(content, dict) else "it holds no keys"
-        raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
+    file, content = _content_of(name)
     form = _form_of(content, file)
     datasets, optional = (_names_in(content.get(key, []), f"'{file}': {key}") for key in ("datasets", "optional_datasets"))
     if form == "datasets" and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
@@ -149,6 +138,34 @@ def read_pipeline(name: str) -> Pipeline:
         datasets=datasets,
         optional_datasets=optional,
     )
+
+
+def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, Any]]:
+    """A pipeline's file and its keys, on top of those of the one it is based on."""
+    file = find_pipeline(name)
+    if file is None:
+        close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
+        hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
+        raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict) or set(content) - KEYS:
+        reason = f"unknown key '{min(set(content) - KEYS)}'" if isinstance(content, dict) else "it holds no keys"
+        raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
+    if "based_on" not in content:
+        return file, content
+    if as_base:
+        raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{content['based_on']}'")
+    _, base = _content_of(str(content["based_on"]), as_base=True)
+    own, parts = content.get("parts") or {}, base.get("parts") or {}
+    if not isinstance(own, dict) or not isinstance(parts, dict) or not all(isinstance(part, dict) for part in own.values()):
+        raise ConfigurationError(f"'{file}': parts must be names, each with what it changes")
+    if set(own) - set(parts):
+        raise ConfigurationError(f"'{file}': '{content['based_on']}' has no part '{min(set(own) - set(parts))}'")
+    merged = {**base, **{key: value for key, value in content.items() if key != "based_on"}}
+    return file, merged | ({"parts": {key: {**part, **own.get(key, {})} for key, part in parts.items()}} if parts else {})
 
 
 def _form_of(content: Mapping[str, Any], file: Path) -> str:
@@ -324,15 +341,15 @@ def _run_parts(
     absent: list[AbsentPart] = []
     waits = False
     for part in pipeline.parts:
-        try:
-            if part.optional:
+        if part.optional:
+            try:
                 workshop.look_for_files(configs[part.name][0])
+            except MissingError as error:
+                workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
+                absent.append(AbsentPart(part.name, part.title))
+                continue
+        try:
             compared[part.name] = compare(configs[part.name], workshop, f"vehest run {pipeline.file}", only_report=only_report)
-        except MissingError as error:
-            if not part.optional or only_report:
-                raise
-            workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
-            absent.append(AbsentPart(part.name, part.title))
         except NotThereYet:
             waits = True
     if waits:

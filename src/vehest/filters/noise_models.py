@@ -1,0 +1,121 @@
+"""Covariances of noise that can be learnt: constant, linear in the state, or fixed; and a floor for their entropy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+FLOOR = 1e-7
+"""Added to the diagonal, so that a covariance stays positive definite (Węgrzynowski et al. 2024, Eq. 7)."""
+
+
+class ConstantNoise(nn.Module):
+    """A full covariance L Lᵀ + floor · I with a lower triangular factor that is learnt.
+
+    Args:
+        variances: its diagonal to begin with, n of them.
+        floor: see `FLOOR`.
+
+    Source: Węgrzynowski et al. 2024, Eq. 7.
+    """
+
+    def __init__(self, variances: Sequence[float], floor: float = FLOOR) -> None:
+        super().__init__()
+        start = _checked(variances)
+        self.floor = floor
+        self.n = len(start)
+        self.factor = nn.Parameter(start.sqrt().diag()[_lower(self.n)])
+
+    def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
+        """The covariance, (..., n, n), the same for every state (..., k)."""
+        return _product(self.factor, self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
+
+
+class StateDependentNoise(nn.Module):
+    """A constant covariance and a part of which the factor is linear in the state: Q + scale · L(x) L(x)ᵀ.
+
+    Args:
+        variances: diagonal of the constant part to begin with, n of them.
+        n_states: length k of the state.
+        scale: weight of the part that depends on the state.
+        deviation: of the random weights of L to begin with; its offsets start at 0.
+        generator: of these.
+        floor: see `FLOOR`.
+
+    Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors' code.
+    """
+
+    def __init__(
+        self,
+        variances: Sequence[float],
+        n_states: int,
+        *,
+        scale: float = 0.01,
+        deviation: float = 1e-3,
+        generator: torch.Generator | None = None,
+        floor: float = FLOOR,
+    ) -> None:
+        super().__init__()
+        self.constant = ConstantNoise(variances, floor)
+        self.scale = scale
+        count = self.constant.n * (self.constant.n + 1) // 2
+        self.weight = nn.Parameter(deviation * torch.randn(count, n_states, generator=generator))
+        self.offset = nn.Parameter(torch.zeros(count))
+
+    def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
+        """The covariance of each state, (..., n, n)."""
+        factor = nn.functional.linear(state, self.weight, self.offset)
+        return self.constant(state, inputs) + self.scale * _product(factor, self.constant.n, 0.0)
+
+
+class FixedNoise(nn.Module):
+    """A diagonal covariance that is not learnt.
+
+    Args:
+        variances: n of them.
+    """
+
+    covariance: Tensor
+
+    def __init__(self, variances: Sequence[float]) -> None:
+        super().__init__()
+        self.register_buffer("covariance", _checked(variances).diag())
+
+    def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
+        """The covariance, (..., n, n)."""
+        return self.covariance.expand(*state.shape[:-1], *self.covariance.shape)
+
+
+def entropy(covariance: Tensor) -> Tensor:
+    """Differential entropy of a normal distribution [nat], (..., n, n) -> (...)."""
+    n = covariance.shape[-1]
+    return 0.5 * (n * math.log(2.0 * math.pi * math.e) + torch.linalg.slogdet(covariance).logabsdet)
+
+
+def with_entropy(covariance: Tensor, least: float) -> Tensor:
+    """The covariance, scaled up where its entropy lies below ``least`` [nat]; the shape of its ellipsoid stays."""
+    short = (least - entropy(covariance)).clamp(min=0.0)
+    return torch.exp(2.0 / covariance.shape[-1] * short)[..., None, None] * covariance
+
+
+def _product(factor: Tensor, n: int, floor: float) -> Tensor:
+    """L Lᵀ + floor · I of the entries of L row by row, (..., n (n + 1) / 2) -> (..., n, n)."""
+    rows, columns = _lower(n)
+    lower = factor.new_zeros(*factor.shape[:-1], n, n)
+    lower[..., rows, columns] = factor
+    return lower @ lower.mT + floor * torch.eye(n, dtype=factor.dtype, device=factor.device)
+
+
+def _lower(n: int) -> tuple[Tensor, Tensor]:
+    rows, columns = torch.tril_indices(n, n)
+    return rows, columns
+
+
+def _checked(variances: Sequence[float]) -> Tensor:
+    values = torch.as_tensor(list(variances), dtype=torch.get_default_dtype())
+    if values.ndim != 1 or not len(values) or not bool((values > 0).all()):
+        raise ValueError(f"variances must be positive numbers, not {list(variances)}")
+    return values

@@ -1,0 +1,115 @@
+"""What the analyses look at: drives of cars and trained estimators, and how these are named and coloured in every figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.estimators.model_files import load_model
+from vehest.report.style import MISSING
+from vehest.studies.artefacts import EvaluatedModel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+CAR_COLOURS = {
+    ("corvette", "real"): "#0b4f9c",
+    ("corvette", "simulated"): "#2f9bc4",
+    ("ferrari", "real"): "#b3122a",
+    ("ferrari", "simulated"): "#ee8a4c",
+}
+OTHER_CARS = ("#00876c", "#a6761d", "#5b8c00", "#6d4c41")
+CAR_TITLES = {
+    "corvette_grand_sport": "Corvette Grand Sport",
+    "ferrari_250_lm": "Ferrari 250 LM",
+    "ferrari_250lm": "Ferrari 250 LM",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A fitted estimator with what a caption has to say of it.
+
+    Args:
+        estimator: fitted.
+        title: its structure, for people.
+        trained_on: data that it learned from, with real or simulated, for example ``Corvette C-1, simulated``.
+        seed: of its training; none where nothing is random.
+    """
+
+    estimator: Estimator
+    title: str
+    trained_on: str
+    seed: int | None = None
+
+    @classmethod
+    def of(cls, model: EvaluatedModel, trained_on: str) -> Trained:
+        """Load it from the folder of an evaluated model.
+
+        Raises:
+            MissingError: there is no model.
+            DataError: a file is damaged.
+        """
+        estimator = load_model(model.model_folder)
+        return cls(estimator, model.title, trained_on, model.seed if estimator.name != "luenberger" else None)
+
+    @property
+    def named(self) -> str:
+        """Title and seed."""
+        return self.title if self.seed is None else f"{self.title}, seed {self.seed}"
+
+    @property
+    def described(self) -> str:
+        """Title, seed and training data, for captions."""
+        return f"{self.named}, trained on {self.trained_on}"
+
+
+def car_title(vehicle: str) -> str:
+    """Name of a car for people."""
+    return CAR_TITLES.get(vehicle, vehicle.replace("_", " "))
+
+
+def car_colours(groups: Iterable[tuple[str, str]]) -> dict[tuple[str, str], str]:
+    """A colour a car and kind: blues for the Corvette, red and orange for the Ferrari, others in the order of their names.
+
+    Args:
+        groups: vehicle, and ``real`` or ``simulated``.
+    """
+    others = iter(OTHER_CARS * 8)
+    known = {(vehicle, kind): CAR_COLOURS.get((_make(vehicle), kind)) for vehicle, kind in sorted(set(groups))}
+    return {group: colour or next(others) for group, colour in known.items()}
+
+
+def _make(vehicle: str) -> str:
+    return next((make for make, _ in CAR_COLOURS if make in vehicle.lower()), "")
+
+
+def kinds_of(recordings: Sequence[Recording]) -> str:
+    """``real``, ``simulated`` or ``real and simulated``."""
+    return " and ".join(sorted({recording.kind for recording in recordings})) or MISSING
+
+
+def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:
+    """One legend over the figure with every label of some axes once."""
+    entries: dict[str, Any] = {}
+    for own in axes:
+        for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
+
+
+def plain_frequencies(axes: Any) -> None:
+    """Marks of a logarithmic axis in plain numbers, from 0.1 Hz."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
+
+    axes.xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0, 2.0, 5.0]))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def listed(words: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

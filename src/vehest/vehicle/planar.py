@@ -1,0 +1,119 @@
+"""A single track with a powertrain, in the plane: x = (vx, vy, yaw rate, rim speed), u = (steering angle, motor current).
+
+    dvx/dt = (F_xr + F_xf cos δ - F_yf sin δ - F_drag)/m + vy r
+    dvy/dt = (F_xf sin δ + F_yr + F_yf cos δ)/m - vx r
+    dr/dt  = ((F_xf sin δ + F_yf cos δ) lf - F_yr lr)/Iz
+    dω/dt  = R/Ie (kφ Iq - R (F_xf + F_xr) - b1 ω - b0 sign ω)
+
+Source: Węgrzynowski et al. 2024, Eq. 2; drag and powertrain as in its authors' code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from vehest.vehicle.positive import PositiveParameters
+from vehest.vehicle.tyres import Slips, TyreForces, slips_of
+
+GRAVITY = 9.81  # m/s²
+
+
+@dataclass(frozen=True)
+class Chassis:
+    """What of a car is known.
+
+    Args:
+        mass: [kg].
+        wheelbase: [m].
+        wheel_radius: R [m].
+    """
+
+    mass: float
+    wheelbase: float
+    wheel_radius: float
+
+
+F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)
+"""As in the public code of Węgrzynowski et al. 2024; the paper says 4.5 kg."""
+
+F1TENTH_START: Mapping[str, float] = {
+    "yaw_inertia": 0.46,
+    "cg_to_rear_axle": 0.115,
+    "drag_constant": 0.1,
+    "drag_linear": 0.01,
+    "drag_quadratic": 0.1,
+    "powertrain_inertia": 0.2,
+    "torque_constant": 0.90064745,
+    "friction_viscous": 0.304115174,
+    "friction_coulomb": 0.50421894,
+}
+"""What is learnt of it, and from where learning starts; the same source."""
+
+
+class Motion(NamedTuple):
+    """Rates of a planar car.
+
+    Attributes:
+        rates: dx/dt, (..., 4).
+        ax, ay: what an accelerometer at the centre of gravity reads (...) [m/s²].
+    """
+
+    rates: Tensor
+    ax: Tensor
+    ay: Tensor
+
+
+class PlanarCar(nn.Module):
+    """The car without its tyres.
+
+    Args:
+        chassis: what is known.
+        start: what is learnt, as `F1TENTH_START`.
+    """
+
+    def __init__(self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START) -> None:
+        super().__init__()
+        self.chassis = chassis
+        self.learnt = PositiveParameters(start)
+
+    @property
+    def to_front_axle(self) -> Tensor:
+        """Distance of the front axle from the centre of gravity [m]."""
+        return self.chassis.wheelbase - self.learnt["cg_to_rear_axle"]
+
+    def slips(self, state: Tensor, inputs: Tensor) -> Slips:
+        """How the tyres slide."""
+        vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
+        return slips_of(vx, vy, yaw_rate, rim_speed, inputs[..., 0], self.to_front_axle, self.learnt["cg_to_rear_axle"])
+
+    def loads(self) -> tuple[Tensor, Tensor]:
+        """Static load of the front and the rear axle [N]."""
+        weight = self.chassis.mass * GRAVITY / self.chassis.wheelbase
+        return weight * self.learnt["cg_to_rear_axle"], weight * self.to_front_axle
+
+    def motion(self, state: Tensor, inputs: Tensor, forces: TyreForces) -> Motion:
+        """Rates under given tyre forces.
+
+        Args:
+            state: vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more).
+            inputs: steering angle [rad], motor current [A], (..., 2).
+            forces: of both axles.
+        """
+        p, chassis = self.learnt, self.chassis
+        vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
+        steer, current = inputs.unbind(-1)
+        sine, cosine = torch.sin(steer), torch.cos(steer)
+        drag = p["drag_constant"] * torch.sign(vx) + p["drag_linear"] * vx + p["drag_quadratic"] * vx.square()
+        sideways = forces.front_x * sine + forces.front_y * cosine
+        ax = (forces.rear_x + forces.front_x * cosine - forces.front_y * sine - drag) / chassis.mass
+        ay = (sideways + forces.rear_y) / chassis.mass
+        turning = (sideways * self.to_front_axle - forces.rear_y * p["cg_to_rear_axle"]) / p["yaw_inertia"]
+        lost = p["friction_viscous"] * rim_speed + p["friction_coulomb"] * torch.sign(rim_speed)
+        torque = p["torque_constant"] * current - chassis.wheel_radius * (forces.front_x + forces.rear_x) - lost
+        spinning = chassis.wheel_radius / p["powertrain_inertia"] * torque
+        return Motion(torch.stack([ax + vy * yaw_rate, ay - vx * yaw_rate, turning, spinning], -1), ax, ay)

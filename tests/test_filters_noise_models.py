@@ -1,0 +1,78 @@
+"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from vehest.filters.noise_models import FLOOR, ConstantNoise, FixedNoise, StateDependentNoise, entropy, with_entropy
+
+STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
+START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
+
+
+@pytest.fixture(params=["constant", "state dependent", "fixed"])
+def noise(request) -> torch.nn.Module:
+    return {
+        "constant": lambda: ConstantNoise(START),
+        "state dependent": lambda: StateDependentNoise(START, 5, generator=torch.Generator().manual_seed(1)),
+        "fixed": lambda: FixedNoise(START),
+    }[request.param]()
+
+
+def test_every_noise_starts_near_the_variances_it_was_given(noise):
+    covariance = noise(STATE, INPUTS)
+    assert covariance.shape == (7, 5, 5)
+    assert torch.allclose(covariance, torch.diag(torch.tensor(START)), atol=2e-6)
+
+
+def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
+    for noise in (ConstantNoise(START), StateDependentNoise(START, 5)):
+        for parameter in noise.parameters():
+            torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(2))
+        covariance = noise.double()(STATE.double(), INPUTS.double())
+        assert (torch.linalg.eigvalsh(covariance) >= 0.99 * FLOOR).all()
+        covariance.square().sum().backward()
+        assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in noise.parameters())
+
+
+def test_a_factor_of_zero_leaves_the_floor():
+    noise = ConstantNoise([1.0, 1.0])
+    torch.nn.init.zeros_(noise.factor)
+    assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
+
+
+def test_state_dependent_noise_is_the_formula_written_out():
+    noise = StateDependentNoise([0.2, 0.3], 5, generator=torch.Generator().manual_seed(3), deviation=0.5)
+    a, b, c = (noise.weight @ STATE[2]).tolist()
+    lower = torch.tensor([[a, 0.0], [b, c]])
+    assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
+
+
+def test_noises_have_as_many_parameters_as_their_factors():
+    counts = [sum(parameter.numel() for parameter in noise.parameters()) for noise in (ConstantNoise(START), FixedNoise(START))]
+    assert counts == [15, 0]
+    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
+
+
+def test_entropy_is_that_of_an_independent_library():
+    root = torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
+    for own, value in zip(covariance, entropy(covariance), strict=True):
+        assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
+
+
+def test_entropy_below_the_floor_is_raised_to_it_and_above_is_left():
+    small, large = 1e-4 * torch.eye(5, dtype=torch.float64), 10.0 * torch.eye(5, dtype=torch.float64)
+    small[0, 1] = small[1, 0] = 5e-5
+    raised = with_entropy(torch.stack([small, large]), -9.0)
+    assert float(entropy(raised[0])) == pytest.approx(-9.0)
+    assert torch.allclose(raised[0] / raised[0, 0, 0], small / small[0, 0]), "only its size has changed"
+    assert torch.equal(raised[1], large)
+
+
+@pytest.mark.parametrize("variances", [[], [1.0, 0.0], [-1.0], [float("nan")]])
+def test_variances_that_make_no_sense_are_refused(variances):
+    with pytest.raises(ValueError, match="positive"):
+        ConstantNoise(variances)
