@@ -130,10 +130,17 @@ def test_order_says_which_pairs_are_the_other_way_round():
     assert isinstance(words, str)
     assert "Paper: KS-NN linear no bias (0.152), KS-NN nonlinear + bias (0.216), Luenberger (0.253), GRU (0.279)." in words
     assert "Ours: KS-NN linear no bias (0.130), Luenberger (0.210), GRU (0.290), KS-NN nonlinear + bias (0.400)." in words
-    assert "2 of 6 pairs are the other way round here" in words
-    assert "Luenberger before KS-NN nonlinear + bias (0.210 against 0.400)" in words
+    assert "2 of 6 pairs are the other way round here, 1 of them by more than chance" in words
+    assert words.endswith("Luenberger before KS-NN nonlinear + bias (0.210 against 0.400).")
+    assert "GRU before" not in words, "its two seeds lie between 0.01 and 0.29"
     agreeing = {name: values for name, values in FIGURES.items() if name[0] != "ksnn" or "no_bias" in name[1]}
     assert "in all 3 pairs" in str(tables.order_in_words(runs_of(part(agreeing)), paper.TABLE_IV, "f2"))
+
+
+def test_specialisation_is_the_ratio_of_the_two_cars():
+    words = tables.specialisation_in_words(runs_of(part()), paper.TABLE_IV, "c2", "f2")
+    assert "FVU on F-2 over C-2" in words
+    assert "KS-NN nonlinear + bias 2.8 in the paper, 8.0 here" in words
 
 
 def test_sideslip_table_has_a_column_a_kind_of_data():

@@ -79,9 +79,8 @@ def _headline(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> li
         )
     sentences = [_scheme_sentence(artefacts.titles[name], runs[name], other) for name, (_, _, other) in SCHEMES.items()]
     fits = sum(len(own) for own in runs.values())
-    sentences.append(
-        f"{fits} fits in all, {sum(own['variant'].nunique() for name, own in runs.items() if name in SCHEMES)} candidates in two schemes."
-    )
+    candidates = len(pd.concat([runs[name] for name in SCHEMES]).drop_duplicates(["estimator", "variant"]))
+    sentences.append(f"{fits} fits in all; {candidates} candidates in each of two schemes.")
     return [words, " ".join(sentences), artefacts.about]
 
 
@@ -152,14 +151,14 @@ def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> lis
     blocks: list[Block] = [scatter.two_tests(columns, caption)]
     for number, (name, (published, own, other)) in zip(("IV", "V"), SCHEMES.items(), strict=True):
         part = artefacts.parts[name]
-        learnt = " and ".join(dict.fromkeys(span.recording for span in part.split.train))
+        learnt = ", ".join(dict.fromkeys(span.recording for span in part.split.train))
         caption = (
             f"Most general models per category, {artefacts.titles[name].lower()} (Table {number} of the paper): learnt on the car of "
             f"{tables.SETS[own]} ({learnt}), stopped and chosen on the other. Ours: {words_of_kinds(part).upper()}. "
             f"`seeds` is the mean over all seeds of that structure."
         )
         blocks += [tables.most_general(runs[name], published, f"table_{4 if name == 'scheme_1' else 5}", caption)]
-        blocks += [tables.order_in_words(runs[name], published, other)]
+        blocks += [tables.order_in_words(runs[name], published, other), tables.specialisation_in_words(runs[name], published, own, other)]
     return blocks
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from vehest.report.document import Block, Column, Table
+from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest.studies.ksnn import paper
 from vehest.studies.ksnn.candidates import chosen, chosen_by_category, seeds_like
@@ -192,10 +192,15 @@ def candidates(runs: pd.DataFrame, tests: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def order_in_words(runs: pd.DataFrame, published: Mapping[str, Published], other: str) -> Block:
-    """The order of categories by FVU on the car not trained on, in the paper and here, and where they disagree."""
-    ours = {name: float(run[f"fvu.{other}"]) for name, run in chosen_by_category(runs).items() if name in published}
+def order_in_words(runs: pd.DataFrame, published: Mapping[str, Published], other: str) -> str:
+    """The order of categories by FVU on the car not trained on, in the paper and here, and where they disagree by more than chance.
+
+    By more than chance: the 95 % intervals of the means over seeds do not overlap.
+    """
+    picked = {name: run for name, run in chosen_by_category(runs).items() if name in published}
+    ours = {name: float(run[f"fvu.{other}"]) for name, run in picked.items()}
     theirs = {name: published[name].fvu(other) for name in ours}
+    over_seeds = {name: interval(seeds_like(runs, run)[f"fvu.{other}"].to_numpy(dtype=float)) for name, run in picked.items()}
     lists = [sorted(values, key=values.__getitem__) for values in (theirs, ours)]
     pairs = [(a, b) for position, a in enumerate(lists[0]) for b in lists[0][position + 1 :]]
     swapped = [(a, b) for a, b in pairs if ours[a] > ours[b]]
@@ -205,8 +210,32 @@ def order_in_words(runs: pd.DataFrame, published: Mapping[str, Published], other
     )
     if not swapped:
         return words + f"The order is the paper's in all {len(pairs)} pairs."
-    listed = "; ".join(f"{b} before {a} ({fixed(ours[b], 3)} against {fixed(ours[a], 3)})" for a, b in swapped)
-    return words + f"{len(swapped)} of {len(pairs)} pairs are the other way round here: {listed}."
+    clear = [(a, b) for a, b in swapped if _above(over_seeds[a], over_seeds[b])]
+    words += f"{len(swapped)} of {len(pairs)} pairs are the other way round here"
+    if not clear:
+        return words + ", none of them by more than chance: the intervals over seeds overlap."
+    listed = "; ".join(f"{b} before {a} ({fixed(ours[b], 3)} against {fixed(ours[a], 3)})" for a, b in clear)
+    return words + f", {len(clear)} of them by more than chance (the intervals over seeds do not overlap): {listed}."
+
+
+def specialisation_in_words(runs: pd.DataFrame, published: Mapping[str, Published], own: str, other: str) -> str:
+    """How many times the FVU of the own car is left on the other one, in the paper and here: what is learnt of one car alone."""
+    ours = {name: float(run[f"fvu.{other}"]) / float(run[f"fvu.{own}"]) for name, run in chosen_by_category(runs).items()}
+    listed = "; ".join(
+        f"{name} {fixed(published[name].fvu(other) / published[name].fvu(own), 1)} in the paper, {fixed(ours[name], 1)} here"
+        for name in ours
+        if name in published
+    )
+    return (
+        f"What a network learns of one car alone shows in how much more it leaves on the other, FVU on {SETS[other]} over {SETS[own]}: "
+        f"{listed}."
+    )
+
+
+def _above(upper: tuple[float, float], lower: tuple[float, float]) -> bool:
+    """Whether a mean's interval lies above another's; a single value has none."""
+    halves = [0.0 if math.isnan(half) else half for _, half in (upper, lower)]
+    return upper[0] - halves[0] > lower[0] + halves[1]
 
 
 def _ordered(names: Sequence[str], values: Mapping[str, float]) -> str:
