@@ -263,13 +263,18 @@ def estimate(
     model: Annotated[
         str,
         typer.Argument(
-            metavar="[MODEL]",
-            help="A model's folder, or the start of its name; left out, the pre-trained one that comes with vehest.",
+            metavar="MODEL|FILE",
+            help="A model's folder, or the start of its name; or the recording at once, for the pre-trained model.",
             autocompletion=_complete_model_or_file,
         ),
     ],
     recording: Annotated[
-        str | None, typer.Argument(metavar="FILE", help="CSV or Parquet file; needs no reference channels.", show_default=False)
+        str | None,
+        typer.Argument(
+            metavar="FILE",
+            help="The recording after a model: a CSV or Parquet file, which needs no reference channels.",
+            show_default=False,
+        ),
     ] = None,
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet or .csv.")] = Path("estimate.parquet"),
@@ -277,7 +282,7 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv`.
+    For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest and says so.
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """

@@ -341,15 +341,16 @@ def _reasons(artefacts: PartsArtefacts) -> str:
 def _spread(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Figure:
     rows = []
     for step in steps:
-        words = [f"{name} choice" for name, choice in choices.items() if choice.step is step]
+        words = [name for name, choice in choices.items() if choice.step is step]
         seed = next((choice.seed for choice in choices.values() if choice.step is step), int(np.argmin(step.validation["rmse_vy"])))
         line = line_of(step.models[0].estimator, step.models[0].variant)
-        label = f"{step.label} ({', '.join(words)})" if words else step.label
+        short = f"{step.part}, {step.models[0].title.removeprefix('KS-NN ').replace(' no bias', '')}"
+        label = f"{short} ({', '.join(words)})" if words else short
         rows.append(figures.Spread(label, line, step.test["fvu"], float(step.test["fvu"][seed])))
     return Figure(
         "spread",
-        "Fraction of the variance of v left unexplained on the real Ferrari, of every seed. Diamonds: the seed with the lowest error on "
-        "the simulated cars that choose; ticks: medians.",
+        "Fraction of the variance of v left unexplained on the real Ferrari, of every seed; first, second and third choice in brackets. "
+        "Diamonds: the seed with the lowest error on the simulated cars that choose; ticks: medians.",
         figures.spread_figure(rows, "FVU on the real car"),
     )
 
