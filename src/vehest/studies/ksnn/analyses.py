@@ -75,11 +75,8 @@ def of_residuals(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
         shown = [picked[category] for category in (paper.NONLINEAR, paper.LUENBERGER, paper.LSTM) if category in picked]
         if not shown or shown[0]["category"] != paper.NONLINEAR:
             continue
-        own = []
-        for run in shown:
-            model = model_of(part, run)
-            seed = "" if model.estimator == "luenberger" else f", seed {model.seed}"
-            own.append(Residuals(model.estimator, model.variant, f"{model.title}{seed}", part.scored(model, test)))
+        models = [model_of(part, run) for run in shown]
+        own = [Residuals(model.estimator, model.variant, model.title, part.scored(model, test)) for model in models]
         panels.append(Panel(title, TRAINED_ON[name], words_of_kinds(part), own, part.protocol.rate_hz))
     return residuals(panels) if panels else []
 

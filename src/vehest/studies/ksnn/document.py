@@ -58,7 +58,8 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     if "one_vehicle" in runs:
         blocks += ["## Without cross-vehicle regularisation", tables.regularisation(runs["scheme_2"], runs["one_vehicle"])]
     blocks += _other_cars(artefacts, runs)
-    blocks += ["## How acceleration noise comes through", *analyses.of_sensitivities(artefacts, runs)]
+    chosen = "The models are those that validation chooses in both schemes, as in the tables above."
+    blocks += [f"## How acceleration noise comes through\n\n{chosen}", *analyses.of_sensitivities(artefacts, runs)]
     blocks += ["## What is left of the lateral velocity", *analyses.of_residuals(artefacts, runs)]
     blocks += ["## What the networks have learnt", *analyses.of_interpretation(artefacts, runs)]
     blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), NOTE]

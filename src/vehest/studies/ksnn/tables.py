@@ -67,7 +67,7 @@ def most_general(runs: pd.DataFrame, published: Mapping[str, Published], name: s
         rows.append(row)
     columns = {"model": Column("model"), "structure": Column("structure")}
     columns = columns | ({"paper_structure": Column("in the paper")} if published else {})
-    columns |= {"n_parameters": Column("params", decimals=0)}
+    columns |= {"n_parameters": Column("params", decimals=0), "seed": Column("seed", decimals=0)}
     for test, title in tests.items():
         if published:
             columns[f"paper_fvu_{test}"] = Column(f"{title} FVU, paper", decimals=3)
