@@ -12,9 +12,10 @@ import pytest
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
 from vehest.studies.ksnn import paper, scatter, tables
 from vehest.studies.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
+from vehest.studies.ksnn.tilted import tilted
 from vehest.studies.sweep import interval
 
 SPLIT = Split(
@@ -141,6 +142,32 @@ def test_specialisation_is_the_ratio_of_the_two_cars():
     words = tables.specialisation_in_words(runs_of(part()), paper.TABLE_IV, "c2", "f2")
     assert "FVU on F-2 over C-2" in words
     assert "KS-NN nonlinear + bias 2.8 in the paper, 8.0 here" in words
+
+
+@pytest.mark.parametrize(
+    ("fvus", "expected"),
+    [
+        ({"ksnn": 0.4, "luenberger": 0.5, "gru": 0.6}, "the order of families that the paper has in its scheme 1"),
+        ({"ksnn": 0.4, "luenberger": 0.7, "gru": 0.6}, "Every KS-NN comes before GRU and LSTM, as in the paper."),
+        ({"ksnn": 0.7, "luenberger": 0.5, "gru": 0.6}, "KS-NN linear no bias (0.700)."),
+        ({"ksnn": 1.7, "luenberger": 1.5, "gru": 1.6}, "none knows that car"),
+    ],
+)
+def test_families_are_ordered_as_they_come_out(fvus, expected):
+    variants = {"ksnn": "linear_no_bias_p2", "luenberger": "luenberger", "gru": "states_2"}
+    runs = runs_of(part({(name, variants[name], 0): (0.1, 0.1, fvu) for name, fvu in fvus.items()}))
+    words = tables.families_in_words(runs, "f2", "other")
+    assert expected in words
+    assert ("scheme 1" in words) == ("scheme 1" in expected)
+
+
+@pytest.mark.parametrize(("fvu", "expected"), [(0.105, "are **not** why the order differs"), (0.2, "The largest factor is 2.00.")])
+def test_tilted_sensors_are_named_as_a_reason_only_where_they_change_something(fvu, expected):
+    before, after = (runs_of(part({("ksnn", "linear_no_bias_p2", 0): (0.1, 0.05, value)})) for value in (0.1, fvu))
+    titles = PartsArtefacts("s", "t", "a", "c", {"scheme_1": "Scheme 1"}, {}, [])
+    blocks = tilted(titles, {"scheme_1": before, "tilted_1": after}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")})
+    assert expected in str(blocks[-1])
+    assert tilted(titles, {"scheme_1": before}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")}) == []
 
 
 def test_sideslip_table_has_a_column_a_kind_of_data():

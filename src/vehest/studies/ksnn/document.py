@@ -176,7 +176,17 @@ def _other_cars(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> 
         }
         caption = f"{artefacts.titles[name]}: of each category the run that the other car's validation range chooses."
         blocks.append(tables.most_general(runs[name], {}, f"table_{name}", caption, tests))
-    return ["## The same with a real Ferrari and a simulated DevBot", *blocks] if blocks else []
+        other = next(test for test, spans in part.split.tests.items() if not _shares_a_car(spans, part.split.train))
+        blocks.append(tables.families_in_words(runs[name], other, tests[other]))
+    lead = (
+        "## The same with a real Ferrari and a simulated DevBot\n\nThe two cars of the schemes are two parameter sets of one simulator, "
+        "driven by one driver on one course, with sensors of one kind. These two differ in all of that."
+    )
+    return [lead, *blocks] if blocks else []
+
+
+def _shares_a_car(spans: Sequence[Span], others: Sequence[Span]) -> bool:
+    return bool({span.dataset for span in spans} & {span.dataset for span in others})
 
 
 def overview(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> Table:

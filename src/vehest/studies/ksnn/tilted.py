@@ -14,6 +14,9 @@ from vehest.studies.ksnn.candidates import chosen_by_category, seeds_like
 from vehest.studies.ksnn.paper import Published
 from vehest.studies.sweep import interval, mean_and_half
 
+NEXT_TO_NOTHING = 0.1
+"""Relative change of an FVU that is taken for none."""
+
 LEAD = """### When the two cars' sensors err differently
 
 The paper explains its order by what a network can learn of one car that does not hold for the other, above all by mean biases of
@@ -69,16 +72,20 @@ def tilted(
 
 
 def _in_words(frame: pd.DataFrame) -> str:
-    """By how much each category loses, and which is best then."""
-    sentences = []
+    """By how much each category loses, and whether that can be why the order differs."""
+    sentences: list[str] = []
+    ratios: list[float] = []
     for scheme in dict.fromkeys(frame["scheme"]):
-        own = frame[frame["scheme"] == scheme]
-        rows = {str(row["model"]): (float(row["alike"]), float(row["tilted"])) for row in own.to_dict("records")}
-        ratios = {name: after / before for name, (before, after) in rows.items()}
-        listed = ", ".join(f"{name} {fixed(ratios[name], 2)}" for name in sorted(ratios, key=ratios.__getitem__))
-        best = min(rows, key=lambda name: rows[name][1])
+        own = {str(row["model"]): float(row["tilted"]) / float(row["alike"]) for row in frame[frame["scheme"] == scheme].to_dict("records")}
+        listed = ", ".join(f"{name} {fixed(own[name], 2)}" for name in sorted(own, key=own.__getitem__))
+        sentences.append(f"{scheme}: the tilt changes the FVU on the other car by these factors: {listed}.")
+        ratios += own.values()
+    if max(abs(ratio - 1.0) for ratio in ratios) <= NEXT_TO_NOTHING:
         sentences.append(
-            f"{scheme}: the FVU on the other car grows by these factors: {listed}. The lowest is then that of {best} "
-            f"({fixed(rows[best][1], 3)})."
+            f"None changes by more than {100 * NEXT_TO_NOTHING:g} %: mean biases of this size are **not** why the order differs here. "
+            "Part of the reason is the measure: what a constant error of a_y adds to the estimate as a constant drops out of a variance."
         )
+    else:
+        worst = max(ratios)
+        sentences.append(f"The largest factor is {fixed(worst, 2)}.")
     return " ".join(sentences)
