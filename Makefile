@@ -58,7 +58,7 @@ docs: $(INSTALLED) ## write the reference pages that are made from the code
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
 
-ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: about an hour
+ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: an hour or more
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from place import Place, write_csv
+from vehest.report.document import Document
 from vehest.stages.pipeline import pipeline_configs, read_pipeline
 from vehest.stages.train import new_estimator
 from vehest.studies.artefacts import METRIC_COLUMNS
@@ -82,6 +83,18 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     assert json.loads(again)["overview"] == json.loads(out)["overview"]
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] in {"train", "evaluate", "report"}} == {"skipped"}
     assert place.files() == made
+
+
+def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
+    monkeypatch.setattr("vehest.studies.ksnn.build_parts", lambda artefacts: Document(artefacts.title, ["no tables"]))
+    file = parts_place.folder / "pipelines" / "both.yaml"
+    content = yaml.safe_load(file.read_text())
+    content["parts"] = {"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}}
+    file.write_text(yaml.safe_dump(content))
+    code, _, err = parts_place("run", "both", "--jobs", "1", "tracking=none")
+    assert code == 2
+    assert "gives no table 'overview'" in " ".join(err.split())
+    assert not list((parts_place.folder / "outputs" / "report").glob("both-*"))
 
 
 def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(parts_place):

@@ -9,10 +9,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from vehest.data.errors import ConfigurationError
 from vehest.stages.artefacts import StagePlan, provenance
 from vehest.stages.code_version import code_version
 from vehest.stages.evaluate import METRICS
-from vehest.stages.report import PROVENANCE, STAGE, ReportJob, plan_report, recording_digests, study_artefacts
+from vehest.stages.report import OVERVIEW, PROVENANCE, STAGE, ReportJob, plan_report, recording_digests, study_artefacts
 from vehest.studies.artefacts import PartsArtefacts
 
 
@@ -84,6 +85,8 @@ def write_parts(job: PartsJob, folder: Path) -> None:
     )
     module = importlib.import_module(f"vehest.studies.{job.module}")
     write_document(module.build_parts(artefacts), folder)
+    if not (folder / OVERVIEW).is_file():
+        raise ConfigurationError(f"the study module '{job.module}' gives no table 'overview', which a study in parts shows in the terminal")
     artefacts.metrics.to_csv(folder / METRICS, index=False, lineterminator="\n")
     about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command, "parts": list(job.parts), "absent": artefacts.absent}
