@@ -230,7 +230,8 @@ def families_in_words(runs: pd.DataFrame, other: str, title: str) -> str:
     if structured and plain and paper.LUENBERGER in fvu and max(structured) < fvu[paper.LUENBERGER] < min(plain):
         words += (
             " Every KS-NN comes before the Luenberger observer, and the observer before GRU and LSTM: the order of families that the paper "
-            "has in its scheme 1. With cars that differ this much, structure pays; the two simulated cars are most likely too much alike to show it."
+            "has in its scheme 1. With cars that differ this much, structure pays; the two simulated cars are most likely too much alike "
+            "to show it."
         )
     elif structured and plain and max(structured) < min(plain):
         words += " Every KS-NN comes before GRU and LSTM, as in the paper."
