@@ -15,8 +15,10 @@ from hypothesis import strategies as st
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.data.splits import Catalogue, Span, Split, split_from_config
+from vehest.data.splits import Catalogue, Span, Split, dataset_names, split_from_config
 from vehest.data.windows import window_starts, windows_of
+from vehest.sources.base import open_source
+from vehest.stages.config import compose_config
 
 PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
 CONFIGURATIONS = sorted((Path(__file__).parents[1] / "conf" / "split").glob("*.yaml"))
@@ -151,9 +153,18 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_every_split_that_is_shipped_is_one(file: Path) -> None:
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has one of some name."""
+
+    def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
+        names = open_source(about).ids() if about["source"] == "simulated" else ["some"]
+        ten_seconds = {"ay": np.full(200, 3.0), "vx": np.full(200, 20.0), "yaw_rate": np.full(200, 0.15)}
+        return {name: Recording(name, "car", 20.0, 0.0, ten_seconds).select for name in names}
+
     config = yaml.safe_load(file.read_text(encoding="utf-8"))
-    cruising = drives({f"{role}_1": [3.0] * 300 for role in ("train", "validation", "test")}, vx=[20.0] * 300)
-    assert split_from_config(config, cruising).name == file.stem
+    split = split_from_config(config, cruising)
+    assert split.name == file.stem
+    assert set(dataset_names(config)) == set(split.datasets)
 
 
 # --- patterns and conditions

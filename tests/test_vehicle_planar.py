@@ -52,7 +52,7 @@ def test_runge_kutta_is_an_independent_integrator(car):
 
 def test_a_car_that_rolls_straight_feels_drag_and_losses_alone(car):
     state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
-    own = rates(car, state, inputs)
+    own = rates(car, state, inputs).detach()
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
     assert float(own[0]) == pytest.approx(-drag / F1TENTH.mass)
     assert own[1:3].abs().max() < 1e-12
