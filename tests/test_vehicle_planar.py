@@ -22,7 +22,7 @@ TYRES |= {f"{name}_{axle}": value for axle in ("front", "rear") for name, value 
 
 @pytest.fixture
 def car() -> tuple[PlanarCar, PacejkaTyres]:
-    return PlanarCar().double(), PacejkaTyres(TYRES).double()
+    return PlanarCar().double().requires_grad_(False), PacejkaTyres(TYRES).double().requires_grad_(False)
 
 
 def rates(car, state: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
@@ -37,22 +37,20 @@ def tensor(*values: float) -> torch.Tensor:
 def test_runge_kutta_is_an_independent_integrator(car):
     """Over 10 ms from a drifting state; and its error falls with the fourth power of the step."""
     state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
-    known = solve_ivp(
-        lambda _, x: rates(car, torch.from_numpy(x), inputs).detach().numpy(), (0.0, 0.01), state.numpy(), rtol=1e-12, atol=1e-13
-    )
+    known = solve_ivp(lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(), (0.0, 0.01), state.numpy(), rtol=1e-12, atol=1e-13)
     errors = []
     for steps in (1, 2):
         own = state
         for _ in range(steps):
             own = rk4(lambda x, u: rates(car, x, u), own, inputs, 0.01 / steps)
-        errors.append(float((own - torch.from_numpy(known.y[:, -1])).abs().max().detach()))
+        errors.append(float((own - torch.from_numpy(known.y[:, -1])).abs().max()))
     assert errors[0] < 1e-6
     assert 10.0 < errors[0] / errors[1] < 24.0
 
 
 def test_a_car_that_rolls_straight_feels_drag_and_losses_alone(car):
     state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
-    own = rates(car, state, inputs).detach()
+    own = rates(car, state, inputs)
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
     assert float(own[0]) == pytest.approx(-drag / F1TENTH.mass)
     assert own[1:3].abs().max() < 1e-12
@@ -127,11 +125,11 @@ def test_curvature_is_learnt_only_where_it_is_asked_for():
     chassis = PlanarCar()
     slips = chassis.slips(torch.tensor([3.0, 0.5, 1.0, 3.5]), torch.tensor([0.1, 0.0]))
     for one, other in zip(plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True):
-        assert float(one) == pytest.approx(float(other), rel=1e-5)
+        assert one.item() == pytest.approx(other.item(), rel=1e-5)
 
 
 def test_gradients_reach_every_parameter_and_batches_work(car):
-    chassis, tyres = car
+    chassis, tyres = (module.requires_grad_() for module in car)
     state = tensor(3.0, -0.6, 2.5, 3.4).repeat(2, 3, 1)
     inputs = tensor(0.2, 8.0).repeat(2, 3, 1)
     outcome = rk4(lambda x, u: rates(car, x, u), state, inputs, 0.01)
@@ -148,8 +146,8 @@ def test_positive_parameters_stay_positive_and_may_be_fixed():
     assert [name for name, _ in own.named_parameters()] == ["log_inertia"]
     with torch.no_grad():
         own.get_parameter("log_inertia").sub_(20.0)
-    assert 0.0 < float(own["inertia"]) < 1e-8
-    assert float(own["mass"]) == pytest.approx(5.1)
+    assert 0.0 < own["inertia"].item() < 1e-8
+    assert own["mass"].item() == pytest.approx(5.1)
     for wrong in ({"mass": 0.0}, {"mass": math.nan}):
         with pytest.raises(ValueError, match="mass must be positive"):
             PositiveParameters(wrong)
@@ -158,7 +156,7 @@ def test_positive_parameters_stay_positive_and_may_be_fixed():
 
 
 def test_forces_of_no_tyre_leave_the_car_to_its_inertia():
-    chassis = PlanarCar().double()
+    chassis = PlanarCar().double().requires_grad_(False)
     none = TyreForces(*(tensor(0.0)[0],) * 4)
     own = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
     drag = 0.1 + 0.01 * 3.0 + 0.1 * 9.0
