@@ -173,12 +173,13 @@ def test_tilted_sensors_are_named_as_a_reason_only_where_they_change_something(f
 def test_sideslip_table_has_a_column_a_kind_of_data():
     runs = runs_of(part())
     drive = runs.rename(columns={"rmse_sideslip.f2": "rmse_sideslip.test"})
-    table = tables.sideslip(runs, drive, None).frame.set_index("model")
-    assert table.loc[paper.LUENBERGER, "simulated"] == pytest.approx(math.sqrt(0.21))
-    assert table.loc[paper.LUENBERGER, "real_drive"] == table.loc[paper.LUENBERGER, "simulated"]
-    assert math.isnan(table.loc[paper.FACTOR_GRAPH, "simulated"])
+    table = tables.sideslip(runs, drive, None, "simulated").frame.set_index("model")
+    assert table.loc[paper.LUENBERGER, "scheme_2"] == pytest.approx(math.sqrt(0.21))
+    assert table.loc[paper.LUENBERGER, "real_drive"] == table.loc[paper.LUENBERGER, "scheme_2"]
+    assert math.isnan(table.loc[paper.FACTOR_GRAPH, "scheme_2"])
     assert table["real_whole"].isna().all()
     assert dict(table["paper"]) == paper.TABLE_VI
+    assert tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header == "ours: REAL F-2, scheme 2 [deg]"
 
 
 def test_regularisation_compares_the_same_structure():

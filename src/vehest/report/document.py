@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
     from plotly.graph_objects import Figure as PlotlyFigure
 
+PATENT_NOTE = (
+    "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
+    "the licence of this software grants none."
+)
+"""What every report with a KS-NN ends with."""
+
 PNG_DPI = 150
 PNG_COLOURS = 256
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")

@@ -160,12 +160,13 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
         raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{content['based_on']}'")
     _, base = _content_of(str(content["based_on"]), as_base=True)
     own, parts = content.get("parts") or {}, base.get("parts") or {}
-    if not isinstance(own, dict) or not isinstance(parts, dict) or not all(isinstance(part, dict) for part in own.values()):
-        raise ConfigurationError(f"'{file}': parts must be names, each with what it changes")
+    if not isinstance(own, dict) or not isinstance(parts, dict) or not all(part is None or isinstance(part, dict) for part in own.values()):
+        raise ConfigurationError(f"'{file}': parts must be names, each with what it changes, or null where it is left out")
     if set(own) - set(parts):
         raise ConfigurationError(f"'{file}': '{content['based_on']}' has no part '{min(set(own) - set(parts))}'")
     merged = {**base, **{key: value for key, value in content.items() if key != "based_on"}}
-    return file, merged | ({"parts": {key: {**part, **own.get(key, {})} for key, part in parts.items()}} if parts else {})
+    kept = {key: {**part, **(own.get(key) or {})} for key, part in parts.items() if own.get(key, part) is not None}
+    return file, merged | ({"parts": kept} if parts else {})
 
 
 def _form_of(content: Mapping[str, Any], file: Path) -> str:

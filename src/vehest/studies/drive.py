@@ -18,7 +18,7 @@ from vehest.data.recording import FloatArray
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import Block, Column, Document, Figure, Table
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of, percent_below, significant
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 
@@ -50,10 +50,7 @@ def build(artefacts: StudyArtefacts) -> Document:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines)
     blocks += _training(artefacts, board, lines)
     if any(model.estimator == "ksnn" for model in artefacts.models):
-        blocks.append(
-            "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
-            "the licence of this software grants none."
-        )
+        blocks.append(PATENT_NOTE)
     return Document(artefacts.title, blocks)
 
 

@@ -18,7 +18,7 @@ from vehest.data.recording import FloatArray
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import Block, Column, Document, Figure, Table
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
 from vehest.report.style import REFERENCE, fixed, line_of
 from vehest.studies.artefacts import EvaluatedModel, PartsArtefacts, StudyArtefacts
 from vehest.studies.drive import VALIDATION
@@ -152,8 +152,7 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         *filter(None, [_why(steps)]),
         "## The model that comes with vehest, on the real car",
         _traces(choices[SHIPPED]),
-        "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
-        "the licence of this software grants none.",
+        PATENT_NOTE,
     ]
     return Document(artefacts.title, blocks)
 

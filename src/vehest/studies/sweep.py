@@ -16,7 +16,7 @@ import pandas as pd
 from vehest.data.recording import FloatArray
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.report.document import Block, Column, Document, Figure, Table
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
 from vehest.report.heat_map import Panel, heat_map
 from vehest.report.style import decimals_for, fixed
 
@@ -76,10 +76,7 @@ def build(artefacts: SweepArtefacts) -> Document:
     if maps:
         blocks += ["## Heat maps", *maps]
     if artefacts.patented:
-        blocks.append(
-            "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
-            "the licence of this software grants none."
-        )
+        blocks.append(PATENT_NOTE)
     return Document(f"Sweep {artefacts.name}", blocks)
 
 

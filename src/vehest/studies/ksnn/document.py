@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.report.document import Block, Column, Document, Table
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Table
 from vehest.report.style import fixed, percent_below
 from vehest.studies.artefacts import PartsArtefacts
 from vehest.studies.ksnn import analyses, paper, scatter, tables
@@ -21,10 +21,12 @@ from vehest.studies.sweep import interval, mean_and_half
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
 """Part -> the paper's table, test set of the car that is learnt on, test set of the other."""
 
-NOTE = (
-    "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
-    "the licence of this software grants none."
+SIMULATED = "simulated"
+ONE_SIMULATOR = (
+    "The two cars of the schemes are two parameter sets of one simulator, driven by one driver on one course, with sensors of one kind. "
+    "These two differ in all of that."
 )
+ALIKE = " With cars that differ this much, structure pays; the two simulated cars are most likely too much alike to show it."
 
 
 def build_parts(artefacts: PartsArtefacts) -> Document:
@@ -40,6 +42,7 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
             raise DataError(f"study '{artefacts.study}': the test sets of part '{name}' must be called c2 and f2")
     runs = {name: runs_of(part) for name, part in artefacts.parts.items()}
     whole = pd.concat([runs[name] for name in SCHEMES], ignore_index=True)
+    kind = words_of_kinds(artefacts.parts["scheme_2"])
     blocks: list[Block] = [
         *_headline(artefacts, runs),
         overview(artefacts, runs),
@@ -51,18 +54,18 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         *analyses.of_activation(artefacts, runs),
         "## On the car trained on and on the other one",
         *_schemes(artefacts, runs),
-        *tilted(artefacts, runs, SCHEMES),
+        *(tilted(artefacts, runs, SCHEMES) if kind == SIMULATED else []),
         "## Sideslip angle, beside Kalman filter and factor graph",
-        tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole")),
+        tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), kind),
     ]
     if "one_vehicle" in runs:
         blocks += ["## Without cross-vehicle regularisation", tables.regularisation(runs["scheme_2"], runs["one_vehicle"])]
-    blocks += _other_cars(artefacts, runs)
+    blocks += _other_cars(artefacts, runs, alike=kind == SIMULATED)
     chosen = "The models are those that validation chooses in both schemes, as in the tables above."
     blocks += [f"## How acceleration noise comes through\n\n{chosen}", *analyses.of_sensitivities(artefacts, runs)]
     blocks += ["## What is left of the lateral velocity", *analyses.of_residuals(artefacts, runs)]
     blocks += ["## What the networks have learnt", *analyses.of_interpretation(artefacts, runs)]
-    blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), NOTE]
+    blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), PATENT_NOTE]
     data = {f"candidates_{name}": tables.candidates(runs[name], list(tables.SETS)) for name in SCHEMES}
     return Document(artefacts.title, blocks, data)
 
@@ -163,8 +166,8 @@ def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> lis
     return blocks
 
 
-def _other_cars(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
-    """Both schemes with other cars, where their recordings are at hand."""
+def _other_cars(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame], *, alike: bool) -> list[Block]:
+    """Both schemes with other cars, where their recordings are at hand; ``alike`` where the cars of the schemes are simulated."""
     blocks: list[Block] = []
     for name in ("devbot_ferrari", "ferrari_devbot"):
         if name not in runs:
@@ -176,13 +179,10 @@ def _other_cars(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> 
         }
         caption = f"{artefacts.titles[name]}: of each category the run that the other car's validation range chooses."
         blocks.append(tables.most_general(runs[name], {}, f"table_{name}", caption, tests))
-        other = next(test for test, spans in part.split.tests.items() if not _shares_a_car(spans, part.split.train))
-        blocks.append(tables.families_in_words(runs[name], other, tests[other]))
-    lead = (
-        "## The same with a real Ferrari and a simulated DevBot\n\nThe two cars of the schemes are two parameter sets of one simulator, "
-        "driven by one driver on one course, with sensors of one kind. These two differ in all of that."
-    )
-    return [lead, *blocks] if blocks else []
+        unseen = [test for test, spans in part.split.tests.items() if not _shares_a_car(spans, part.split.train)]
+        blocks += [tables.families_in_words(runs[name], test, tests[test], ALIKE if alike else "") for test in unseen]
+    lead = "## The same with a real Ferrari and a simulated DevBot"
+    return [f"{lead}\n\n{ONE_SIMULATOR}" if alike else lead, *blocks] if blocks else []
 
 
 def _shares_a_car(spans: Sequence[Span], others: Sequence[Span]) -> bool:

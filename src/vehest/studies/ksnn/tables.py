@@ -80,20 +80,21 @@ def most_general(runs: pd.DataFrame, published: Mapping[str, Published], name: s
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def sideslip(simulated: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, name: str = "table_6") -> Table:
+def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str, name: str = "table_6") -> Table:
     """Table VI: RMSE of the sideslip angle.
 
     Args:
-        simulated: runs of scheme 2; F-2 is read.
+        schemes: runs of scheme 2; F-2 is read.
         drive: runs of one drive of the real Ferrari, its test range ``test``.
         whole: runs on the whole drive of the real Ferrari, of estimators that learn nothing.
+        kind: of the data of scheme 2, ``real`` or ``simulated``.
         name: of the file.
     """
     rows = []
     lags = [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)] if whole is not None else []
     for category in [*paper.TABLE_VI, *lags]:
         row: dict[str, object] = {"model": category, "paper": paper.TABLE_VI.get(category, math.nan)}
-        for column, runs, test in (("real_drive", drive, "test"), ("real_whole", whole, "test"), ("simulated", simulated, "f2")):
+        for column, runs, test in (("real_drive", drive, "test"), ("real_whole", whole, "test"), ("scheme_2", schemes, "f2")):
             own = runs[runs["category"] == category] if runs is not None else pd.DataFrame()
             row[column] = chosen(own)[f"rmse_sideslip.{test}"] if len(own) else math.nan
         rows.append(row)
@@ -102,13 +103,13 @@ def sideslip(simulated: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.Data
         "paper": Column("paper: real F-2 [deg]", decimals=2),
         "real_drive": Column("ours: REAL, 550 to 700 s of one file of F-2 [deg]", decimals=3),
         "real_whole": Column("ours: REAL, all of that file [deg]", decimals=3),
-        "simulated": Column("ours: SIMULATED F-2, scheme 2 [deg]", decimals=3),
+        "scheme_2": Column(f"ours: {kind.upper()} F-2, scheme 2 [deg]", decimals=3),
     }
     caption = (
         "RMSE of the sideslip angle (Table VI of the paper). On the real drive networks and observer learn on 150 to 450 s and stop on 450 "
         "to 550 s of the same file; the paper's learn on F-1. Kalman filter and factor graph learn nothing from references; on the whole "
-        "file the filter's noise levels are read off that file, and the graph is one batch. They need a car's parameters, which the "
-        "simulated car has only as a multi-body model: no entry there."
+        "file the filter's noise levels are read off that file, and the graph is one batch. They need a car's parameters and were not run "
+        "in scheme 2: no entry there."
     )
     return Table(name, caption, pd.DataFrame(rows), columns)
 
@@ -218,8 +219,15 @@ def order_in_words(runs: pd.DataFrame, published: Mapping[str, Published], other
     return words + f", {len(clear)} of them by more than chance (the intervals over seeds do not overlap): {listed}."
 
 
-def families_in_words(runs: pd.DataFrame, other: str, title: str) -> str:
-    """Who comes first on the car not trained on: KS-NN, the observer, or networks without structure; and what the paper has."""
+def families_in_words(runs: pd.DataFrame, other: str, title: str, where_as_in_the_paper: str = "") -> str:
+    """Who comes first on the car not trained on: KS-NN, the observer, or networks without structure; and what the paper has.
+
+    Args:
+        runs: from `candidates.runs_of`.
+        other: test set of the car not trained on.
+        title: of that test set, for people.
+        where_as_in_the_paper: what is said on top where the families come in the paper's order.
+    """
     fvu = {name: float(run[f"fvu.{other}"]) for name, run in chosen_by_category(runs).items()}
     order = sorted(fvu, key=fvu.__getitem__)
     words = f"Order by FVU on the {title}, the car not trained on, best first: {_ordered(order, fvu)}."
@@ -230,8 +238,7 @@ def families_in_words(runs: pd.DataFrame, other: str, title: str) -> str:
     if structured and plain and paper.LUENBERGER in fvu and max(structured) < fvu[paper.LUENBERGER] < min(plain):
         words += (
             " Every KS-NN comes before the Luenberger observer, and the observer before GRU and LSTM: the order of families that the paper "
-            "has in its scheme 1. With cars that differ this much, structure pays; the two simulated cars are most likely too much alike "
-            "to show it."
+            f"has in its scheme 1.{where_as_in_the_paper}"
         )
     elif structured and plain and max(structured) < min(plain):
         words += " Every KS-NN comes before GRU and LSTM, as in the paper."
