@@ -42,7 +42,7 @@ PUBLISHED = (
     ("KS-NN that learnt on another real car", 0.145),
     ("KS-NN that learnt on the same real car", 0.06),
 )
-"""FVU on a real Ferrari 250 LM in Da Lio et al. 2023, on other recordings of it than ours."""
+"""FVU on a real Ferrari 250 LM in Da Lio et al. 2023, on two recordings of it, one of which is ours."""
 
 REASONS = {
     "one": "one car, simulated by others: what little there is without a fleet",
@@ -312,7 +312,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
         "overview",
         "Steps, what simulated cars say of them, and what they do on the whole recording of the real Ferrari: medians over the seeds, for "
         "FVU also the smallest and largest. β₁(0) is what the network makes of an acceleration without yaw rate (Eq. 7a). Below: Da Lio et "
-        "al. 2023, real cars, other recordings.",
+        "al. 2023, real cars, two recordings of which ours is one.",
         pd.DataFrame(rows),
         {
             "step": Column("learns on: estimator"),
