@@ -107,20 +107,20 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         stop = server.breaks.pop(0) if server.breaks else len(whole) - start
         body = whole[start : start + stop]
+        server.sent.append(len(body))  # before the client can have it and ask for more
         self.wfile.write(body)
-        server.sent.append(len(body))
         if stop < len(whole) - start and server.stall.is_set():
             server.stalled.set()
             server.go_on.wait(30)
         self.close_connection = True
 
     def plain(self, status: int, headers: dict[str, str]) -> None:
+        self.server.sent.append(0)
         self.send_response(status)
         for key, value in headers.items():
             self.send_header(key, value)
         self.send_header("Content-Length", "0")
         self.end_headers()
-        self.server.sent.append(0)
 
     def log_message(self, format: str, *args: object) -> None:
         """Nothing on standard error."""
@@ -375,7 +375,9 @@ def test_a_changed_file_of_a_server_that_ignores_if_range_is_never_mixed(server:
     server.breaks = [200_000]
     fetch(Download("mine", tmp_path, server.url, ("a.csv",), {}, Patience(pause=Careless(server, other))))
     assert_only(tmp_path, other)
-    assert server.sent[1] < SIZE  # the range of the other file, which was thrown away
+    ranges = [asked_range for _, asked_range, _ in server.asked]
+    assert ranges[1] is not None, "the rest of the file, as the server sent it of the other one"
+    assert ranges[2:] == [None], "which was thrown away, and the whole file asked for"
 
 
 def test_a_part_from_another_address_is_not_gone_on_with(server: Server, tmp_path: Path) -> None:
