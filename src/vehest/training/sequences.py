@@ -1,0 +1,365 @@
+"""Training by gradient in phases one after another, on sequences or pairs, that a killed run goes on with to the same result."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from vehest.training.context import FitContext, Progress
+from vehest.training.settings import PhaseSettings
+
+SKIPS_ALLOWED = 20  # steps in a row without a finite loss and gradient after which training gives up
+_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What learns, from what, and what is to become small.
+
+    Phases may be of one module or of several that share parameters; what an earlier phase learnt is where a later one starts.
+    The module is never asked for random numbers: what is random about an epoch (order, offsets, masks of dropout) is drawn by ``batches``.
+
+    Args:
+        name: for people and for the checkpoint; unique among the phases of a training.
+        settings: step size, epochs, patience, clipping.
+        module: its parameters are changed in place.
+        batches: one epoch's batches; draws random numbers from the generator that it is given and from no other.
+        loss: scalar to minimise, of one batch; ``backward`` is called on it.
+        validation: loss on the validation data with the parameters as they stand; called without gradients.
+        trainable: which parameters learn, by name; the others are frozen (``requires_grad`` is False during the phase). All if None.
+    """
+
+    name: str
+    settings: PhaseSettings
+    module: nn.Module
+    batches: Callable[[torch.Generator], Iterable[Any]]
+    loss: Callable[[Any], Tensor]
+    validation: Callable[[], float]
+    trainable: Callable[[str], bool] | None = None
+
+
+@dataclass(frozen=True)
+class PhaseRecord:
+    """How a phase went.
+
+    Args:
+        name: of the phase.
+        epochs: epochs finished.
+        best_epoch: epoch (from 1) whose parameters were kept; 0 if none was better than the start.
+        best_loss: validation loss of the parameters that were kept.
+        start_loss: validation loss before the first epoch; NaN if it was stopped before.
+        train_loss: mean loss over the batches of each epoch, skipped ones left out.
+        validation_loss: after each epoch; NaN where not validated.
+        seconds: wall time, earlier runs that a checkpoint continues included [s].
+        skipped_steps: batches whose loss or gradient was not finite.
+        interrupted: whether it was stopped before it was over.
+    """
+
+    name: str
+    epochs: int
+    best_epoch: int
+    best_loss: float
+    start_loss: float
+    train_loss: tuple[float, ...]
+    validation_loss: tuple[float, ...]
+    seconds: float
+    skipped_steps: int
+    interrupted: bool
+
+
+def train_phases(
+    phases: Sequence[Phase], seed: int, context: FitContext, folder_index: int = 0, checkpoint_seconds: float = 15.0
+) -> list[PhaseRecord]:
+    """Train one member through its phases by AdamW; each phase ends with the parameters of its best validation.
+
+    The start of a phase counts as a candidate. A step whose loss or gradient is not finite is skipped and counted. Gradients are clipped
+    element by element. Each phase draws from a stream of its own of ``seed``, so that its batches do not hang on how long the phases before
+    it took.
+
+    A stop ends within the current epoch, which the next run does again; the phase's best parameters so far are in its module then.
+
+    Args:
+        phases: in their order; names differ.
+        seed: of the batches.
+        context: where the checkpoint is kept, if anywhere, whether to stop (asked before every batch), whom to tell after every epoch.
+        folder_index: which of ``context.checkpoint_folders`` is this member's, where several train one after the other.
+        checkpoint_seconds: time between two checkpoints [s].
+
+    Returns:
+        One record for every phase that was begun.
+
+    Raises:
+        DataError: 20 steps in a row, or all validations of a phase, were not finite.
+        ConfigurationError: phases of equal names, or nothing to learn in one.
+
+    Source:
+        Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
+    """
+    run = _Run(phases, seed, context, folder_index, checkpoint_seconds)
+    run.resume()
+    while run.position < len(phases) and not run.interrupted:
+        run.train_phase()
+    return run.records
+
+
+@dataclass
+class _Progressing:
+    """What a phase under way has come to; plain values, which a checkpoint keeps as they are."""
+
+    name: str
+    epoch: int = 0
+    best_epoch: int = 0
+    best_loss: float = math.inf
+    start_loss: float = math.nan
+    train_loss: list[float] = field(default_factory=list)
+    validation_loss: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    skipped: int = 0
+    skipped_in_a_row: int = 0
+    validated: bool = False  # before its first epoch
+
+    def record(self, interrupted: bool) -> PhaseRecord:
+        losses = (tuple(self.train_loss), tuple(self.validation_loss))
+        best = (self.best_epoch, self.best_loss, self.start_loss)
+        return PhaseRecord(self.name, self.epoch, *best, *losses, self.seconds, self.skipped, interrupted)
+
+
+class _Run:
+    """State of a training: phases done, the phase under way, parameters, best ones, moments, generator."""
+
+    def __init__(self, phases: Sequence[Phase], seed: int, context: FitContext, folder_index: int, checkpoint_seconds: float) -> None:
+        if len({phase.name for phase in phases}) != len(phases):
+            raise ConfigurationError(f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}")
+        self.phases, self.seed, self.context = phases, seed, context
+        self.folder_index, self.checkpoint_seconds = folder_index, checkpoint_seconds
+        self.folder = context.checkpoint_folders[folder_index] if folder_index < len(context.checkpoint_folders) else None
+        self.state = _shared_state(phases)
+        self.records: list[PhaseRecord] = []
+        self.interrupted = False
+        self.saved = time.monotonic()
+        self._begin(0)
+
+    @property
+    def position(self) -> int:
+        """Number of the phase under way; how many there are once all are over."""
+        return self._position
+
+    def _begin(self, position: int) -> None:
+        """Stand at the start of a phase."""
+        self._position = position
+        if position == len(self.phases):
+            self.best = _copies(self.state)
+            return
+        phase = self.phases[position]
+        self.now = _Progressing(phase.name)
+        self.best = _copies(self.state)
+        self.generator = torch.Generator().manual_seed(_stream(self.seed, position))
+        named = phase.module.named_parameters()
+        self.learning = {name: value for name, value in named if phase.trainable is None or phase.trainable(name)}
+        if not self.learning:
+            raise ConfigurationError(f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable")
+        settings = phase.settings
+        self.adam = torch.optim.AdamW(self.learning.values(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+
+    def train_phase(self) -> None:
+        """Train the phase under way from where it stands to its end, or until a stop."""
+        phase = self.phases[self.position]
+        asked = {name: value.requires_grad for name, value in phase.module.named_parameters()}
+        started = time.monotonic() - self.now.seconds
+        try:
+            for name, value in phase.module.named_parameters():
+                value.requires_grad_(name in self.learning)
+            while not self._is_over(phase) and not self.interrupted:
+                self._train_epoch(phase, started)
+        finally:
+            for name, value in phase.module.named_parameters():
+                value.requires_grad_(asked[name])
+                value.grad = None
+        if self.now.epoch and not math.isfinite(self.now.best_loss) and not self.interrupted:
+            raise DataError(
+                f"training: phase '{phase.name}' had no finite validation loss in {self.now.epoch} epochs; "
+                f"lower its learning_rate or check the data with 'vehest data check'"
+            )
+        _put_back(self.state, self.best)
+        self.records.append(self.now.record(self.interrupted))
+        if not self.interrupted:
+            self._begin(self.position + 1)
+            if self.position == len(self.phases) or time.monotonic() - self.saved > self.checkpoint_seconds:
+                self._save(self._checkpoint())
+
+    def _is_over(self, phase: Phase) -> bool:
+        epoch, settings = self.now.epoch, phase.settings
+        waited = epoch - self.now.best_epoch if epoch % settings.validate_every == 0 else 0
+        return epoch >= settings.max_epochs or 0 < settings.patience <= waited
+
+    def _train_epoch(self, phase: Phase, started: float) -> None:
+        """One pass over the batches, then the validation; an epoch that is stopped leaves no trace but the checkpoint before it."""
+        settings, now = phase.settings, self.now
+        before = self._checkpoint()
+        if not now.validated:
+            if self.context.should_stop():
+                self._stop(before)
+                return
+            now.start_loss = self._validate(phase)
+            now.validated = True
+            before = self._checkpoint()
+        if settings.schedule == "cosine":
+            for group in self.adam.param_groups:
+                group["lr"] = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epoch / settings.max_epochs))
+        total, taken = 0.0, 0
+        for number, batch in enumerate(phase.batches(self.generator), start=1):
+            if self.context.should_stop():
+                self._stop(before)
+                return
+            loss = self._step(phase, batch, f"epoch {now.epoch + 1}, step {number}")
+            if loss is not None:
+                total, taken = total + loss, taken + 1
+        now.epoch += 1
+        now.train_loss.append(total / taken if taken else math.nan)
+        judged = now.epoch % settings.validate_every == 0 or now.epoch == settings.max_epochs
+        now.validation_loss.append(self._validate(phase) if judged else math.nan)
+        now.seconds = time.monotonic() - started
+        self._tell()
+        if time.monotonic() - self.saved > self.checkpoint_seconds:
+            self._save(self._checkpoint())
+
+    def _stop(self, before: Checkpoint) -> None:
+        """End here, as if what came after ``before`` had not been."""
+        self.interrupted = True
+        self.now = _Progressing(**before.values["phase"])
+        self._save(before)
+
+    def _step(self, phase: Phase, batch: Any, where: str) -> float | None:
+        """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
+        self.adam.zero_grad(set_to_none=True)
+        loss = phase.loss(batch)
+        value = float(loss.detach())
+        if math.isfinite(value):
+            loss.backward()
+            gradients = [parameter.grad for parameter in self.learning.values() if parameter.grad is not None]
+            if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+                if phase.settings.clip:
+                    nn.utils.clip_grad_value_(self.learning.values(), phase.settings.clip)
+                self.adam.step()
+                self.now.skipped_in_a_row = 0
+                return value
+        self.now.skipped += 1
+        self.now.skipped_in_a_row += 1
+        if self.now.skipped_in_a_row >= SKIPS_ALLOWED:
+            raise DataError(
+                f"training: phase '{phase.name}', {where}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
+                f"lower its learning_rate or check the data with 'vehest data check'"
+            )
+        return None
+
+    def _validate(self, phase: Phase) -> float:
+        """The validation loss; the parameters are kept if it is the lowest so far."""
+        with torch.no_grad():
+            loss = float(phase.validation())
+        if loss < self.now.best_loss:
+            self.now.best_loss, self.now.best_epoch = loss, self.now.epoch
+            self.best = _copies(self.state)
+        return loss
+
+    def _tell(self) -> None:
+        done = sum(record.epochs for record in self.records) + self.now.epoch
+        left = sum(phase.settings.max_epochs for phase in self.phases[self.position :])
+        members = max(len(self.context.checkpoint_folders), self.folder_index + 1)
+        allowed = sum(record.epochs for record in self.records) + left
+        self.context.on_progress(Progress(done, allowed, members - self.folder_index, members, self.now.best_loss))
+
+    def _checkpoint(self) -> Checkpoint:
+        """The state as it stands, copied."""
+        finished = self.position == len(self.phases)
+        tensors = {f"best.{name}": value for name, value in self.best.items()}
+        values: dict[str, Any] = {
+            "finished": finished,
+            "epoch": sum(record.epochs for record in self.records) + (0 if finished else self.now.epoch),
+            "records": [vars(record) for record in self.records],
+        }
+        if not finished:
+            tensors |= {f"now.{name}": value for name, value in _copies(self.state).items()}
+            tensors["generator"] = self.generator.get_state()
+            for name, parameter in self.learning.items():
+                moments = self.adam.state.get(parameter, {})
+                tensors |= {f"adam.{moment}.{name}": moments[moment].clone() for moment in _MOMENTS if moment in moments}
+            lists = {"train_loss": list(self.now.train_loss), "validation_loss": list(self.now.validation_loss)}
+            values["phase"] = vars(self.now) | lists
+        return Checkpoint(tensors, values)
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        self.saved = time.monotonic()
+        if self.folder is not None:
+            save_checkpoint(self.folder, checkpoint)
+
+    def resume(self) -> None:
+        """Go on from the checkpoint, if there is one and it is of these phases and modules."""
+        checkpoint = load_checkpoint(self.folder) if self.folder is not None else None
+        if checkpoint is None or not self._fits(checkpoint):
+            return
+        for record in checkpoint.values["records"]:
+            losses = {name: tuple(record[name]) for name in ("train_loss", "validation_loss")}
+            self.records.append(PhaseRecord(**{**record, **losses}))
+        if checkpoint.values["finished"]:
+            _put_back(self.state, _named(checkpoint, "best."))
+            self._begin(len(self.phases))
+            return
+        _put_back(self.state, _named(checkpoint, "now."))
+        self._begin(len(self.records))
+        self.best = {name: value.to(self.state[name].device) for name, value in _named(checkpoint, "best.").items()}
+        self.now = _Progressing(**checkpoint.values["phase"])
+        self.generator.set_state(checkpoint.tensors["generator"])
+        kept = {moment: _named(checkpoint, f"adam.{moment}.") for moment in _MOMENTS}
+        for name, parameter in self.learning.items():
+            if name in kept["step"]:
+                averages = {moment: kept[moment][name].to(parameter.device) for moment in _MOMENTS[1:]}
+                self.adam.state[parameter] = {"step": kept["step"][name], **averages}
+
+    def _fits(self, checkpoint: Checkpoint) -> bool:
+        names = [record["name"] for record in checkpoint.values["records"]]
+        if not checkpoint.values["finished"]:
+            names.append(checkpoint.values["phase"]["name"])
+        shapes = {name: value.shape for name, value in _named(checkpoint, "best.").items()}
+        known = [phase.name for phase in self.phases]
+        enough = len(names) == len(known) or not checkpoint.values["finished"]
+        return enough and names == known[: len(names)] and shapes == {name: value.shape for name, value in self.state.items()}
+
+
+def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:
+    """Parameters and buffers of all phases, each once, under the first phase that has it."""
+    state: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for position, phase in enumerate(phases):
+        for name, value in phase.module.state_dict(keep_vars=True).items():
+            if id(value) not in seen:
+                seen.add(id(value))
+                state[f"{position}.{name}"] = value
+    return state
+
+
+def _copies(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in tensors.items()}
+
+
+def _put_back(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> None:
+    with torch.no_grad():
+        for name, value in state.items():
+            value.copy_(values[name])
+
+
+def _named(checkpoint: Checkpoint, prefix: str) -> dict[str, Tensor]:
+    return {name.removeprefix(prefix): value for name, value in checkpoint.tensors.items() if name.startswith(prefix)}
+
+
+def _stream(seed: int, position: int) -> int:
+    """A stream for the batches of a phase that has nothing to do with the one the initial weights were drawn from."""
+    return int(np.random.SeedSequence([seed, 1, position]).generate_state(1, np.uint64)[0] >> np.uint64(1))
