@@ -17,8 +17,10 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.report.heat_map import Panel, heat_map
+from vehest.stages.artefacts import StagePlan
 from vehest.stages.completion import complete_override
 from vehest.stages.sweep import plan_sweep
+from vehest.stages.train import TrainJob
 from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of
 
 QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
@@ -264,3 +266,13 @@ def test_the_same_training_twice_is_refused_and_named(place):
 
 def test_overrides_of_a_sweep_are_completed():
     assert ("estimator.n_local=2", "default") in complete_override("eval", ["estimator=ksnn"], "estimator.n_l")
+
+
+def test_jobs_group_by_training_settings_that_come_in_groups():
+    def job(rate):
+        split = Split("any", (), (), {"test": (Span("any", "one", -math.inf, math.inf),)})
+        plan = StagePlan("train", "any", {}, {}, "", Path())
+        return TrainJob(plan, {"name": "ksnn"}, {"name": "sequences", "phase": {"learning_rate": rate}}, split, 0, {})
+
+    assert hash(job(1e-3).group) == hash(job(1e-3).group)
+    assert job(1e-3).group == job(1e-3).group != job(2e-3).group

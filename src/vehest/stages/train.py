@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,7 +50,8 @@ class TrainJob:
     def group(self) -> tuple[Any, ...]:
         """Jobs of one group may be trained together."""
         key = new_estimator(self.estimator).batch_key
-        return (key, tuple(sorted(self.training.items())), self.split.train, self.split.validation, tuple(sorted(self.plan.inputs.items())))
+        training = json.dumps(dict(self.training), sort_keys=True)  # may hold groups of settings, which have no hash
+        return (key, training, self.split.train, self.split.validation, tuple(sorted(self.plan.inputs.items())))
 
 
 def new_estimator(config: Mapping[str, Any]) -> Estimator:
