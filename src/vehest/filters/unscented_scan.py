@@ -1,0 +1,393 @@
+"""The unscented filter over long sequences: the same as `unscented_filter`, with compiled steps and their adjoints.
+
+A model says how its points move and what is expected at them, and the adjoints of both; everything else is here. Of each step only states
+and what became of the points are kept, so that long sequences need little memory.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vehest.filters.definiteness import MARGIN
+from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.nonlinear import Function, NonlinearFiltered
+from vehest.filters.sigma_points import SigmaRule
+from vehest.filters.unscented_steps import moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
+
+Array = NDArray[Any]
+Share = Callable[[Callable[[int, int], None], int], None]
+"""Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
+
+
+class PointModel(ABC):
+    """How sigma points move and what is expected at them, with adjoints; arrays of one precision, float32 or float64.
+
+    Attributes:
+        parameters: what gradients are wanted for.
+        lower: smallest possible value of each state, (n,); none: everything is possible.
+    """
+
+    parameters: Sequence[Tensor] = ()
+    lower: Sequence[float] | None = None
+
+    @abstractmethod
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """Points one step later, (B, S, n) under inputs (B, p) -> (B, S, n)."""
+
+    @abstractmethod
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """What is expected at points, (B, S, n) -> (B, S, m)."""
+
+    @abstractmethod
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """Gradient of the points, (B, S, n); those of the parameters are added to ``gradients``."""
+
+    @abstractmethod
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """Gradient of the points, (B, S, n); those of the parameters are added to ``gradients``."""
+
+
+class TorchModel(PointModel):
+    """A model written in torch, whose adjoints are those of automatic differentiation.
+
+    Args:
+        transition: f of points (..., n) and inputs (..., p).
+        observation: h of the same, (..., m).
+        parameters: leaves that both may use and gradients are wanted for.
+        lower: see `PointModel`.
+    """
+
+    def __init__(
+        self, transition: Function, observation: Function, parameters: Sequence[Tensor] = (), lower: Sequence[float] | None = None
+    ) -> None:
+        self._transition, self._observation = transition, observation
+        self.parameters = [parameter for parameter in parameters if parameter.requires_grad]
+        self.lower = lower
+
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """By the function."""
+        return self._value(self._transition, points, inputs)
+
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """By the function."""
+        return self._value(self._observation, points, inputs)
+
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """By automatic differentiation."""
+        return self._adjoint(self._transition, points, inputs, upstream, gradients)
+
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """By automatic differentiation."""
+        return self._adjoint(self._observation, points, inputs, upstream, gradients)
+
+    @staticmethod
+    def _value(function: Function, points: Array, inputs: Array) -> Array:
+        with torch.no_grad():
+            value: Array = function(torch.from_numpy(points), torch.from_numpy(inputs).unsqueeze(-2)).contiguous().numpy()
+        return value
+
+    def _adjoint(self, function: Function, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        with torch.enable_grad():
+            state = torch.from_numpy(points).requires_grad_()
+            value = function(state, torch.from_numpy(inputs).unsqueeze(-2))
+            own = torch.autograd.grad(value, [state, *self.parameters], torch.from_numpy(upstream), allow_unused=True)
+        for gradient, part in zip(gradients, own[1:], strict=True):
+            if part is not None:
+                gradient += part.numpy()
+        return np.zeros_like(points) if own[0] is None else np.ascontiguousarray(own[0].numpy())
+
+
+@dataclass(frozen=True)
+class _Setting:
+    model: PointModel
+    rule: Array
+    lower: Array
+    margin: Any
+    repair: bool
+    share: Share
+
+
+class _Tape:
+    """What the steps leave behind, sample by sample."""
+
+    def __init__(self, steps: int, sequences: int, n: int, m: int, dtype: Any) -> None:
+        def empty(*shape: int) -> Array:
+            return np.empty((steps, sequences, *shape), dtype)
+
+        points = 2 * n + 1
+        self.prior_mean, self.prior_covariance = empty(n), empty(n, n)
+        self.post_mean, self.post_covariance = empty(n), empty(n, n)
+        self.moved, self.expected = empty(points, n), empty(points, m)
+        self.innovation, self.own, self.gain, self.likelihood = empty(m), empty(m, m), empty(n, m), empty()
+        self.repaired = np.zeros((steps, sequences), np.bool_)
+
+    def slice(self, first: int, end: int) -> _Tape:
+        """The same of some sequences, copied to lie together."""
+        part = _Tape.__new__(_Tape)
+        for name, values in vars(self).items():
+            setattr(part, name, np.ascontiguousarray(values[:, first:end]))
+        return part
+
+    def put(self, first: int, end: int, part: _Tape) -> None:
+        """Take what was computed for some sequences back."""
+        for name, values in vars(part).items():
+            getattr(self, name)[:, first:end] = values
+
+
+def unscented_scan(
+    model: PointModel,
+    measurements: Tensor,
+    inputs: Tensor,
+    initial: Gaussian[Tensor],
+    process_noise: Tensor | Function,
+    observation_noise: Tensor | Function,
+    rule: SigmaRule,
+    *,
+    repair: bool = True,
+    share: Share | None = None,
+) -> NonlinearFiltered:
+    """Filter sequences; filtered means and covariances are differentiable in everything that is a tensor, the rest is not.
+
+    Args:
+        model: how points move.
+        measurements: y, (B, T, m); what is NaN was not measured.
+        inputs: u, (B, T, p).
+        initial: state at the first sample before its measurement, mean (n,) or (B, n).
+        process_noise: Q of each step, (B, T, n, n) or what broadcasts to it; or a function of the estimated state, without gradients.
+        observation_noise: R of each sample, (B, T, m, m) or what broadcasts to it; or a function of the predicted state, without gradients.
+        rule: which sigma points.
+        repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
+        share: how sequences are shared out over threads; none: one thread.
+
+    Raises:
+        ValueError: shapes do not fit each other.
+
+    Source: as `unscented_filter`; adjoint of the Cholesky factor from Murray 2016, arXiv 1602.07527.
+    """
+    if measurements.dim() != 3 or not measurements.shape[1]:
+        raise ValueError(f"measurements must be of shape (B, T, m) with T > 0, not {tuple(measurements.shape)}")
+    if inputs.shape[:-1] != measurements.shape[:-1]:
+        raise ValueError(f"inputs of shape {tuple(inputs.shape)} do not fit measurements of shape {tuple(measurements.shape)}")
+    sequences, steps, m = measurements.shape
+    n = initial.mean.shape[-1]
+    try:
+        mean, covariance = initial.mean.expand(sequences, n), initial.covariance.expand(sequences, n, n)
+    except RuntimeError:
+        raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
+    dtype = measurements.dtype
+    numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
+    row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], numpy_dtype)
+    lower = np.full(n, -np.inf, numpy_dtype) if model.lower is None else np.asarray(model.lower, numpy_dtype)
+    setting = _Setting(model, row, lower, numpy_dtype(MARGIN), repair, share or _alone)
+    noises = [process_noise, observation_noise]
+    functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
+    tensors = [
+        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0)
+        for noise, size in zip(noises, (n, m), strict=True)
+    ]
+    tape = _Tape(steps, sequences, n, m, numpy_dtype)
+    post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
+        setting, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+    )
+    outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
+    filtered = Filtered(
+        Gaussian(outside[0], outside[1]),
+        Gaussian(post_mean.transpose(0, 1), post_covariance.transpose(0, 1)),
+        outside[2],
+        outside[3],
+        ~torch.isnan(measurements),
+        torch.from_numpy(tape.likelihood.swapaxes(0, 1)),
+    )
+    return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
+
+
+class _Scan(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        setting: _Setting,
+        tape: _Tape,
+        functions: Sequence[Function | None],
+        measurements: Tensor,
+        inputs: Tensor,
+        mean: Tensor,
+        covariance: Tensor,
+        process: Tensor,
+        observation: Tensor,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        y, u = _by_time(measurements), _by_time(inputs)
+        first = [tensor.detach().contiguous().numpy() for tensor in (mean, covariance)]
+        noises: list[Any] = [
+            _by_time(noise) if function is None else function
+            for noise, function in zip((process, observation), functions, strict=True)
+        ]
+
+        def work(start: int, end: int) -> None:
+            part = tape if end - start == y.shape[1] else tape.slice(start, end)
+            own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
+            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
+            if part is not tape:
+                tape.put(start, end, part)
+
+        setting.share(work, y.shape[1])
+        ctx.kept = (setting, tape, functions, y, u, first)
+        return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        setting, tape, functions, y, u, first = ctx.kept
+        if any(function is not None for function in functions):
+            raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
+        steps, sequences, n = tape.post_mean.shape
+        m = y.shape[2]
+        dtype = y.dtype
+        process, observation = np.zeros((steps, sequences, n, n), dtype), np.zeros((steps, sequences, m, m), dtype)
+        mean, covariance = np.zeros((sequences, n), dtype), np.zeros((sequences, n, n), dtype)
+        mean_up, covariance_up = (np.ascontiguousarray(part.numpy()) for part in upstream)
+        gradients: dict[int, list[Array]] = {}
+
+        def work(start: int, end: int) -> None:
+            whole = end - start == sequences
+            part = tape if whole else tape.slice(start, end)
+            own = [np.zeros(tuple(parameter.shape), dtype) for parameter in setting.model.parameters]
+            gradients[start] = own
+            pieces = (process, observation, mean_up, covariance_up)
+            cut = pieces if whole else tuple(np.ascontiguousarray(piece[:, start:end]) for piece in pieces)
+            mean[start:end], covariance[start:end] = _backward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], *cut, own)
+            if not whole:
+                process[:, start:end], observation[:, start:end] = cut[0], cut[1]
+
+        setting.share(work, sequences)
+        summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
+        noise = (torch.from_numpy(process).transpose(0, 1), torch.from_numpy(observation).transpose(0, 1))
+        return (None, None, None, None, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+
+
+def _forward(setting: _Setting, tape: _Tape, y: Array, u: Array, mean: Array, covariance: Array, noises: Sequence[Any]) -> None:
+    model, rule, lower = setting.model, setting.rule, setting.lower
+    steps, sequences = y.shape[:2]
+    n = mean.shape[1]
+    factor, points = np.empty((sequences, n, n), y.dtype), np.empty((sequences, 2 * n + 1, n), y.dtype)
+    lost = np.zeros(sequences, np.bool_)
+    for k in range(steps):
+        now = np.ascontiguousarray(u[k])
+        if k == 0:
+            tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
+        else:
+            before = np.ascontiguousarray(u[k - 1])
+            draw = tape.post_covariance[k - 1].copy()
+            points_of(tape.post_mean[k - 1], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
+            tape.repaired[k] = lost
+            tape.moved[k] = model.transition(points, before)
+            noise = _noise(noises[0], k - 1, tape.post_mean[k - 1], before)
+            moments_of(tape.moved[k], noise, rule, lower, tape.prior_mean[k], tape.prior_covariance[k])
+        draw = tape.prior_covariance[k].copy()
+        points_of(tape.prior_mean[k], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
+        tape.repaired[k] |= lost
+        tape.expected[k] = model.observation(points, now)
+        update_of(
+            tape.prior_mean[k],
+            draw,
+            points,
+            tape.expected[k],
+            np.ascontiguousarray(y[k]),
+            _noise(noises[1], k, tape.prior_mean[k], now),
+            rule,
+            lower,
+            setting.margin,
+            setting.repair,
+            tape.post_mean[k],
+            tape.post_covariance[k],
+            tape.innovation[k],
+            tape.own[k],
+            tape.gain[k],
+            tape.likelihood[k],
+            tape.repaired[k],
+        )
+
+
+def _backward(
+    setting: _Setting,
+    tape: _Tape,
+    y: Array,
+    u: Array,
+    first: Array,
+    process_bar: Array,
+    observation_bar: Array,
+    mean_up: Array,
+    covariance_up: Array,
+    gradients: Sequence[Array],
+) -> tuple[Array, Array]:
+    """Gradients of the initial mean and covariance; those of the noise are written, those of the parameters added."""
+    model, rule, lower = setting.model, setting.rule, setting.lower
+    steps, sequences, n = tape.post_mean.shape
+    m = y.shape[2]
+    factor, points = np.empty((sequences, n, n), y.dtype), np.empty((sequences, 2 * n + 1, n), y.dtype)
+    points_bar, expected_bar = np.empty_like(points), np.empty((sequences, 2 * n + 1, m), y.dtype)
+    moved_bar, lost = np.empty_like(points), np.zeros(sequences, np.bool_)
+    post_mean_bar, post_covariance_bar = np.zeros((sequences, n), y.dtype), np.zeros((sequences, n, n), y.dtype)
+    mean_bar, covariance_bar = np.empty_like(post_mean_bar), np.empty_like(post_covariance_bar)
+    for k in range(steps - 1, -1, -1):
+        now = np.ascontiguousarray(u[k])
+        post_mean_bar += mean_up[k]
+        post_covariance_bar += covariance_up[k]
+        draw = tape.prior_covariance[k].copy()
+        points_of(tape.prior_mean[k], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
+        update_adjoint(
+            tape.prior_mean[k],
+            points,
+            tape.expected[k],
+            np.ascontiguousarray(y[k]),
+            rule,
+            lower,
+            tape.innovation[k],
+            tape.own[k],
+            tape.gain[k],
+            post_mean_bar,
+            post_covariance_bar,
+            mean_bar,
+            covariance_bar,
+            points_bar,
+            expected_bar,
+            observation_bar[k],
+        )
+        points_bar += model.observation_adjoint(points, now, expected_bar, gradients)
+        points_adjoint(tape.prior_mean[k], factor, rule, lower, points_bar, mean_bar, covariance_bar)
+        if k == 0:
+            break
+        moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1])
+        before = np.ascontiguousarray(u[k - 1])
+        draw = tape.post_covariance[k - 1].copy()
+        points_of(tape.post_mean[k - 1], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
+        points_bar[:] = model.transition_adjoint(points, before, moved_bar, gradients)
+        post_mean_bar[:] = 0
+        post_covariance_bar[:] = 0
+        points_adjoint(tape.post_mean[k - 1], factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar)
+    return mean_bar, covariance_bar
+
+
+def _noise(noise: Any, k: int, mean: Array, inputs: Array) -> Array:
+    if isinstance(noise, np.ndarray):
+        return np.ascontiguousarray(noise[k])
+    with torch.no_grad():
+        values: Array = noise(torch.from_numpy(mean), torch.from_numpy(inputs)).contiguous().numpy()
+    return values
+
+
+def _by_time(tensor: Tensor) -> Array:
+    """(B, T, ...) -> (T, B, ...), together in memory."""
+    values: Array = tensor.detach().transpose(0, 1).contiguous().numpy()
+    return values
+
+
+def _alone(work: Callable[[int, int], None], sequences: int) -> None:
+    work(0, sequences)

@@ -1,0 +1,250 @@
+"""Planar cars that differ in what of them is a network: x = (vx, vy, yaw rate, rim speed, friction), u = (steering angle, motor current).
+
+Source: Węgrzynowski et al. 2024, Section III-B.2; sizes, inputs and start values as in its authors' code.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from vehest.vehicle.integration import rk4
+from vehest.vehicle.planar import F1TENTH, F1TENTH_START, Chassis, Motion, PlanarCar
+from vehest.vehicle.tyres import PacejkaTyres, Slips, TyreForces
+
+STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
+INPUTS = ("steer", "motor_current")
+MEASUREMENTS = ("ax", "ay", "yaw_rate", "rim_speed")
+
+PACEJKA_START: Mapping[str, float] = {
+    "friction": 0.8916,
+    **{"B_x": 2.8, "C_x": 1.2, "D_x": 0.8095},
+    **{f"{name}_{axle}": value for axle in ("front", "rear") for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))},
+}
+"""Where learning Pacejka's curves of the F1TENTH car starts; the same source."""
+
+TURN = 100.0  # [1/rad] steepness with which a lateral force changes its sign
+UNSCALED = 0.4  # factor of the forces of a tyre network that does not know the friction
+
+
+class Perceptron(nn.Sequential):
+    """Fully connected layers with sigmoids between them; inputs and outputs are divided and multiplied by fixed scales.
+
+    Args:
+        scales: of the inputs; what an input is divided by.
+        hidden: sizes of the hidden layers.
+        outputs: what outputs are multiplied by.
+    """
+
+    input_scale: Tensor
+    output_scale: Tensor
+
+    def __init__(self, scales: Sequence[float], hidden: Sequence[int], outputs: Sequence[float]) -> None:
+        sizes = [len(scales), *hidden, len(outputs)]
+        layers: list[nn.Module] = []
+        for before, after in zip(sizes, sizes[1:], strict=False):
+            layers += [nn.Linear(before, after), nn.Sigmoid()]
+        super().__init__(*layers[:-1])
+        self.register_buffer("input_scale", torch.tensor(list(scales)))
+        self.register_buffer("output_scale", torch.tensor(list(outputs)))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(..., inputs) -> (..., outputs)."""
+        scaled: Tensor = super().forward(values / self.input_scale)
+        return scaled * self.output_scale
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw weights and offsets anew, uniform within one over the root of a layer's inputs (torch's way)."""
+        with torch.no_grad():
+            for layer in self:
+                if isinstance(layer, nn.Linear):
+                    bound = layer.in_features**-0.5
+                    for parameter in (layer.weight, layer.bias):
+                        parameter.copy_(bound * (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0))
+
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weight and offset of each layer, scales included."""
+        linear = [layer for layer in self if isinstance(layer, nn.Linear)]
+        pairs = [(layer.weight, layer.bias) for layer in linear]
+        pairs[0] = (pairs[0][0] / self.input_scale, pairs[0][1])
+        pairs[-1] = (pairs[-1][0] * self.output_scale.unsqueeze(-1), pairs[-1][1] * self.output_scale)
+        return pairs
+
+
+class Dynamics(nn.Module):
+    """A planar car with everything that makes it move. Friction stays as it is."""
+
+    @abstractmethod
+    def motion(self, state: Tensor, inputs: Tensor) -> Motion:
+        """Rates of vx, vy, yaw rate and rim speed, and what an accelerometer reads.
+
+        Args:
+            state: (..., 5).
+            inputs: (..., 2).
+        """
+
+    def rates(self, state: Tensor, inputs: Tensor) -> Tensor:
+        """dx/dt, (..., 5)."""
+        moving = self.motion(state, inputs).rates
+        return torch.cat([moving, torch.zeros_like(moving[..., :1])], -1)
+
+    def transition(self, state: Tensor, inputs: Tensor, step: float) -> Tensor:
+        """The state one step [s] later, by the Runge-Kutta method, (..., 5)."""
+        state, inputs = _broadcast(state, inputs)
+        return rk4(self.rates, state, inputs, step)
+
+    def observation(self, state: Tensor, inputs: Tensor) -> Tensor:
+        """What sensors read: ax, ay [m/s²], yaw rate [rad/s], rim speed [m/s], (..., 4)."""
+        state, inputs = _broadcast(state, inputs)
+        motion = self.motion(state, inputs)
+        return torch.cat([motion.ax.unsqueeze(-1), motion.ay.unsqueeze(-1), state[..., 2:4]], -1)
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw the weights of networks anew; physical parameters keep their values."""
+        for module in self.modules():
+            if isinstance(module, Perceptron):
+                module.reset(generator)
+
+
+class PacejkaCar(Dynamics):
+    """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not the state's."""
+
+    def __init__(
+        self,
+        chassis: Chassis = F1TENTH,
+        start: Mapping[str, float] = F1TENTH_START,
+        tyres: Mapping[str, float] = PACEJKA_START,
+        *,
+        with_curvature: bool = False,
+    ) -> None:
+        super().__init__()
+        self.car = PlanarCar(chassis, start)
+        self.tyres = PacejkaTyres(tyres, with_curvature=with_curvature)
+
+    def motion(self, state: Tensor, inputs: Tensor) -> Motion:
+        """See `Dynamics.motion`."""
+        return self.car.motion(state, inputs, self.tyres(self.car.slips(state, inputs), self.car.loads()))
+
+
+class ResidualCar(PacejkaCar):
+    """PCR: the same, and a network that adds to its rates."""
+
+    def __init__(
+        self,
+        chassis: Chassis = F1TENTH,
+        start: Mapping[str, float] = F1TENTH_START,
+        tyres: Mapping[str, float] = PACEJKA_START,
+        *,
+        hidden: Sequence[int] = (256, 256),
+    ) -> None:
+        super().__init__(chassis, start, tyres)
+        self.network = Perceptron([1.0] * 6, hidden, [1.0] * 4)
+
+    def motion(self, state: Tensor, inputs: Tensor) -> Motion:
+        """See `Dynamics.motion`."""
+        return _kinematic(state, super().motion(state, inputs).rates + self.network(torch.cat([state[..., :4], inputs], -1)))
+
+
+class NeuralCar(Dynamics):
+    """NN: the rates are a network's (Eq. 4)."""
+
+    def __init__(self, hidden: Sequence[int] = (256, 256)) -> None:
+        super().__init__()
+        self.network = Perceptron([1.0] * 6, hidden, [1.0] * 4)
+
+    def motion(self, state: Tensor, inputs: Tensor) -> Motion:
+        """See `Dynamics.motion`."""
+        return _kinematic(state, self.network(torch.cat([state[..., :4], inputs], -1)))
+
+
+class TyreNetworkCar(Dynamics):
+    """NNTF and NNT: single track with a network for the tyres (Eqs. 6 and 5).
+
+    NNTF: F_x = μ o, F_y = -μ softplus(o) tanh(100 α); the network sees vx, vy, yaw rate, rim speed, friction, steering angle and slips.
+    NNT: forces are 0.4 o, and it sees the motor's current too.
+
+    Args:
+        friction_scaled: whether forces are scaled by friction (NNTF).
+        input_scale: what the network's inputs are divided by; none: 1.
+        force_scale: [N] what its outputs are multiplied by.
+    """
+
+    def __init__(
+        self,
+        chassis: Chassis = F1TENTH,
+        start: Mapping[str, float] = F1TENTH_START,
+        *,
+        friction_scaled: bool = True,
+        hidden: Sequence[int] = (64, 64),
+        input_scale: Sequence[float] | None = None,
+        force_scale: float = 1.0,
+    ) -> None:
+        super().__init__()
+        self.car = PlanarCar(chassis, start)
+        self.friction_scaled = friction_scaled
+        count = 9 if friction_scaled else 10
+        self.network = Perceptron([1.0] * count if input_scale is None else input_scale, hidden, [force_scale] * 4)
+
+    def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
+        """Forces of both axles [N]."""
+        steer, current = inputs.unbind(-1)
+        seen = [*state.unbind(-1), steer, slips.front, slips.rear, slips.ratio]
+        if not self.friction_scaled:
+            rear_x, front_x, rear_y, front_y = (UNSCALED * self.network(torch.stack([*seen, current], -1))).unbind(-1)
+            return TyreForces(front_x, front_y, rear_x, rear_y)
+        rear_x, front_x, rear_y, front_y = self.network(torch.stack(seen, -1)).unbind(-1)
+        mu = state[..., 4]
+        return TyreForces(
+            mu * front_x,
+            -mu * nn.functional.softplus(front_y) * torch.tanh(TURN * slips.front),
+            mu * rear_x,
+            -mu * nn.functional.softplus(rear_y) * torch.tanh(TURN * slips.rear),
+        )
+
+    def motion(self, state: Tensor, inputs: Tensor) -> Motion:
+        """See `Dynamics.motion`."""
+        return self.car.motion(state, inputs, self.forces(state, inputs, self.car.slips(state, inputs)))
+
+
+class Physical(NamedTuple):
+    """What compiled code is given of a planar car, in this order."""
+
+    values: Tensor
+    mass: float
+    wheelbase: float
+    wheel_radius: float
+
+
+PHYSICAL = (
+    "cg_to_rear_axle",
+    "yaw_inertia",
+    "drag_constant",
+    "drag_linear",
+    "drag_quadratic",
+    "powertrain_inertia",
+    "torque_constant",
+    "friction_viscous",
+    "friction_coulomb",
+)
+
+
+def physical_of(car: PlanarCar) -> Physical:
+    """Learnt values in the order of `PHYSICAL`, differentiable, and known ones."""
+    return Physical(
+        torch.stack([car.learnt[name] for name in PHYSICAL]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius
+    )
+
+
+def _kinematic(state: Tensor, rates: Tensor) -> Motion:
+    """Motion of given rates: ax = dvx/dt - vy r, ay = dvy/dt + vx r."""
+    vx, vy, yaw_rate = state[..., 0], state[..., 1], state[..., 2]
+    return Motion(rates, rates[..., 0] - vy * yaw_rate, rates[..., 1] + vx * yaw_rate)
+
+
+def _broadcast(state: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    shape = torch.broadcast_shapes(state.shape[:-1], inputs.shape[:-1])
+    return state.expand(*shape, state.shape[-1]), inputs.expand(*shape, inputs.shape[-1])
