@@ -62,8 +62,15 @@ class StateDependentNoise(nn.Module):
         self.constant = ConstantNoise(variances, floor)
         self.scale = scale
         count = self.constant.n * (self.constant.n + 1) // 2
-        self.weight = nn.Parameter(deviation * torch.randn(count, n_states, generator=generator))
+        self.deviation = deviation
+        self.weight = nn.Parameter(torch.empty(count, n_states))
         self.offset = nn.Parameter(torch.zeros(count))
+        self.reset(generator)
+
+    def reset(self, generator: torch.Generator | None = None) -> None:
+        """Draw the weights anew."""
+        with torch.no_grad():
+            self.weight.copy_(self.deviation * torch.randn(self.weight.shape, generator=generator))
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""

@@ -209,6 +209,26 @@ def unscented_scan(
     return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
 
 
+def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
+    """States one step later, (B, n) under inputs (B, p) -> (B, n), differentiable in the model's parameters alone."""
+    after: Tensor = _Moved.apply(model, states, inputs, *model.parameters)  # type: ignore[no-untyped-call]
+    return after
+
+
+class _Moved(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor) -> Tensor:
+        ctx.kept = (model, states.detach().unsqueeze(1).contiguous().numpy(), inputs.contiguous().numpy())
+        return torch.from_numpy(model.transition(*ctx.kept[1:])[:, 0])
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        model, points, inputs = ctx.kept
+        gradients = [np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters]
+        model.transition_adjoint(points, inputs, upstream[0].unsqueeze(1).contiguous().numpy(), gradients)
+        return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
+
+
 class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(

@@ -189,6 +189,11 @@ class TyreNetworkCar(Dynamics):
         count = 9 if friction_scaled else 10
         self.network = Perceptron([1.0] * count if input_scale is None else input_scale, hidden, [force_scale] * 4)
 
+    @property
+    def is_compilable(self) -> bool:
+        """Whether the network has the two hidden layers that compiled code is written for."""
+        return len(self.network) == 5
+
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
         """Forces of both axles [N]."""
         steer, current = inputs.unbind(-1)

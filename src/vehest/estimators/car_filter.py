@@ -1,0 +1,150 @@
+"""An unscented filter of a planar car whose dynamics and noise can be learnt."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from vehest.estimators.kernels.threads import over_members
+from vehest.estimators.kernels.tyre_network import CompiledTyreNetwork
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
+from vehest.filters.nonlinear import NonlinearFiltered
+from vehest.filters.sigma_points import symmetric_rule
+from vehest.filters.unscented_scan import PointModel, TorchModel, moved, unscented_scan
+from vehest.training.through_filter import Drive
+from vehest.vehicle.dynamics import MEASUREMENTS, STATES, Dynamics, TyreNetworkCar
+
+NoiseKind = Literal["constant", "state_dependent"]
+
+PROCESS = (1e-3, 1e-3, 1e-2, 1e-2)  # variances to begin with, of one sample's step
+FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
+OBSERVATION = (50.0, 50.0, 0.1, 0.1)
+INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
+LEAST_ENTROPY = -9.0  # [nat] of the process noise
+
+
+class CarFilter(nn.Module):
+    """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
+
+    Args:
+        dynamics: how the car moves.
+        noise: covariances constant, or dependent on the state.
+        step: [s].
+        least: smallest possible vx [m/s] and friction.
+        kappa: of the symmetric sigma points.
+        repair: whether lost definiteness is repaired.
+
+    Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
+    """
+
+    def __init__(
+        self, dynamics: Dynamics, noise: NoiseKind, *, step: float, least: tuple[float, float], kappa: float = -2.0, repair: bool = True
+    ) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+        n = len(STATES)
+        process = (*PROCESS, FRICTION[noise])
+        if noise == "constant":
+            self.process_noise: nn.Module = ConstantNoise(process)
+            self.observation_noise: nn.Module = ConstantNoise(OBSERVATION)
+        else:
+            self.process_noise = StateDependentNoise(process, n)
+            self.observation_noise = StateDependentNoise(OBSERVATION, n)
+        self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
+        self.step, self.repair = step, repair
+        self.lower = (least[0], *[-torch.inf] * 3, least[1])
+        self.rule = symmetric_rule(n, kappa)
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw everything that is random to begin with anew."""
+        self.dynamics.reset(generator)
+        for noise in (self.process_noise, self.observation_noise):
+            if isinstance(noise, StateDependentNoise):
+                noise.reset(generator)
+
+    def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """States one sample later, (B, 5)."""
+        return moved(self.point_model(), states, inputs)
+
+    def point_model(self) -> PointModel:
+        """The dynamics as the filter takes them: compiled where they can be."""
+        dtype = next(self.parameters()).dtype
+        if isinstance(self.dynamics, TyreNetworkCar) and self.dynamics.is_compilable:
+            return CompiledTyreNetwork(self.dynamics, self.step, self.lower, dtype)
+        return TorchModel(
+            lambda points, inputs: self.dynamics.transition(points, inputs, self.step),
+            self.dynamics.observation,
+            list(self.dynamics.parameters()),
+            self.lower,
+        )
+
+    def initial_covariance(self) -> Tensor:
+        """Of a state that is known, (5, 5)."""
+        covariance: Tensor = self.initial_noise(torch.zeros(len(STATES)), torch.zeros(0))
+        return covariance
+
+    def filtered(
+        self, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], states: Tensor | None = None, model: PointModel | None = None
+    ) -> NonlinearFiltered:
+        """Filter sequences.
+
+        Args:
+            measurements: (B, T, 4), NaN where nothing was measured.
+            inputs: (B, T, 2).
+            initial: at the first sample, mean (B, 5).
+            states: true ones, (B, T, 5), that the noise then depends on; none: it depends on the estimate, and has no gradients.
+            model: what `point_model` returned, to use it again.
+        """
+        if states is not None or isinstance(self.process_noise, ConstantNoise):
+            at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
+            process, observation = self._process_noise(at, inputs), self.observation_noise(at, inputs)
+        else:
+            process, observation = self._process_noise, self.observation_noise
+        return unscented_scan(
+            model or self.point_model(),
+            measurements,
+            inputs,
+            initial,
+            process,
+            observation,
+            self.rule,
+            repair=self.repair,
+            share=partial(over_members, pieces=1),
+        )
+
+    def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
+        """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""
+        total = drives.states.shape[1]
+        initial = Gaussian(start, self.initial_covariance())
+        model = self.point_model()
+        parts = []
+        for first in range(0, total, steps or total):
+            # a later stretch starts with the last sample of the one before, which is not measured twice
+            begin, end = max(first - 1, 0), min(first + (steps or total), total)
+            measurements = drives.measurements[:, begin:end]
+            if first:
+                measurements = torch.cat([torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1)
+            states = self._settled(drives.states[:, begin:end])
+            filtered = self.filtered(measurements, drives.inputs[:, begin:end], initial, states, model).steps.filtered
+            parts.append(filtered.mean[:, first - begin :])
+            initial = Gaussian(filtered.mean[:, -1].detach(), filtered.covariance[:, -1].detach())
+        return torch.cat(parts, 1)
+
+    def judged(self, drives: Drive) -> Tensor:
+        """Estimated states of sequences, (B, T, 5), from the true state of their first sample."""
+        with torch.no_grad():
+            initial = Gaussian(drives.states[:, 0], self.initial_covariance())
+            return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean
+
+    def _settled(self, states: Tensor) -> Tensor | None:
+        return None if isinstance(self.process_noise, ConstantNoise) else states
+
+    def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
+        return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
+
+
+assert len(OBSERVATION) == len(MEASUREMENTS)

@@ -1,0 +1,224 @@
+"""Training of a filter's model: as a one-step predictor, and through the filter, on sequences that start at the true state.
+
+Knows neither cars nor which filter it is: a `Filtering` says how states move and how a sequence is filtered.
+
+Source: Węgrzynowski et al. 2024, Section III-B.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.training.sequences import Phase
+from vehest.training.settings import PhaseSettings
+
+
+class Drive(NamedTuple):
+    """An uninterrupted drive, sampled, or several of one length.
+
+    Attributes:
+        states: true ones, (..., T, n).
+        inputs: (..., T, p).
+        measurements: (..., T, m); NaN where nothing was measured.
+    """
+
+    states: Tensor
+    inputs: Tensor
+    measurements: Tensor
+
+
+class Filtering(Protocol):
+    """A filter that can be trained."""
+
+    def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """States one sample later, (..., n)."""
+        ...
+
+    def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
+        """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
+        ...
+
+    def judged(self, drives: Drive) -> Tensor:
+        """Estimated states, (B, T, n), as in use: without gradients, and without knowing any true state but the first."""
+        ...
+
+
+@dataclass(frozen=True)
+class ThroughFilterSettings:
+    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors' code).
+
+    Args:
+        one_step: the model as a one-step predictor.
+        one_step_batch: pairs of samples in a batch.
+        through: model and noise together, through the filter; for models that learn so.
+        noise: noise alone, through the filter, with the model as it is; for the others.
+        steps: samples T of a training sequence.
+        drop_steps: first samples of a sequence that do not count.
+        batch_size: sequences in a batch.
+        placing: ``fixed`` cuts drives into the same sequences every epoch, ``random`` draws where they start.
+        curriculum: lengths of shorter sequences to begin with, each for ``curriculum_epochs``.
+        curriculum_epochs: see there.
+        truncate_steps: samples that gradients reach back; 0: to the start of the sequence.
+        validation_steps: samples of a validation sequence.
+        validation_drop_steps: first samples of it that do not count.
+        start_spread: by how much the last state (friction) is off at the start of a training sequence, at most, up or down.
+        checkpoint_seconds: time between two checkpoints [s].
+    """
+
+    one_step: PhaseSettings = PhaseSettings()
+    one_step_batch: int = 2048
+    through: PhaseSettings = PhaseSettings(validate_every=5)
+    noise: PhaseSettings = PhaseSettings(max_epochs=200, validate_every=5)
+    steps: int = 500
+    drop_steps: int = 0
+    batch_size: int = 256
+    placing: str = "fixed"
+    curriculum: Sequence[int] = ()
+    curriculum_epochs: int = 100
+    truncate_steps: int = 0
+    validation_steps: int = 1000
+    validation_drop_steps: int = 200
+    start_spread: float = 0.0
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        for name in ("one_step_batch", "steps", "batch_size", "curriculum_epochs", "validation_steps"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+        for name in ("drop_steps", "validation_drop_steps", "truncate_steps", "start_spread"):
+            if getattr(self, name) < 0:
+                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
+            raise ConfigurationError("training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps")
+        if self.placing not in ("fixed", "random"):
+            raise ConfigurationError(f"training.placing '{self.placing}' is not one of: fixed, random")
+        if any(isinstance(steps, bool) or not isinstance(steps, int) or steps <= self.drop_steps for steps in self.curriculum):
+            raise ConfigurationError(f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}")
+
+
+@dataclass(frozen=True)
+class Weights:
+    """What counts how much.
+
+    Args:
+        one_step: weight of each state's squared error of the one-step prediction, (n,).
+        training: the same through the filter, (n,).
+        validation: the same when judging epochs, (n,).
+    """
+
+    one_step: Tensor
+    training: Tensor
+    validation: Tensor
+
+
+def one_step_phase(
+    module: torch.nn.Module,
+    filtering: Filtering,
+    train: Sequence[Drive],
+    validation: Sequence[Drive],
+    weights: Weights,
+    settings: ThroughFilterSettings,
+    trainable: Callable[[str], bool],
+) -> Phase:
+    """The model as a predictor of the next sample."""
+    before, inputs, after = (torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in train), strict=True))
+    judged = [torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in validation), strict=True)]
+
+    def batches(generator: torch.Generator) -> Iterable[Tensor]:
+        return torch.randperm(len(before), generator=generator).split(settings.one_step_batch)
+
+    def loss(rows: Tensor) -> Tensor:
+        return _weighted(filtering.moved(before[rows], inputs[rows]) - after[rows], weights.one_step)
+
+    def judge() -> float:
+        return float(_weighted(filtering.moved(judged[0], judged[1]) - judged[2], weights.one_step))
+
+    return Phase("one_step", settings.one_step, module, batches, loss, judge, trainable)
+
+
+def filter_phases(
+    module: torch.nn.Module,
+    filtering: Filtering,
+    train: Sequence[Drive],
+    validation: Sequence[Drive],
+    weights: Weights,
+    settings: ThroughFilterSettings,
+    how: PhaseSettings,
+    trainable: Callable[[str], bool],
+    name: str,
+) -> list[Phase]:
+    """Through the filter: one phase a length of the curriculum, the last on whole sequences.
+
+    Raises:
+        DataError: no training or validation drive is long enough.
+    """
+    judged = sequences_of(validation, settings.validation_steps)
+
+    def judge() -> float:
+        estimated = filtering.judged(judged)
+        error = (estimated - judged.states)[:, settings.validation_drop_steps :]
+        return float(_weighted(error, weights.validation))
+
+    def phase(steps: int, epochs: int, label: str) -> Phase:
+        fixed = sequences_of(train, steps)
+
+        def batches(generator: torch.Generator) -> Iterable[tuple[Drive, Tensor]]:
+            drives = fixed if settings.placing == "fixed" else placed(train, steps, generator)
+            order = torch.randperm(len(drives.states), generator=generator)
+            for rows in order.split(settings.batch_size):
+                start = drives.states[rows, 0].clone()
+                if settings.start_spread:
+                    off = 2.0 * torch.rand(len(rows), generator=generator, dtype=start.dtype) - 1.0
+                    start[:, -1] = start[:, -1] + settings.start_spread * off
+                yield Drive(*(part[rows] for part in drives)), start
+
+        def loss(batch: tuple[Drive, Tensor]) -> Tensor:
+            drives, start = batch
+            estimated = filtering.estimated(drives, start, settings.truncate_steps or None)
+            return _weighted((estimated - drives.states)[:, settings.drop_steps :], weights.training)
+
+        own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
+        return Phase(label, own, module, batches, loss, judge, trainable)
+
+    shorter = [phase(steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum]
+    return [*shorter, phase(settings.steps, how.max_epochs, name)]
+
+
+def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
+    """Drives cut from their start into sequences of so many steps, without overlap; a remainder is left out.
+
+    Raises:
+        DataError: no drive is long enough.
+    """
+    starts = [(drive, first) for drive in drives for first in range(0, len(drive.states) - steps + 1, steps)]
+    return _stacked(starts, steps)
+
+
+def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> Drive:
+    """As many sequences of each drive as fit into it, each at a random place."""
+    starts = []
+    for drive in drives:
+        room = len(drive.states) - steps + 1
+        for _ in range(len(drive.states) // steps):
+            starts.append((drive, int(torch.randint(room, (), generator=generator))))
+    return _stacked(starts, steps)
+
+
+def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
+    if not starts:
+        raise DataError(f"no drive is {steps} samples long, as a sequence for training through a filter is; lower training.steps")
+    return Drive(*(torch.stack([drive[part][first : first + steps] for drive, first in starts]) for part in range(3)))
+
+
+def _pairs(drive: Drive) -> tuple[Tensor, Tensor, Tensor]:
+    return drive.states[:-1], drive.inputs[:-1], drive.states[1:]
+
+
+def _weighted(error: Tensor, weights: Tensor) -> Tensor:
+    return (error.square() @ weights).mean()
