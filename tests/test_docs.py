@@ -271,12 +271,12 @@ def test_readme_names_the_patent_and_the_licence():
     assert "(LICENSE)" in page("README.md")
 
 
-def test_citation_names_five_papers():
+def test_citation_names_seven_papers():
     citation = yaml.safe_load(page("CITATION.cff"))
     assert citation["cff-version"] == "1.2.0"
     assert citation["version"] == vehest.__version__
     papers = citation["references"]
-    assert len({paper["title"] for paper in papers}) == 5
+    assert len({paper["title"] for paper in papers}) == 7
     assert all(paper["authors"] and paper["year"] for paper in papers)
     assert {paper["doi"] for paper in papers if "doi" in paper} == {
         "10.1109/TITS.2023.3303776",

@@ -13,18 +13,26 @@ from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
-from vehest.training.settings import DirectSearchSettings, NoTraining, SupervisedSettings
+from vehest.training.settings import DirectSearchSettings, NoTraining, PhaseSettings, SequenceSettings, SupervisedSettings
 
-CAUSAL = {"factor_graph": {"window": 0.05}}  # of those that are offline by default, settings with which they are not
+VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
+CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
+    "factor_graph": {"window": 0.05},
+    "velocity_gru": VELOCITIES,
+    "velocity_lstm": VELOCITIES,
+}
 
 
 def _fitted(name, dtype="float64", **config):
     if name == "factor_graph":
         pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
-    estimator = estimator_class(name).from_config(CAUSAL.get(name, {}) | config)
+    estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:
         estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), NoTraining())
+    elif estimator.training_type is SequenceSettings:
+        training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
+        estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
     elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))

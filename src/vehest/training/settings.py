@@ -80,6 +80,54 @@ class PhaseSettings:
 
 
 @dataclass(frozen=True)
+class SequenceSettings:
+    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024, Section IV).
+
+    Args:
+        phase: the one phase of the training.
+        sequence_steps: samples in a training sequence, the dropped ones included.
+        validation_steps: samples in a validation sequence, the dropped ones included.
+        dropped_steps: first samples of every sequence, on which the hidden state settles; no loss is taken of them.
+        batch_size: sequences in a batch.
+        weight_vx: of the squared error of vx in the loss; likewise the others.
+        weight_vy: of vy.
+        weight_yaw_rate: of the yaw rate.
+        dtype: ``float32`` or ``float64``.
+        checkpoint_seconds: time between two checkpoints [s].
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+
+    phase: PhaseSettings = PhaseSettings()
+    sequence_steps: int = 500
+    validation_steps: int = 1000
+    dropped_steps: int = 200
+    batch_size: int = 4
+    weight_vx: float = 0.2225
+    weight_vy: float = 0.5064
+    weight_yaw_rate: float = 0.1566
+    dtype: Literal["float32", "float64"] = "float32"
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise ConfigurationError(f"training.batch_size must be at least 1, not {self.batch_size}")
+        if self.dropped_steps < 0:
+            raise ConfigurationError(f"training.dropped_steps must not be negative, not {self.dropped_steps}")
+        for name in ("sequence_steps", "validation_steps"):
+            if getattr(self, name) <= self.dropped_steps:
+                raise ConfigurationError(
+                    f"training.{name} must be more than dropped_steps ({self.dropped_steps}), not {getattr(self, name)}"
+                )
+        for name in ("weight_vx", "weight_vy", "weight_yaw_rate"):
+            if getattr(self, name) < 0:
+                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+
+
+@dataclass(frozen=True)
 class DirectSearchSettings:
     """Nelder-Mead from a grid of starts inside a box (Da Lio et al. 2023, Appendix A).
 

@@ -1,0 +1,73 @@
+"""Gated recurrent unit that estimates velocities from all samples so far: Srinivasan et al. 2020."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork, VelocityNetworkSettings
+
+
+@dataclass(frozen=True)
+class VelocityGruSettings(VelocityNetworkSettings):
+    """Settings of the GRU.
+
+    Args:
+        rate_hz: sampling rate [Hz].
+        inputs: measured channels that the network sees.
+        outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates.
+        n_states: size of the hidden state.
+        dropout: share of the hidden state that is hidden from the read-out in training.
+        negative_slope: of the leaky rectifier after the read-out; the paper gives none, 0.3 is assumed (the default of Keras).
+    """
+
+    dropout: float = 0.075
+    negative_slope: float = 0.3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.negative_slope <= 1:
+            raise ConfigurationError(f"estimator.negative_slope must be over 0 and at most 1, not {self.negative_slope}")
+
+
+class VelocityGruNetwork(VelocityNetwork):
+    """One layer of gated recurrent units, a dense read-out, a leaky rectifier.
+
+    h⁺ = GRU(h, x),  y = leaky_relu(W d(h⁺) + b)         x, y standardised, d dropout
+
+    Source: Srinivasan et al., End-to-end velocity estimation for autonomous racing, IEEE RA-L 5 (4), 2020.
+    """
+
+    def __init__(self, settings: VelocityGruSettings) -> None:
+        super().__init__(settings)
+        self.negative_slope = settings.negative_slope
+        self.recurrent = nn.GRU(len(settings.inputs), settings.n_states, batch_first=True)
+        self.read_out = nn.Linear(settings.n_states, len(settings.outputs))
+
+    def start(self, velocities: Tensor) -> State:
+        """A hidden state of zero; the network has no use for velocities to start from."""
+        return (velocities.new_zeros(1, len(velocities), self.recurrent.hidden_size),)
+
+    def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
+        """Run over the samples."""
+        hidden, last = self.recurrent(inputs, state[0])
+        outputs = self.read_out(hidden if mask is None else hidden * mask)
+        return functional.leaky_relu(outputs, self.negative_slope), (last,)
+
+
+class VelocityGru(RecurrentVelocityEstimator):
+    """GRU of Srinivasan et al. 2020; an ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it."""
+
+    name = "velocity_gru"
+    title = "Velocity GRU"
+    settings_type = VelocityGruSettings
+    settings: VelocityGruSettings
+
+    def _new_network(self) -> VelocityGruNetwork:
+        return VelocityGruNetwork(self.settings)
+
+
+ESTIMATOR = VelocityGru
