@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from conftest import planar_drive
+from single_track_drive import linear_drive
 from vehest.cli import main
 from vehest.data.files import ASIDE_PREFIX
 
@@ -65,6 +66,10 @@ DATASET = {
 }
 
 
+STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
+STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
+
+
 def run_vehest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of a command."""
     former, code = sys.argv, 0
@@ -99,6 +104,17 @@ class Place:
             (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
         (folder / "pipelines").mkdir()
         (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
+
+    def add_steered(self) -> None:
+        """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single track with a steering angle."""
+        (self.folder / "raw" / "steered").mkdir()
+        for name, seed in (("first", 1), ("second", 2)):
+            drive = linear_drive(30.0, seed=seed)[0]
+            table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
+            table.to_csv(self.folder / "raw" / "steered" / f"{name}.csv", index=False)
+        channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
+        dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+        (self.folder / "conf" / "dataset" / "steered.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
 
     def __call__(self, *arguments: str) -> tuple[int, str, str]:
         """Exit code, standard output and standard error of a command."""

@@ -36,6 +36,7 @@ def linear_drive(
         "steer": steer,
         "vx_ref": vx,
         "vy_ref": vx * np.tan(states[:, 0]),
+        "yaw_rate_ref": states[:, 1],
         "sideslip_ref": states[:, 0],
     }
     return Recording("linear", "single track", rate_hz, 0.0, channels, "simulated"), states

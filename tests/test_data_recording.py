@@ -160,6 +160,26 @@ def test_a_covariance_of_another_shape_is_refused(shape: tuple[int, ...]) -> Non
         Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}, covariance=np.zeros(shape))
 
 
+@pytest.mark.parametrize("names", [(), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate")])
+def test_rows_of_a_covariance_must_have_names(names: tuple[str, ...]) -> None:
+    channels = {"vy": np.zeros(3), "sideslip": np.zeros(3)}
+    with pytest.raises(DataError, match="covariance_of must name 2 different quantities"):
+        Estimate("r", "ekf", 20.0, 0.0, channels, covariance=np.zeros((3, 2, 2)), covariance_of=names)
+    with pytest.raises(DataError, match="must name 0"):
+        Estimate("r", "ekf", 20.0, 0.0, channels, covariance_of=("vy",))
+
+
+def test_a_covariance_is_held_like_its_quantities_and_read_by_name() -> None:
+    covariance = np.arange(27.0).reshape(3, 3, 3)
+    estimate = Estimate("r", "ukf", 10.0, 0.0, {"vy": np.zeros(3)}, covariance=covariance, covariance_of=("vx", "vy", "friction"))
+    held = estimate.covariance_at(np.array([-0.05, 0.1, 0.19, 0.3]), ["friction", "vx"])
+    assert np.isnan(held[[0, 3]]).all()
+    assert (held[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
+    assert (held[2] == held[1]).all()
+    with pytest.raises(DataError, match="a covariance of vx, vy, friction, not of yaw_rate"):
+        estimate.covariance_at(np.zeros(1), ["yaw_rate"])
+
+
 def test_an_estimate_of_unknown_or_unequal_quantities_is_refused() -> None:
     with pytest.raises(DataError, match="unknown quantity 'vz'"):
         Estimate("r", "ekf", 20.0, 0.0, {"vz": np.zeros(3)})

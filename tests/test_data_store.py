@@ -20,7 +20,7 @@ from hypothesis.extra.numpy import arrays
 
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError, MissingError
-from vehest.data.estimate import Estimate
+from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
 
@@ -135,6 +135,8 @@ def test_a_channel_that_is_not_there_is_named_with_those_that_are(tmp_path: Path
 @given(st.integers(1, 20), st.integers(1, 4), st.data())
 def test_an_estimate_comes_back_with_its_covariance(length: int, n_states: int, data: st.DataObject) -> None:
     values = arrays(np.float64, length, elements=finite | st.just(math.nan))
+    covariance = data.draw(st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite))
+    names = tuple(data.draw(st.permutations(list(QUANTITIES)))[:n_states])
     estimate = Estimate(
         recording_id=data.draw(st.text(max_size=8)),
         estimator="ekf",
@@ -142,14 +144,15 @@ def test_an_estimate_comes_back_with_its_covariance(length: int, n_states: int, 
         start_time=data.draw(st.floats(-1e10, 1e10)),
         channels={"vy": data.draw(values), "sideslip": data.draw(values)},
         mode=data.draw(st.sampled_from(["causal", "offline"])),
-        covariance=data.draw(st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite)),
+        covariance=covariance,
+        covariance_of=() if covariance is None else names,
     )
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "estimate.parquet"
         write_estimate(estimate, file)
         read = read_estimate(file)
     assert {name: bits(samples) for name, samples in read.channels.items()} == {name: bits(s) for name, s in estimate.channels.items()}
-    about = ("recording_id", "estimator", "rate_hz", "start_time", "mode")
+    about = ("recording_id", "estimator", "rate_hz", "start_time", "mode", "covariance_of")
     assert [getattr(read, key) for key in about] == [getattr(estimate, key) for key in about]
     if estimate.covariance is None:
         assert read.covariance is None

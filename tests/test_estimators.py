@@ -169,6 +169,21 @@ def test_luenberger_starts_from_a_state_that_is_handed_over():
     assert abs(started[-1] - free[-1]) < 0.05, "the observer forgets where it started"
 
 
+def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
+    estimator = _fitted("luenberger")
+    drive = _drive_for(estimator)
+    states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
+    both = estimator.estimate([drive, drive], states)
+    for state, own in zip(states, both, strict=True):
+        assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
+    one = estimator.estimate([drive, drive], states[0])
+    assert np.array_equal(one[0]["vy"], one[1]["vy"])
+    with pytest.raises(DataError, match="2 initial states for 1 recordings"):
+        estimator.estimate([drive], states)
+    monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
+    assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
+
+
 def test_window_network_has_no_state_to_start_from(drive):
     with pytest.raises(ConfigurationError, match="no state to start from"):
         _fitted("ksnn").estimate([drive], {"vy": 1.0})

@@ -7,27 +7,18 @@ import json
 import math
 from pathlib import Path
 
-import pandas as pd
 import pytest
 import yaml
 
-from place import DATASET, Place
-from single_track_drive import linear_drive
+from place import Place
 
-UNITS = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad", "vy_ref": "m/s"}
 OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
 
 
 @pytest.fixture
 def steered(place) -> Place:
     """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
-    folder = place.folder / "raw" / "steered"
-    folder.mkdir()
-    for name, seed in (("first", 1), ("second", 2)):
-        drive = linear_drive(30.0, seed=seed)[0]
-        pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in UNITS}}).to_csv(folder / f"{name}.csv", index=False)
-    channels = {name: {"column": name, "unit": unit} for name, unit in UNITS.items()}
-    dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+    place.add_steered()
     whole = {"name": "whole", "dataset": "steered", "train": [], "validation": [], "tests": {"test": [{"recording": "second"}]}}
     cut = whole | {
         "name": "cut",
@@ -35,9 +26,8 @@ def steered(place) -> Place:
         "validation": [{"recording": "second", "stop": 10}],
         "tests": {"test": [{"recording": "second", "start": 10}]},
     }
-    for group, content in (("dataset", dataset), ("split", whole), ("split", cut)):
-        text = yaml.safe_dump(content, allow_unicode=True)
-        (Path("conf") / group / f"{content['name']}.yaml").write_text(text)
+    for split in (whole, cut):
+        (Path("conf") / "split" / f"{split['name']}.yaml").write_text(yaml.safe_dump(split))
     return place
 
 
@@ -83,11 +73,14 @@ def test_estimator_that_learns_is_refused_where_there_is_nothing_to_learn_from(s
     assert "split 'whole' has nothing to train on, and estimator 'ksnn' learns" in line
 
 
-def test_study_without_training_reports(steered):
-    pipeline = {"study": "given", "report": "drive", "split": "whole", "sweeps": [[*OWN_NOISE[:2]]]}
+def test_study_without_training_reports_and_says_where_estimates_start(steered):
+    evaluation = {"initial_state": True, "warm_up_seconds": 0}
+    pipeline = {"study": "given", "report": "drive", "split": "whole", "evaluation": evaluation, "sweeps": [[*OWN_NOISE[:2]]]}
     (Path("pipelines") / "given.yaml").write_text(yaml.safe_dump(pipeline))
     code, out, _ = steered("run", "given", "tracking=none", "--json")
     assert code == 0
     (row,) = json.loads(out)["leaderboard"]
-    assert row["estimator"] == "kalman"
+    assert (row["estimator"], row["start"]) == ("kalman", "reference")
+    report = (Path(json.loads(out)["report"]).parent / "report.md").read_text(encoding="utf-8")
+    assert "Estimates start at the reference state" in report
     assert 0 < row["rmse_sideslip"] < 5

@@ -11,7 +11,7 @@ from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_squared_errors
 
 
 def _estimate(times, vy, rate_hz, start):
@@ -45,6 +45,30 @@ def test_a_constant_offset_does_not_count_in_fvu_but_does_in_rmse(drive):
 def test_without_nonlinear_samples_nonlinear_metrics_are_nan():
     part = Scored(np.arange(3.0), np.ones(3), np.arange(3.0), np.zeros(3), np.zeros(3), np.zeros(3))
     assert math.isnan(accuracy([part])["mse_sideslip_nonlinear"])
+
+
+def test_weighted_metrics_have_the_values_of_a_hand_calculation():
+    zero = np.zeros(2)
+    others = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
+    part = Scored(np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, others)
+    figures = accuracy([part])
+    absolute = [0.2225, 3 * 0.5064 + 2 * 0.1566]
+    assert figures["mse_weighted"] == pytest.approx((0.2225 + 9 * 0.5064 + 4 * 0.1566) / 2)
+    assert figures["mae_weighted"] == pytest.approx(sum(absolute) / 2)
+    assert figures["ae99_weighted"] == pytest.approx(np.quantile(absolute, 0.99))
+    assert (figures["rmse_vx"], figures["rmse_yaw_rate"]) == (pytest.approx(math.sqrt(0.5)), pytest.approx(math.sqrt(2.0)))
+    assert set(figures) <= set(UNITS)
+
+
+def test_metrics_of_states_that_one_part_lacks_are_absent():
+    zero = np.zeros(2)
+    with_vx = Scored(zero, zero, zero, zero, zero, zero, {"vx": (zero, zero)})
+    without = Scored(zero, zero, zero, zero, zero, zero)
+    assert "rmse_vx" in accuracy([with_vx])
+    assert "mse_weighted" not in accuracy([with_vx])
+    assert not {"rmse_vx", "rmse_yaw_rate", "nees", "nis"} & set(accuracy([with_vx, without]))
+    with pytest.raises(DataError, match="there is none of yaw_rate"):
+        weighted_squared_errors(with_vx)
 
 
 def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):

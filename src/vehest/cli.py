@@ -620,7 +620,8 @@ def _run_pipeline(
             typer.echo(f"published: {outcome.published}")
         return
     for test_set, rows in outcome.leaderboard.groupby("test_set", sort=False):
-        typer.echo(f"\n{pipeline.title}: test set '{test_set}'")
+        given = " (estimates start at the reference state)" if (rows["start"] == "reference").any() else ""
+        typer.echo(f"\n{pipeline.title}: test set '{test_set}'{given}")
         _table(
             ["estimator", "parameters", "seeds", "seed", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"],
             [

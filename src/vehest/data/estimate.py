@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.data.errors import DataError
 from vehest.data.recording import FloatArray, clock_tolerance
@@ -19,7 +20,12 @@ QUANTITIES: dict[str, str] = {
     "vx": "m/s",
     "yaw_rate": "rad/s",
     "friction": "1",
+    "rim_speed": "m/s",
+    "nis": "1",
+    "nis_dof": "1",
 }
+"""What an estimate may hold, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; ``nis`` the normalised
+innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +41,12 @@ class Estimate:
         start_time: time of the first sample [s].
         channels: quantity -> values, shape (T,); ``vy`` and ``sideslip`` always, others where the method has them.
         mode: ``causal`` if no sample used measurements later than its own time.
-        covariance: of the state (vy first), shape (T, n, n), where the method has one.
+        covariance: of the errors of some of the quantities, shape (T, n, n), where the method has one.
+        covariance_of: the quantity behind each row of the covariance, n names.
 
     Raises:
-        DataError: a quantity is unknown or of another length, or the covariance is not of shape (T, n, n).
+        DataError: a quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its rows have no n
+            different names.
     """
 
     recording_id: str
@@ -48,6 +56,7 @@ class Estimate:
     channels: Mapping[str, FloatArray]
     mode: Mode = "causal"
     covariance: FloatArray | None = None
+    covariance_of: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         lengths = set()
@@ -61,6 +70,12 @@ class Estimate:
             shape = self.covariance.shape
             if len(shape) != 3 or shape[0] != len(self) or shape[1] != shape[2]:
                 raise DataError(f"estimate of '{self.recording_id}': the covariance must be of shape ({len(self)}, n, n), not {shape}")
+        n_rows = 0 if self.covariance is None else self.covariance.shape[1]
+        if len(set(self.covariance_of)) != n_rows or len(self.covariance_of) != n_rows or set(self.covariance_of) - set(QUANTITIES):
+            raise DataError(
+                f"estimate of '{self.recording_id}': covariance_of must name {n_rows} different quantities, one a row of the covariance, "
+                f"not ({', '.join(self.covariance_of)})"
+            )
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))
@@ -87,7 +102,30 @@ class Estimate:
         Returns:
             Shape (K,).
         """
+        index = self._held_index(times)
+        return np.where(index < 0, np.nan, self[name][index])
+
+    def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
+        """Covariance of some quantities at other times: the latest one that is not in the future, NaN outside the estimate.
+
+        Args:
+            times: shape (K,) [s].
+            names: n quantities, in the order that is wanted.
+
+        Returns:
+            Shape (K, n, n).
+
+        Raises:
+            DataError: the estimate has no covariance of one of them.
+        """
+        if self.covariance is None or set(names) - set(self.covariance_of):
+            have = ", ".join(self.covariance_of) or "nothing"
+            raise DataError(f"estimator '{self.estimator}' gives a covariance of {have}, not of {', '.join(names)}")
+        index, rows = self._held_index(times), [self.covariance_of.index(name) for name in names]
+        return np.where(index[:, None, None] < 0, np.nan, self.covariance[index][:, rows][:, :, rows])
+
+    def _held_index(self, times: FloatArray) -> NDArray[np.int64]:
+        """Sample that is held at each time; -1 outside the estimate."""
         tolerance = clock_tolerance(self.start_time, self.start_time + len(self) / self.rate_hz, self.rate_hz)
         index = np.floor((np.asarray(times) - self.start_time) * self.rate_hz + tolerance).astype(np.int64)
-        values = self[name][np.clip(index, 0, len(self) - 1)]
-        return np.where((index >= 0) & (index < len(self)), values, np.nan)
+        return np.where((index >= 0) & (index < len(self)), index, -1)

@@ -94,6 +94,7 @@ def write_estimate(estimate: Estimate, path: Path) -> None:
     columns: dict[str, Any] = {"time": estimate.time, **estimate.channels}
     if estimate.covariance is not None:
         description["n_states"] = estimate.covariance.shape[1]
+        description["covariance_of"] = list(estimate.covariance_of)
         for row, column in np.ndindex(estimate.covariance.shape[1:]):
             columns[f"{_COVARIANCE}_{row}_{column}"] = estimate.covariance[:, row, column]
     _write(path, columns, description)
@@ -109,10 +110,11 @@ def read_estimate(path: Path) -> Estimate:
     columns, description = _read(path, "estimate", None)
     columns.pop("time")
     n_states = description.get("n_states")
-    covariance = None
+    covariance, covariance_of = None, ()
     if n_states is not None:
         entries = [columns.pop(f"{_COVARIANCE}_{row}_{column}") for row, column in np.ndindex(n_states, n_states)]
         covariance = np.stack(entries, axis=1).reshape(-1, n_states, n_states)
+        covariance_of = tuple(description.get("covariance_of", ("vy", "yaw_rate")))  # of files from before rows had names
     return Estimate(
         recording_id=description["recording_id"],
         estimator=description["estimator"],
@@ -121,6 +123,7 @@ def read_estimate(path: Path) -> Estimate:
         channels=columns,
         mode=description["mode"],
         covariance=covariance,
+        covariance_of=covariance_of,
     )
 
 

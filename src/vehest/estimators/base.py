@@ -82,6 +82,7 @@ class Estimator(ABC):
         settings_type: dataclass of its settings.
         training_type: dataclass of the settings of its fit.
         skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
+        ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
 
@@ -91,6 +92,7 @@ class Estimator(ABC):
     settings_type: ClassVar[type[EstimatorSettings]]
     training_type: ClassVar[type]
     skippable: ClassVar[tuple[str, ...]] = ()
+    ignores_initial_state: ClassVar[bool] = False
 
     def __init__(self, settings: EstimatorSettings) -> None:
         self.settings = settings
@@ -158,17 +160,31 @@ class Estimator(ABC):
         """Fit this one alone."""
         return type(self).fit_members([self], data, training, context or FitContext())[0]
 
-    def estimate(self, recordings: Sequence[Recording], initial_state: Mapping[str, float] | None = None) -> list[Estimate]:
+    def estimate(
+        self, recordings: Sequence[Recording], initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None
+    ) -> list[Estimate]:
         """Estimate the lateral velocity of recordings that carry no reference channels.
 
         Args:
             recordings: at the estimator's rate.
-            initial_state: state to start from (``vy`` [m/s] and others), where a protocol hands it over openly.
+            initial_state: state at the first sample to start from, where a protocol hands it over openly, for all recordings or one a
+                recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
 
         Raises:
-            DataError: a channel is missing, or the rate is another.
+            DataError: a channel is missing, the rate is another, or there are not as many states as recordings.
+            ConfigurationError: a state is given and the method cannot start from one.
         """
-        return [self._estimate_one(self._checked(recording), initial_state) for recording in recordings]
+        if initial_state is None or self.ignores_initial_state:
+            states: list[Mapping[str, float] | None] = [None] * len(recordings)
+        elif isinstance(initial_state, Mapping):
+            states = [initial_state] * len(recordings)
+        else:
+            states = list(initial_state)
+        if len(states) != len(recordings):
+            raise DataError(
+                f"there are {len(states)} initial states for {len(recordings)} recordings; give one a recording, or one for all"
+            )
+        return self._estimate_all([self._checked(recording) for recording in recordings], states)
 
     def _checked(self, recording: Recording) -> Recording:
         if abs(recording.rate_hz / self.settings.rate_hz - 1.0) > 1e-9:
@@ -183,11 +199,23 @@ class Estimator(ABC):
                 raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip")
         return recording.select(self.channels)
 
-    def _wrapped(self, recording: Recording, vy: FloatArray, covariance: FloatArray | None = None, **others: FloatArray) -> Estimate:
+    def _wrapped(
+        self,
+        recording: Recording,
+        vy: FloatArray,
+        covariance: FloatArray | None = None,
+        covariance_of: tuple[str, ...] = (),
+        **others: FloatArray,
+    ) -> Estimate:
         """An `Estimate` on the recording's clock; sideslip is atan2(vy, vx) with the measured vx."""
         channels = {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"]), **others}
         mode = "causal" if self.causal else "offline"
-        return Estimate(recording.id, self.name, recording.rate_hz, recording.start_time, channels, mode, covariance)  # type: ignore[arg-type]
+        clock = (recording.rate_hz, recording.start_time)
+        return Estimate(recording.id, self.name, *clock, channels, mode, covariance, covariance_of)  # type: ignore[arg-type]
+
+    def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
+        """Estimate checked recordings, each from its state; one after another, unless a method can do better."""
+        return [self._estimate_one(recording, state) for recording, state in zip(recordings, states, strict=True)]
 
     @abstractmethod
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:

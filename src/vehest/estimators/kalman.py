@@ -153,8 +153,11 @@ class KalmanFilter(SingleTrackEstimator):
         levels = self._known_levels() if self.causal else self._levels_of([recording])
         measurements = recording.stack(self.channels)
         first = self.first_state(measurements[0, 1], self.settings.initial_deviation, initial_state)
-        filtered = self.filter_samples(measurements, levels, first).filtered
-        return self.wrapped_state(recording, filtered.mean, filtered.covariance)
+        result = self.filter_samples(measurements, levels, first)
+        scaled = np.linalg.solve(result.innovation_covariance, result.innovation[..., None])[..., 0]
+        nis = np.einsum("ti,ti->t", result.innovation, scaled)
+        n_measured: FloatArray = np.sum(np.asarray(result.measured), axis=1, dtype=np.float64)
+        return self.wrapped_state(recording, result.filtered.mean, result.filtered.covariance, nis=nis, nis_dof=n_measured)
 
     def filter_samples(self, samples: FloatArray, levels: Mapping[str, float], first: Gaussian[FloatArray]) -> Filtered[FloatArray]:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement."""

@@ -18,6 +18,7 @@ from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
 
 KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol hands over
+STATE = ("vy", "yaw_rate")  # what an estimate's covariance is of
 
 
 @dataclass(frozen=True)
@@ -76,15 +77,19 @@ class SingleTrackEstimator(Estimator):
         """(β, r) before the first sample: 0 with a standard deviation, or what a protocol hands over (``vy``, ``yaw_rate``)."""
         given = dict(initial_state or {})
         mean = np.array([np.arctan2(given.get("vy", 0.0), max(vx, self.settings.minimum_speed)), given.get("yaw_rate", 0.0)])
-        return Gaussian(mean, np.diag([KNOWN**2 if name in given else deviation**2 for name in ("vy", "yaw_rate")]))
+        return Gaussian(mean, np.diag([KNOWN**2 if name in given else deviation**2 for name in STATE]))
 
-    def wrapped_state(self, recording: Recording, states: FloatArray, covariance: FloatArray | None = None) -> Estimate:
-        """The estimate that goes with states (β, r), (T, 2), and their covariances, (T, 2, 2): vy = vx tan β."""
+    def wrapped_state(
+        self, recording: Recording, states: FloatArray, covariance: FloatArray | None = None, **others: FloatArray
+    ) -> Estimate:
+        """The estimate that goes with states (β, r), (T, 2), and their covariances, (T, 2, 2): vy = vx tan β; and other quantities."""
         vx, tangent = recording["vx"], np.tan(states[:, 0])
         if covariance is not None:
             scale = np.stack([vx * (1.0 + tangent**2), np.ones_like(vx)], axis=1)
             covariance = covariance * scale[:, :, None] * scale[:, None, :]
-        return self._wrapped(recording, vx * tangent, covariance, yaw_rate=states[:, 1].copy())
+        return self._wrapped(
+            recording, vx * tangent, covariance, STATE if covariance is not None else (), yaw_rate=states[:, 1].copy(), **others
+        )
 
 
 def checked_sample(sample: Mapping[str, float], channels: Sequence[str], skippable: Sequence[str]) -> FloatArray:

@@ -104,7 +104,9 @@ class WindowedEstimator(Estimator):
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         if initial_state is not None:
-            raise ConfigurationError(f"estimator '{self.name}' has no state to start from: it sees a window of samples only")
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no state to start from: it sees a window of samples only; set evaluation.initial_state=false"
+            )
         vy = np.full(len(recording), np.nan)
         starts = window_starts(len(recording), self.settings.window)
         if len(starts):

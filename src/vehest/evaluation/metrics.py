@@ -1,9 +1,10 @@
-"""Error metrics of lateral velocity and sideslip angle."""
+"""What is scored, and the metrics: errors of lateral velocity, sideslip angle and further states, and how consistent a filter is."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -11,8 +12,15 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
 from vehest.data.splits import Span
+from vehest.evaluation.consistency import coverage, normalised_error_squared, normalised_innovation_squared
 
 NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
+
+REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
+"""Quantity of an estimate -> channel that it is measured against."""
+
+WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
+"""Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
 
 UNITS: dict[str, str] = {
     "rmse_vy": "m/s",
@@ -24,6 +32,16 @@ UNITS: dict[str, str] = {
     "max_error_sideslip": "deg",
     "max_error_sideslip_nonlinear": "deg",
     "p99_sideslip": "deg",
+    "rmse_vx": "m/s",
+    "rmse_yaw_rate": "rad/s",
+    "mse_weighted": "1",
+    "mae_weighted": "1",
+    "ae99_weighted": "1",
+    "nees": "1",
+    "nis": "1",
+    "coverage_1sigma": "1",
+    "coverage_2sigma": "1",
+    "n_sequences": "1",
     "n_parameters": "1",
     "epochs": "1",
     "train_seconds": "s",
@@ -37,13 +55,39 @@ class Protocol:
 
     Args:
         rate_hz: rate at which every estimate is read, whatever rate it was made at [Hz]; held, never interpolated.
-        warm_up_seconds: how long before a test range an estimator may start [s].
-        skip_seconds: start of each range that is not scored [s].
+        warm_up_seconds: how long before a range, or before each sequence, an estimator may start [s].
+        skip_seconds: start of each range, or of each sequence, that is not scored [s].
+        sequence_seconds: ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate
+            starts anew; a remainder is left out [s]. None leaves ranges whole.
+        initial_state: whether estimates start at the reference state of the first sample.
     """
 
     rate_hz: float = 20.0
     warm_up_seconds: float = 10.0
     skip_seconds: float = 1.5
+    sequence_seconds: float | None = None
+    initial_state: bool = False
+
+    @property
+    def piece(self) -> str:
+        """What an estimate is made of in one go, for people: ``range`` or ``sequence``."""
+        return "range" if self.sequence_seconds is None else "sequence"
+
+    @property
+    def start_in_words(self) -> str:
+        """Sentences on sequences and initial states, each after a space; empty for whole ranges that start from nothing."""
+        words = ""
+        if self.sequence_seconds is not None:
+            words += (
+                f" Ranges are cut from their starts into sequences of {self.sequence_seconds:g} s without overlap, in each of which every "
+                f"estimate starts anew; a remainder is left out."
+            )
+        if self.initial_state:
+            words += (
+                f" Estimates start at the reference state (forward and lateral velocity, yaw rate) of the first sample of each "
+                f"{self.piece}, as far as the method has these states."
+            )
+        return words
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +101,11 @@ class Scored:
         sideslip: estimated sideslip angle, atan2(vy, vx) with the measured vx [rad].
         sideslip_ref: reference sideslip angle, atan2(vy_ref, vx) [rad].
         ay: measured lateral acceleration [m/s²].
+        others: ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there.
+        covariance: of the errors in ``covariance_of``, shape (K, n, n), where the method gives one.
+        covariance_of: those quantities among `errors` that the covariance is of.
+        nis: normalised innovation squared of the filter's update, where the method gives it.
+        nis_dof: numbers measured at each update.
     """
 
     time: FloatArray
@@ -65,6 +114,87 @@ class Scored:
     sideslip: FloatArray
     sideslip_ref: FloatArray
     ay: FloatArray
+    others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    covariance: FloatArray | None = None
+    covariance_of: tuple[str, ...] = ()
+    nis: FloatArray | None = None
+    nis_dof: FloatArray | None = None
+
+    @property
+    def errors(self) -> dict[str, FloatArray]:
+        """Estimate - reference of ``vx``, ``vy`` [m/s] and ``yaw_rate`` [rad/s], of those that are there."""
+        pairs = {**self.others, "vy": (self.vy, self.vy_ref)}
+        return {name: pairs[name][0] - pairs[name][1] for name in REFERENCES if name in pairs}
+
+
+def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Span]:
+    """The stretches that estimates are made of, one after another: the ranges, or the sequences that they are cut into.
+
+    Args:
+        spans: ranges of a test set.
+        recording_of: of a range: its recording at ``protocol.rate_hz``; asked for only if ranges are cut.
+        protocol: see `Protocol`.
+
+    Raises:
+        DataError: no range is as long as a sequence.
+    """
+    if protocol.sequence_seconds is None:
+        return list(spans)
+    steps = round(protocol.sequence_seconds * protocol.rate_hz)
+    pieces = []
+    for span in spans:
+        recording = recording_of(span)
+        first, end = recording.index_range(span.start, span.stop)
+        for begin in range(first, end - steps + 1, steps):
+            start, stop = (recording.start_time + index / recording.rate_hz for index in (begin, begin + steps))
+            pieces.append(Span(span.dataset, span.recording, start, stop))
+    if not pieces:
+        raise DataError(
+            f"none of {', '.join(span.describe() for span in spans)} lasts as long as a sequence of {protocol.sequence_seconds:g} s; "
+            f"set evaluation.sequence_seconds lower"
+        )
+    return pieces
+
+
+def reference_state(reference: Recording, span: Span) -> dict[str, float]:
+    """The state that a protocol hands over at the first sample of a range: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s].
+
+    Raises:
+        DataError: a reference channel is missing, or has a gap there.
+    """
+    first = reference.index_range(span.start, span.stop)[0]
+    state = {}
+    for name, channel in REFERENCES.items():
+        if channel not in reference or np.isnan(reference[channel][first]):
+            raise DataError(
+                f"recording '{reference.id}' has no '{channel}' at {reference.time[first]:.12g} s to start estimates from; "
+                f"set evaluation.initial_state=false"
+            )
+        state[name] = float(reference[channel][first])
+    return state
+
+
+def score_all(
+    estimate_of: Callable[[int], Estimate], spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
+) -> list[Scored]:
+    """Score the estimates of a test set, one a range or one a sequence, as `sequences` counts them.
+
+    Args:
+        estimate_of: position among the sequences -> estimate.
+        spans: ranges of the test set.
+        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
+        protocol: see `Protocol`.
+
+    Raises:
+        DataError: as `score` and `sequences` say.
+    """
+    read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
+
+    def cached(span: Span) -> Recording:
+        return read(span.dataset, span.recording)
+
+    pieces = sequences(spans, cached, protocol)
+    return [score(estimate_of(position), cached(piece), piece, protocol) for position, piece in enumerate(pieces)]
 
 
 def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protocol) -> Scored:
@@ -84,13 +214,19 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     for name in ("vx", "vy_ref", "ay"):
         if np.isnan(scored[name]).any():
             raise DataError(f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without")
-    vy = estimate.held_at(scored.time, "vy")
-    missing = int(np.isnan(vy).sum())
-    if missing:
-        raise DataError(
-            f"estimator '{estimate.estimator}' has no estimate for {missing} of {len(vy)} scored samples of {span.describe()}; "
-            f"give it a longer warm-up or check that it does not diverge"
-        )
+
+    def held(name: str) -> FloatArray:
+        values = estimate.held_at(scored.time, name)
+        _require_all(values, f"estimator '{estimate.estimator}' has no estimate{'' if name == 'vy' else f' of {name}'}", span)
+        return values
+
+    vy = held("vy")
+    others = {name: (held(name), scored[reference_name]) for name, reference_name in REFERENCES.items() if _has(estimate, scored, name)}
+    covariance_of = tuple(name for name in REFERENCES if name in estimate.covariance_of and (name == "vy" or name in others))
+    covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
+    if covariance is not None:
+        _require_all(covariance.sum(axis=(1, 2)), f"estimator '{estimate.estimator}' has no covariance", span)
+    innovations = "nis" in estimate.channels and "nis_dof" in estimate.channels
     return Scored(
         time=scored.time,
         vy=vy,
@@ -98,7 +234,27 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         sideslip=np.arctan2(vy, scored["vx"]),
         sideslip_ref=np.arctan2(scored["vy_ref"], scored["vx"]),
         ay=scored["ay"],
+        others=others,
+        covariance=covariance,
+        covariance_of=covariance_of,
+        nis=held("nis") if innovations else None,
+        nis_dof=held("nis_dof") if innovations else None,
     )
+
+
+def _has(estimate: Estimate, scored: Recording, name: str) -> bool:
+    """Whether a quantity other than vy is estimated and measured, without gaps in the reference."""
+    reference = REFERENCES[name]
+    return name != "vy" and name in estimate.channels and reference in scored and not np.isnan(scored[reference]).any()
+
+
+def _require_all(values: FloatArray, what: str, span: Span) -> None:
+    missing = int(np.isnan(values).sum())
+    if missing:
+        raise DataError(
+            f"{what} for {missing} of {len(values)} scored samples of {span.describe()}; "
+            f"give it a longer warm-up or check that it does not diverge"
+        )
 
 
 def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
@@ -106,9 +262,11 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
     ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none.
+    ``…_weighted`` are the mean of `weighted_squared_errors`, the mean and the 99th percentile of `weighted_absolute_errors`.
 
     Returns:
-        Metric name -> value; sideslip in deg or deg².
+        Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and of innovations are there only if all
+        parts have what they need.
     """
     vy = np.concatenate([part.vy for part in parts])
     vy_ref = np.concatenate([part.vy_ref for part in parts])
@@ -126,4 +284,64 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         "max_error_sideslip": float(np.abs(error).max()),
         "max_error_sideslip_nonlinear": float(np.abs(error[nonlinear]).max()) if nonlinear.any() else float("nan"),
         "p99_sideslip": float(np.quantile(np.abs(error), 0.99)),
+        **_state_accuracy(parts),
+        **_consistency(parts),
     }
+
+
+def weighted_squared_errors(part: Scored) -> FloatArray:
+    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
+
+    Raises:
+        DataError: an estimate or its reference is missing.
+    """
+    return _weighted(part, np.square)
+
+
+def weighted_absolute_errors(part: Scored) -> FloatArray:
+    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
+
+    Raises:
+        DataError: an estimate or its reference is missing.
+    """
+    return _weighted(part, np.abs)
+
+
+def _weighted(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    errors = part.errors
+    missing = [name for name in WEIGHTS if name not in errors]
+    if missing:
+        raise DataError(f"weighted errors need estimate and reference of {', '.join(WEIGHTS)}; there is none of {', '.join(missing)}")
+    total: FloatArray = np.sum([weight * size(errors[name]) for name, weight in WEIGHTS.items()], axis=0)
+    return total
+
+
+def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
+    common = set.intersection(*(set(part.errors) for part in parts))
+    figures = {
+        f"rmse_{name}": float(np.sqrt(np.mean(np.square(np.concatenate([part.errors[name] for part in parts])))))
+        for name in REFERENCES
+        if name in common and name != "vy"
+    }
+    if common >= set(WEIGHTS):
+        absolute = np.concatenate([weighted_absolute_errors(part) for part in parts])
+        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_squared_errors(part) for part in parts])))
+        figures |= {"mae_weighted": float(absolute.mean()), "ae99_weighted": float(np.quantile(absolute, 0.99))}
+    return figures
+
+
+def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
+    figures = {}
+    kinds = {part.covariance_of for part in parts}
+    if len(kinds) == 1 and "vy" in (names := kinds.pop()):
+        errors = np.concatenate([np.stack([part.errors[name] for name in names], axis=1) for part in parts])
+        covariance = np.concatenate([part.covariance for part in parts if part.covariance is not None])
+        row = names.index("vy")
+        figures["nees"] = float(np.mean(normalised_error_squared(errors, covariance)))
+        for n_sigma in (1, 2):
+            figures[f"coverage_{n_sigma}sigma"] = coverage(errors[:, row], covariance[:, row, row], n_sigma)
+    innovations = [(part.nis, part.nis_dof) for part in parts if part.nis is not None and part.nis_dof is not None]
+    if len(innovations) == len(parts):
+        nis, dof = (np.concatenate(columns) for columns in zip(*innovations, strict=True))
+        figures["nis"] = normalised_innovation_squared(nis, dof)
+    return figures

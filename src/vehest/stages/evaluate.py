@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_module
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, reference_state, score_all, sequences
 from vehest.stages.artefacts import Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.train import file_digest, read_fit_metrics, recording_file
@@ -67,6 +68,10 @@ class EvaluateJob:
     kinds: Mapping[str, str]
     protocol: Protocol
 
+    def reference(self, span: Span) -> Recording:
+        """The recording of a range at the evaluation rate, references included."""
+        return read_recording(recording_file(self.references[span.dataset], span))
+
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     """How estimates are scored.
@@ -75,11 +80,26 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
         ConfigurationError: a value that makes no sense.
     """
     try:
-        protocol = Protocol(**{key: float(value) for key, value in config.items()})
+        numbers = {key: float(value) for key, value in config.items() if key != "initial_state" and value is not None}
+        protocol = Protocol(**numbers, initial_state=config.get("initial_state", False))
     except (TypeError, ValueError):
-        raise ConfigurationError(f"evaluation: {dict(config)} must be numbers") from None
+        raise ConfigurationError(f"evaluation: {dict(config)} must be numbers, initial_state true or false") from None
+    if not isinstance(protocol.initial_state, bool):
+        raise ConfigurationError(f"evaluation.initial_state must be true or false, not {protocol.initial_state}")
     if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
         raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
+    if protocol.sequence_seconds is not None:
+        samples = protocol.sequence_seconds * protocol.rate_hz
+        if not protocol.sequence_seconds > protocol.skip_seconds or abs(samples - round(samples)) > 1e-6:
+            raise ConfigurationError(
+                f"evaluation.sequence_seconds must be longer than skip_seconds ({protocol.skip_seconds:g} s) and a whole number of "
+                f"samples at {protocol.rate_hz:g} Hz, not {protocol.sequence_seconds:g} s"
+            )
+    if protocol.initial_state and protocol.warm_up_seconds > 0:
+        raise ConfigurationError(
+            f"evaluation.initial_state hands over the state at the first sample of a {protocol.piece}, so estimates cannot start "
+            f"{protocol.warm_up_seconds:g} s earlier; set evaluation.warm_up_seconds=0"
+        )
     return protocol
 
 
@@ -131,14 +151,17 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     fit = read_fit_metrics(job.model.folder)
     rows: list[tuple[Any, ...]] = []
     for name, spans in test_sets(job.split).items():
-        parts = []
-        for position, span in enumerate(spans):
-            parts.append(_estimate_and_score(estimator, job, span, folder / name / f"{position}.parquet"))
-        figures = accuracy(parts)
+        pieces = sequences(spans, job.reference, job.protocol)
+        estimates = _estimates(estimator, job, pieces)
+        for position, estimate in enumerate(estimates):
+            write_estimate(estimate, folder / name / f"{position}.parquet")
+        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.protocol))
+        if job.protocol.sequence_seconds is not None:
+            figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
             figures |= {key: fit[key] for key in ("n_parameters", "epochs", "train_seconds")}
             if estimator.causal:
-                figures["step_seconds"] = _step_seconds(estimator, _measured(job, spans[0]))
+                figures["step_seconds"] = _step_seconds(estimator, _measured(job, pieces[0]))
         trained_on = "+".join(about["datasets"])
         datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
         kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
@@ -158,12 +181,13 @@ def learnt_spans(model: Artefact) -> list[Span]:
 
 
 def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:
-    """Estimate and reference of an evaluation on each range of a test set."""
-    parts = []
-    for position, span in enumerate(test_sets(split)[test_set]):
-        estimate = read_estimate(evaluation.folder / test_set / f"{position}.parquet")
-        parts.append(score(estimate, read_recording(recording_file(references[span.dataset], span)), span, protocol))
-    return parts
+    """Estimate and reference of an evaluation on each range of a test set, or on each sequence."""
+    return score_all(
+        lambda position: read_estimate(evaluation.folder / test_set / f"{position}.parquet"),
+        test_sets(split)[test_set],
+        lambda span: read_recording(recording_file(references[span.dataset], span)),
+        protocol,
+    )
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:
@@ -182,11 +206,17 @@ def _measured(job: EvaluateJob, span: Span) -> Recording:
     return recording.cut(span.start - job.protocol.warm_up_seconds, span.stop).without_references()
 
 
-def _estimate_and_score(estimator: Estimator, job: EvaluateJob, span: Span, file: Path) -> Scored:
-    estimate = estimator.estimate([_measured(job, span)])[0]
-    write_estimate(estimate, file)
-    reference = read_recording(recording_file(job.references[span.dataset], span))
-    return score(estimate, reference, span, job.protocol)
+def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -> list[Estimate]:
+    """An estimate each; those of a protocol that cuts ranges in one go, since a method may then take them all at once."""
+    states: Sequence[Mapping[str, float]] | None = None
+    if job.protocol.initial_state:
+        states = [reference_state(job.reference(piece), piece) for piece in pieces]
+    if job.protocol.sequence_seconds is not None:
+        return estimator.estimate([_measured(job, piece) for piece in pieces], states)
+    return [
+        estimator.estimate([_measured(job, piece)], states[position] if states is not None else None)[0]
+        for position, piece in enumerate(pieces)
+    ]
 
 
 def _step_seconds(estimator: Estimator, recording: Recording) -> float:

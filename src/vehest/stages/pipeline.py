@@ -132,7 +132,9 @@ def read_pipeline(name: str) -> Pipeline:
         about=" ".join(str(content.get("about", "")).split()),
         report=str(content["report"]),
         parts=tuple(_part(str(name), part, file) for name, part in parts.items()),
-        evaluation=tuple(f"evaluation.{key}={value}" for key, value in (content.get("evaluation") or {}).items()),
+        evaluation=tuple(
+            f"evaluation.{key}={'null' if value is None else value}" for key, value in (content.get("evaluation") or {}).items()
+        ),
         publish=bool(content.get("publish", False)),
         file=file,
         datasets=datasets,

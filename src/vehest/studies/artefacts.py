@@ -13,7 +13,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Split
 from vehest.data.store import read_estimate, read_recording
-from vehest.evaluation.metrics import Protocol, Scored, score
+from vehest.evaluation.metrics import Protocol, Scored, score_all
 
 METRIC_COLUMNS = (
     "study",
@@ -44,7 +44,7 @@ class EvaluatedModel:
         title: for people, for example ``KS-NN linear + bias, P = 2``.
         seed: its seed.
         model_folder: what the train stage wrote (``history.csv`` in it, where there is one).
-        evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set.
+        evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence.
     """
 
     estimator: str
@@ -60,7 +60,7 @@ class EvaluatedModel:
         return pd.read_csv(path) if path.is_file() else None
 
     def estimate(self, test_set: str, position: int) -> Estimate:
-        """The stored estimate of the n-th range of a test set."""
+        """The stored estimate of the n-th range of a test set, or of the n-th sequence (`sequences`)."""
         return read_estimate(self.evaluation_folder / test_set / f"{position}.parquet")
 
 
@@ -97,12 +97,14 @@ class StudyArtefacts:
     facts: Sequence[str]
 
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
-        """Estimate and reference of a model on each range of a test set."""
+        """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""
         spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
-        return [
-            score(model.estimate(test_set, position), read_recording(self.references[span.dataset, span.recording]), span, self.protocol)
-            for position, span in enumerate(spans)
-        ]
+        return score_all(
+            lambda position: model.estimate(test_set, position),
+            spans,
+            lambda span: read_recording(self.references[span.dataset, span.recording]),
+            self.protocol,
+        )
 
 
 @dataclass(frozen=True)

@@ -59,13 +59,14 @@ def leaderboard(artefacts: StudyArtefacts) -> pd.DataFrame:
 
     The figures are those of the seed with the lowest rmse_vy on the validation range (the lower seed of two equals): test
     data choose nothing. ``rmse_sideslip_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation) are taken
-    over all seeds with a finite value; ``_std`` is NaN if there are fewer than two. ``epochs`` is NaN for a method without.
+    over all seeds with a finite value; ``_std`` is NaN if there are fewer than two. ``epochs`` is NaN for a method without. ``start``
+    is ``reference`` if the protocol hands the true initial state over, else ``own``.
     Sideslip in deg, velocities in m/s.
 
     Raises:
         DataError: two different values for one metric of one run, or no validation metrics to choose a seed by.
     """
-    runs = _runs(artefacts)
+    runs, start = _runs(artefacts), "reference" if artefacts.protocol.initial_state else "own"
     rows = []
     for (estimator, variant), models in _by_name(artefacts.models).items():
         seeds = sorted(model.seed for model in models)
@@ -74,7 +75,7 @@ def leaderboard(artefacts: StudyArtefacts) -> pd.DataFrame:
         for test_set in artefacts.split.tests:
             own = {metric: _values(runs, (estimator, variant), seeds, test_set, metric) for metric in _ACCURACY}
             row: dict[str, object] = {"estimator": estimator, "variant": variant, "title": models[0].title, "test_set": test_set}
-            row |= {"seed": seed, "n_seeds": len(seeds)}
+            row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
             row |= {metric: values[seeds.index(seed)] for metric, values in own.items()}
             row |= _spread_of(own["rmse_sideslip"])
             row["rmse_vy_validation"] = validation[seeds.index(seed)]
@@ -95,6 +96,7 @@ _LEADERBOARD_COLUMNS = (
     "test_set",
     "seed",
     "n_seeds",
+    "start",
     "rmse_sideslip",
     *_SPREAD,
     "rmse_vy",
@@ -246,8 +248,8 @@ def _how_it_was_made(artefacts: StudyArtefacts, board: pd.DataFrame) -> list[Blo
     lines = [
         f"Command: `{artefacts.command}`",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values. Estimators may "
-        f"start up to {protocol.warm_up_seconds:g} s before a range; the first {protocol.skip_seconds:g} s of each range are not scored, "
-        f"for anyone.",
+        f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
+        f"{protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
         "Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike.",
         "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing.",
         *artefacts.facts,
@@ -428,7 +430,7 @@ def _joined(parts: Sequence[Scored], step: float) -> Scored:
 
     vy = chained("vy")
     time: FloatArray = np.arange(len(vy), dtype=np.float64) * step
-    return Scored(time, vy, *(chained(name) for name in ("vy_ref", "sideslip", "sideslip_ref", "ay")))
+    return Scored(time, vy, chained("vy_ref"), chained("sideslip"), chained("sideslip_ref"), chained("ay"))
 
 
 def _gap_of(parts: Sequence[Scored]) -> int:

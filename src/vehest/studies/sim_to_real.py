@@ -266,8 +266,8 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
         "lateral velocity.",
         "Ranges of training and validation are those with a yaw rate up to 1 rad/s, at 5 m/s or more, for 5 s or longer: a spin would move "
         "the last of a KS-NN's local models to where no car drives.",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; the first {protocol.skip_seconds:g} s of each range are not "
-        "scored. FVU = var(v − v̂)/var(v).",
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; the first {protocol.skip_seconds:g} s of each {protocol.piece} "
+        f"are not scored.{protocol.start_in_words} FVU = var(v − v̂)/var(v).",
         *_facts(artefacts),
     ]
     return ["## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)]

@@ -268,7 +268,8 @@ def _how_it_was_made(artefacts: SweepArtefacts) -> str:
         *artefacts.facts,
         f"Split `{split.name}`: {'; '.join(ranges)}",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held; up to {protocol.warm_up_seconds:g} s of warm-up before a "
-        f"range, whose first {protocol.skip_seconds:g} s are not scored",
+        f"{protocol.piece}, whose first {protocol.skip_seconds:g} s are not scored{'.' * bool(protocol.start_in_words)}"
+        f"{protocol.start_in_words.rstrip('.')}",
         "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
         "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
         "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",

@@ -107,7 +107,7 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
     lines = [
         f"Command: `{artefacts.command}`",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values; the first "
-        f"{protocol.skip_seconds:g} s of each range are not scored, for anyone.",
+        f"{protocol.skip_seconds:g} s of each {protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
         "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
         "Of several structures and seeds, the one with the lowest RMSE(v) on the validation set is shown, which in both schemes is "
         "the other car. Test data choose nothing. `±` is half the 95 % confidence interval of the mean over seeds (Student's t).",
