@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal
 
@@ -12,7 +13,7 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.kernels.tyre_network import CompiledTyreNetwork
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
-from vehest.filters.nonlinear import NonlinearFiltered
+from vehest.filters.nonlinear import Function, NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
@@ -24,6 +25,8 @@ PROCESS = (1e-3, 1e-3, 1e-2, 1e-2)  # variances to begin with, of one sample's s
 FRICTION = {"constant": 1e-4, "state_dependent": 1e-5}
 OBSERVATION = (50.0, 50.0, 0.1, 0.1)
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
+PACE = 10.0  # by which noise learns faster than in units of its deviations
+OBSERVED_EXACTLY = (0.0, 0.0, 0.0, 1e-3)  # added to variances: the rim speed is measured, and is its own reference
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
@@ -84,7 +87,7 @@ class CarFilter(nn.Module):
 
     def initial_covariance(self) -> Tensor:
         """Of a state that is known, (5, 5)."""
-        covariance: Tensor = self.initial_noise(torch.zeros(len(STATES)), torch.zeros(0))
+        covariance: Tensor = self.initial_noise(self.initial_noise.unit.new_zeros(len(STATES)), torch.zeros(0))
         return covariance
 
     def filtered(
@@ -101,20 +104,40 @@ class CarFilter(nn.Module):
         """
         if states is not None or isinstance(self.process_noise, ConstantNoise):
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            process, observation = self._process_noise(at, inputs), self.observation_noise(at, inputs)
+            noises: list[Tensor | Function] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
         else:
-            process, observation = self._process_noise, self.observation_noise
+            noises = [self._process_noise, self.observation_noise]
         return unscented_scan(
             model or self.point_model(),
             measurements,
             inputs,
             initial,
-            process,
-            observation,
+            noises[0],
+            noises[1],
             self.rule,
             repair=self.repair,
             share=partial(over_members, pieces=1),
         )
+
+    def begin_noise(self, drives: Sequence[Drive]) -> None:
+        """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
+
+        The friction, which the true states hold as a constant, and the initial state keep the variances that they have.
+        """
+        with torch.no_grad():
+            steps = torch.cat([self.moved(d.states[:-1], d.inputs[:-1]) - d.states[1:] for d in drives])
+            expected = torch.cat([d.measurements - self.dynamics.observation(d.states, d.inputs) for d in drives])
+            size = torch.cat([drive.states for drive in drives]).square().mean(0).sqrt()
+            process, observation = steps.T @ steps / len(steps), expected.T @ expected / len(expected)
+            friction = len(STATES) - 1
+            process[friction, friction] = FRICTION["constant" if isinstance(self.process_noise, ConstantNoise) else "state_dependent"]
+            observation += observation.new_tensor(OBSERVED_EXACTLY).diag()
+        for noise, covariance in ((self.process_noise, process), (self.observation_noise, observation)):
+            if isinstance(noise, StateDependentNoise):
+                noise.begin(covariance, PACE, size)
+            else:
+                noise.begin(covariance, PACE)  # type: ignore[operator]
+        self.initial_noise.begin(self.initial_covariance(), PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""

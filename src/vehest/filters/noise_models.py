@@ -13,7 +13,7 @@ FLOOR = 1e-7
 
 
 class ConstantNoise(nn.Module):
-    """A full covariance L Lᵀ + floor · I with a lower triangular factor that is learnt.
+    """A full covariance L Lᵀ + floor · I with a lower triangular factor that is learnt, row by row in units that `begin` may set.
 
     Args:
         variances: its diagonal to begin with, n of them.
@@ -22,16 +22,25 @@ class ConstantNoise(nn.Module):
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
 
+    unit: Tensor
+
     def __init__(self, variances: Sequence[float], floor: float = FLOOR) -> None:
         super().__init__()
         start = _checked(variances)
         self.floor = floor
         self.n = len(start)
         self.factor = nn.Parameter(start.sqrt().diag()[_lower(self.n)])
+        self.register_buffer("unit", torch.ones(self.n))
+
+    def begin(self, covariance: Tensor, pace: float) -> None:
+        """Start from a covariance, (n, n), and learn in units of ``pace`` times its deviations, so that all entries learn alike."""
+        with torch.no_grad():
+            self.unit.copy_(pace * covariance.diagonal().sqrt())
+            self.factor.copy_((torch.linalg.cholesky(covariance) / self.unit.unsqueeze(-1))[_lower(self.n)])
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
-        return _product(self.factor, self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
+        return _product(self.factor * self.unit[_lower(self.n)[0]], self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
 
 
 class StateDependentNoise(nn.Module):
@@ -48,6 +57,9 @@ class StateDependentNoise(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors' code.
     """
 
+    unit: Tensor
+    state_unit: Tensor
+
     def __init__(
         self,
         variances: Sequence[float],
@@ -63,9 +75,18 @@ class StateDependentNoise(nn.Module):
         self.scale = scale
         count = self.constant.n * (self.constant.n + 1) // 2
         self.deviation = deviation
+        self.register_buffer("unit", torch.ones(self.constant.n))
+        self.register_buffer("state_unit", torch.ones(n_states))
         self.weight = nn.Parameter(torch.empty(count, n_states))
         self.offset = nn.Parameter(torch.zeros(count))
         self.reset(generator)
+
+    def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
+        """Start from a covariance, (n, n); see `ConstantNoise.begin`. L sees states in units, (k,)."""
+        self.constant.begin(covariance, pace)
+        with torch.no_grad():
+            self.unit.copy_(self.constant.unit / self.scale**0.5)
+            self.state_unit.copy_(state_unit)
 
     def reset(self, generator: torch.Generator | None = None) -> None:
         """Draw the weights anew."""
@@ -74,7 +95,7 @@ class StateDependentNoise(nn.Module):
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""
-        factor = nn.functional.linear(state, self.weight, self.offset)
+        factor = nn.functional.linear(state / self.state_unit, self.weight, self.offset) * self.unit[_lower(self.constant.n)[0]]
         return self.constant(state, inputs) + self.scale * _product(factor, self.constant.n, 0.0)
 
 

@@ -247,8 +247,7 @@ class _Scan(torch.autograd.Function):
         y, u = _by_time(measurements), _by_time(inputs)
         first = [tensor.detach().contiguous().numpy() for tensor in (mean, covariance)]
         noises: list[Any] = [
-            _by_time(noise) if function is None else function
-            for noise, function in zip((process, observation), functions, strict=True)
+            _by_time(noise) if function is None else function for noise, function in zip((process, observation), functions, strict=True)
         ]
 
         def work(start: int, end: int) -> None:
@@ -259,12 +258,12 @@ class _Scan(torch.autograd.Function):
                 tape.put(start, end, part)
 
         setting.share(work, y.shape[1])
-        ctx.kept = (setting, tape, functions, y, u, first)
+        ctx.kept = (setting, tape, functions, y, u)
         return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        setting, tape, functions, y, u, first = ctx.kept
+        setting, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
         steps, sequences, n = tape.post_mean.shape
@@ -280,11 +279,13 @@ class _Scan(torch.autograd.Function):
             part = tape if whole else tape.slice(start, end)
             own = [np.zeros(tuple(parameter.shape), dtype) for parameter in setting.model.parameters]
             gradients[start] = own
-            pieces = (process, observation, mean_up, covariance_up)
-            cut = pieces if whole else tuple(np.ascontiguousarray(piece[:, start:end]) for piece in pieces)
-            mean[start:end], covariance[start:end] = _backward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], *cut, own)
+            bars = [
+                piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (process, observation, mean_up, covariance_up)
+            ]
+            data = (y[:, start:end], u[:, start:end])
+            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars[0], bars[1], bars[2], bars[3], own)
             if not whole:
-                process[:, start:end], observation[:, start:end] = cut[0], cut[1]
+                process[:, start:end], observation[:, start:end] = bars[0], bars[1]
 
         setting.share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
@@ -340,7 +341,6 @@ def _backward(
     tape: _Tape,
     y: Array,
     u: Array,
-    first: Array,
     process_bar: Array,
     observation_bar: Array,
     mean_up: Array,

@@ -124,7 +124,23 @@ def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, n
 
 @compiled
 def update_of(  # type: ignore[no-untyped-def]
-    mean, covariance, points, expected, y, noise, rule, lower, margin, repair, post_mean, post_covariance, innovation, own, gain, likelihood, repaired
+    mean,
+    covariance,
+    points,
+    expected,
+    y,
+    noise,
+    rule,
+    lower,
+    margin,
+    repair,
+    post_mean,
+    post_covariance,
+    innovation,
+    own,
+    gain,
+    likelihood,
+    repaired,
 ):
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired."""
     sequences, count, m = expected.shape
@@ -337,7 +353,7 @@ def _cholesky(A, L):  # type: ignore[no-untyped-def]
 
 @compiled
 def _all_finite(A):  # type: ignore[no-untyped-def]
-    for value in A.flat:
+    for value in A.flat:  # noqa: SIM110 - compiled
         if not np.isfinite(value):
             return False
     return True

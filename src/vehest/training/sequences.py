@@ -35,6 +35,7 @@ class Phase:
         batches: one epoch's batches; draws random numbers from the generator that it is given and from no other.
         loss: scalar to minimise, of one batch; ``backward`` is called on it.
         validation: loss on the validation data with the parameters as they stand; called without gradients.
+        prepare: called once before the first validation; may set parameters that this phase starts from.
         trainable: which parameters learn, by name; the others are frozen (``requires_grad`` is False during the phase). All if None.
     """
 
@@ -45,6 +46,7 @@ class Phase:
     loss: Callable[[Any], Tensor]
     validation: Callable[[], float]
     trainable: Callable[[str], bool] | None = None
+    prepare: Callable[[], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -209,6 +211,9 @@ class _Run:
             if self.context.should_stop():
                 self._stop(before)
                 return
+            if phase.prepare is not None:
+                with torch.no_grad():
+                    phase.prepare()
             now.start_loss = self._validate(phase)
             now.validated = True
             before = self._checkpoint()

@@ -40,6 +40,10 @@ class Filtering(Protocol):
         """States one sample later, (..., n)."""
         ...
 
+    def begin_noise(self, drives: Sequence[Drive]) -> None:
+        """Start noise from what the model, as it is, leaves unexplained in drives."""
+        ...
+
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
         ...
@@ -68,23 +72,28 @@ class ThroughFilterSettings:
         validation_steps: samples of a validation sequence.
         validation_drop_steps: first samples of it that do not count.
         start_spread: by how much the last state (friction) is off at the start of a training sequence, at most, up or down.
+        start_noise: ``residuals`` starts the noise from what the pre-trained model leaves unexplained and learns it in units of that;
+            ``given`` from the authors' values, in SI units.
+        dtype: ``float32`` or ``float64``.
         checkpoint_seconds: time between two checkpoints [s].
     """
 
-    one_step: PhaseSettings = PhaseSettings()
+    one_step: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine")  # noqa: RUF009
     one_step_batch: int = 2048
-    through: PhaseSettings = PhaseSettings(validate_every=5)
-    noise: PhaseSettings = PhaseSettings(max_epochs=200, validate_every=5)
+    through: PhaseSettings = PhaseSettings(max_epochs=400, validate_every=5, schedule="cosine")  # noqa: RUF009
+    noise: PhaseSettings = PhaseSettings(max_epochs=100, validate_every=5, schedule="cosine")  # noqa: RUF009
     steps: int = 500
     drop_steps: int = 0
-    batch_size: int = 256
-    placing: str = "fixed"
+    batch_size: int = 7
+    placing: str = "random"
     curriculum: Sequence[int] = ()
     curriculum_epochs: int = 100
     truncate_steps: int = 0
     validation_steps: int = 1000
     validation_drop_steps: int = 200
-    start_spread: float = 0.0
+    start_spread: float = 0.2
+    start_noise: str = "residuals"
+    dtype: str = "float32"
     checkpoint_seconds: float = 15.0
 
     def __post_init__(self) -> None:
@@ -98,6 +107,10 @@ class ThroughFilterSettings:
             raise ConfigurationError("training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps")
         if self.placing not in ("fixed", "random"):
             raise ConfigurationError(f"training.placing '{self.placing}' is not one of: fixed, random")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+        if self.start_noise not in ("residuals", "given"):
+            raise ConfigurationError(f"training.start_noise '{self.start_noise}' is not one of: residuals, given")
         if any(isinstance(steps, bool) or not isinstance(steps, int) or steps <= self.drop_steps for steps in self.curriculum):
             raise ConfigurationError(f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}")
 
@@ -165,7 +178,11 @@ def filter_phases(
         error = (estimated - judged.states)[:, settings.validation_drop_steps :]
         return float(_weighted(error, weights.validation))
 
-    def phase(steps: int, epochs: int, label: str) -> Phase:
+    def prepare() -> None:
+        if settings.start_noise == "residuals":
+            filtering.begin_noise(train)
+
+    def phase(steps: int, epochs: int, label: str, first: bool) -> Phase:
         fixed = sequences_of(train, steps)
 
         def batches(generator: torch.Generator) -> Iterable[tuple[Drive, Tensor]]:
@@ -184,10 +201,11 @@ def filter_phases(
             return _weighted((estimated - drives.states)[:, settings.drop_steps :], weights.training)
 
         own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
-        return Phase(label, own, module, batches, loss, judge, trainable)
+        return Phase(label, own, module, batches, loss, judge, trainable, prepare if first else None)
 
-    shorter = [phase(steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum]
-    return [*shorter, phase(settings.steps, how.max_epochs, name)]
+    lengths = [(steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum]
+    lengths.append((settings.steps, how.max_epochs, name))
+    return [phase(*length, first=number == 0) for number, length in enumerate(lengths)]
 
 
 def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:

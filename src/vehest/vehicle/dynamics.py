@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -46,7 +47,7 @@ class Perceptron(nn.Sequential):
     def __init__(self, scales: Sequence[float], hidden: Sequence[int], outputs: Sequence[float]) -> None:
         sizes = [len(scales), *hidden, len(outputs)]
         layers: list[nn.Module] = []
-        for before, after in zip(sizes, sizes[1:], strict=False):
+        for before, after in pairwise(sizes):
             layers += [nn.Linear(before, after), nn.Sigmoid()]
         super().__init__(*layers[:-1])
         self.register_buffer("input_scale", torch.tensor(list(scales)))
@@ -54,7 +55,7 @@ class Perceptron(nn.Sequential):
 
     def forward(self, values: Tensor) -> Tensor:
         """(..., inputs) -> (..., outputs)."""
-        scaled: Tensor = super().forward(values / self.input_scale)
+        scaled: Tensor = super().forward(values / self.input_scale)  # type: ignore[no-untyped-call]
         return scaled * self.output_scale
 
     def reset(self, generator: torch.Generator) -> None:
@@ -69,7 +70,7 @@ class Perceptron(nn.Sequential):
     def layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weight and offset of each layer, scales included."""
         linear = [layer for layer in self if isinstance(layer, nn.Linear)]
-        pairs = [(layer.weight, layer.bias) for layer in linear]
+        pairs: list[tuple[Tensor, Tensor]] = [(layer.weight, layer.bias) for layer in linear]
         pairs[0] = (pairs[0][0] / self.input_scale, pairs[0][1])
         pairs[-1] = (pairs[-1][0] * self.output_scale.unsqueeze(-1), pairs[-1][1] * self.output_scale)
         return pairs
@@ -239,9 +240,7 @@ PHYSICAL = (
 
 def physical_of(car: PlanarCar) -> Physical:
     """Learnt values in the order of `PHYSICAL`, differentiable, and known ones."""
-    return Physical(
-        torch.stack([car.learnt[name] for name in PHYSICAL]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius
-    )
+    return Physical(torch.stack([car.learnt[name] for name in PHYSICAL]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius)
 
 
 def _kinematic(state: Tensor, rates: Tensor) -> Motion:

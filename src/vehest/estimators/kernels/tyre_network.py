@@ -1,7 +1,7 @@
 """Sigma points through the car whose tyres are a network (`TyreNetworkCar`), compiled, with the adjoint.
 
-Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes stages again
-instead of keeping them. Blocks of sequences are small enough for a core's own cache, and for the matrix products to stay on their thread.
+Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes
+stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache, and for the matrix products to stay on their thread.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _motion_adjoint(  # type: ignore[no-untyped-def]
 ):
     """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
     mass, wheelbase, radius, _, turn, unscaled, still = constants
-    lr, inertia, drag0, drag1, drag2, powertrain, torque, viscous, coulomb = theta
+    lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta
     lf = wheelbase - lr
     points = x.shape[1]
     zero = x[0, 0] * 0
@@ -291,9 +291,7 @@ def _stages(x0, u, W1, b1, W2, b2, W3, b3, theta, constants, scaled, x, f, h1, h
                 for p in range(x0.shape[1]):
                     x[stage, i, p] = x0[i, p] + share * rates[stage - 1, i, p]
         at = stage
-        _motion(
-            x[at], u, W1, b1, W2, b2, W3, b3, theta, constants, scaled, f[at], h1[at], h2[at], o[at], forces[at], motion[at]
-        )
+        _motion(x[at], u, W1, b1, W2, b2, W3, b3, theta, constants, scaled, f[at], h1[at], h2[at], o[at], forces[at], motion[at])
         _rates(x[at], motion[at], rates[at])
 
 
