@@ -92,11 +92,19 @@ def channels_page() -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def _manoeuvre(name: str, made: type[Any]) -> list[str]:
+    """Heading, meaning and parameters of one manoeuvre."""
+    described = _sections(made)
+    rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
+    return [f"### `{name}`", described[""], _table(("parameter", "default", "meaning"), rows)]
+
+
 def manoeuvres_page(root: Path) -> str:
     """Manoeuvres of the proving ground with their parameters, its courses, and its vehicles."""
     from vehest.simulation import tracks
     from vehest.simulation.course import course_by_name
     from vehest.simulation.manoeuvres import MANOEUVRES
+    from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
 
     parts = [
         "# Manoeuvres, courses and vehicles of the proving ground",
@@ -107,11 +115,10 @@ def manoeuvres_page(root: Path) -> str:
         "is the share of the grip that the driver means to use, on the surface at hand.",
     ]
     for name, made in sorted(MANOEUVRES.items()):
-        described = _sections(made)
-        parts.append(f"### `{name}`")
-        parts.append(described.pop(""))
-        rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
-        parts.append(_table(("parameter", "default", "meaning"), rows))
+        parts += _manoeuvre(name, made)
+    parts.append("## Manoeuvres of the planar plant's cars")
+    for name, free in sorted(PLANAR_MANOEUVRES.items()):
+        parts += _manoeuvre(name, free)
     courses = [(name, course_by_name(name)) for name in tracks.LAYOUTS]
     parts += [
         "## Courses",
@@ -158,7 +165,7 @@ def _simulated_sensors() -> Iterable[str]:
     from vehest.simulation.sensor_levels import PRESETS, REFERENCES, SensorLevels
 
     header = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
-    references = (REFERENCES["gnss"], REFERENCES["optical"])
+    references = (REFERENCES["gnss"], REFERENCES["optical"], REFERENCES["motion_capture"])
     levers = ("lever_x", "lever_y", "lever_z", "lever_error")
     yield "## Simulated sensors"
     yield (
@@ -173,8 +180,8 @@ def _simulated_sensors() -> Iterable[str]:
         "of the body, `bank` and `grade` of the road let gravity into the accelerometers. Roll and pitch themselves are not measured."
     )
     yield (
-        "A data set says `sensors: default`, `race` or `ideal` (no errors, the road's axes), or changes a preset. `off` takes a whole "
-        "sensor's errors away, `switched_off` names single ones; `*` stands for all sensors but the reference:"
+        "A data set says `sensors: default`, `race`, `small_car` or `ideal` (no errors, the road's axes), or changes a preset. `off` "
+        "takes a whole sensor's errors away, `switched_off` names single ones; `*` stands for all sensors but the reference:"
     )
     yield (
         "```yaml\nsensors:\n  preset: race\n  reference: optical\n  ay: {noise: 0, offset: 0.05}\n  steer: off\n  tilt: {bank: off}\n"
@@ -195,11 +202,22 @@ def _simulated_sensors() -> Iterable[str]:
         "the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a banked road is part of it). "
         "How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are those of `default`."
     )
-    yield "### `reference: gnss` and `reference: optical`"
+    yield "### `sensors: small_car`"
+    vibration = PRESETS["small_car"].vibration
+    shaken = ", ".join(f"`{field.name}` {getattr(vibration, field.name):g}" for field in fields(vibration))
+    yield f"A model race car of 5 kg, as in the F1TENTH recordings. {_mounting(PRESETS['small_car'].imu)}"
+    yield _table(header, _sensor_rows(PRESETS["small_car"]))
     yield (
-        "Where `vx_ref`, `vy_ref`, `yaw_rate_ref` and `sideslip_ref` come from; `gnss` belongs to `default` and `race`. The sensor "
-        "measures velocity where it sits, in axes turned by the error `heading` [rad], and moves it to the centre of gravity with its own "
-        "yaw rate and a lever known to `lever_error`. The sources stand beside the numbers in `vehest.simulation.sensor_levels`."
+        f"Its inertial unit shakes with the wheels: `vibration` adds white noise whose standard deviation is, per rad/s of the wheels' "
+        f"mean speed, {shaken}. These and what the comments in `vehest.simulation.sensor_levels` name are read off the recording that the "
+        "learned-dynamics UKF trains on; the rest is assumed."
+    )
+    yield "### `reference: gnss`, `reference: optical` and `reference: motion_capture`"
+    yield (
+        "Where `vx_ref`, `vy_ref`, `yaw_rate_ref` and `sideslip_ref` come from; `gnss` belongs to `default` and `race`, `motion_capture` "
+        "to `small_car`. The sensor measures velocity where it sits, in axes turned by the error `heading` [rad], and moves it to the "
+        "centre of gravity with its own yaw rate and a lever known to `lever_error`. The sources stand beside the numbers in "
+        "`vehest.simulation.sensor_levels`."
     )
     yield _table(("reference", *header), [(f"`{r.kind}`", *row) for r in references for row in _sensor_rows(r)])
     rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in references]

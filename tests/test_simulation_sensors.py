@@ -26,7 +26,9 @@ from vehest.simulation.sensors import (
     SensorLevel,
     SensorLevels,
     Tilt,
+    Vibration,
     body_rates,
+    described,
     ideal_sensors,
     measure,
     sensor_levels_from_config,
@@ -77,6 +79,8 @@ def weaving(seconds: float = 20.0, rate_hz: float = 100.0) -> Motion:
         tyre_fz=30.0 * wheels,
         bank=0.03 * np.sin(0.2 * t),
         grade=0.02 * np.cos(0.2 * t),
+        motor_speed=80.0 + np.sin(0.6 * t),
+        motor_current=30.0 * np.sin(0.8 * t),
     )
 
 
@@ -129,7 +133,30 @@ def test_channels_are_those_of_the_table_without_angles_of_the_body() -> None:
     shown = measure(weaving(1.0), SensorLevels(), seed=0)
     assert set(shown) <= set(CHANNELS)
     assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
-    assert len(shown) == 2 + 5 + 4 + 12 + 4
+    assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
+
+
+def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_none() -> None:
+    electric = weaving(1.0)
+    motion = replace(electric, motor_speed=None, motor_current=None)
+    with_motor, without = measure(electric, SensorLevels(), 0), measure(motion, SensorLevels(), 0)
+    assert set(with_motor) - set(without) == {"motor_speed", "motor_current"}
+    assert all(np.array_equal(without[name], with_motor[name]) for name in without)
+    assert set(described(SensorLevels(), electric)) - set(described(SensorLevels(), motion)) == {"motor_speed", "motor_current"}
+    assert "vibration" not in described(SensorLevels(), electric)
+    assert "vibration" in described(PRESETS["small_car"], electric)
+
+
+def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else() -> None:
+    motion = motion_of(20_000, wheel_speed=np.repeat(np.linspace(0.0, 100.0, 20_000)[:, None], 4, axis=1))
+    shaken = measure(motion, only(vibration=Vibration(yaw_rate=0.01, ax=0.1, ay=0.2)), seed=3)
+    assert different(shaken, measure(motion, ideal_sensors(), seed=3)) == {"yaw_rate", "ax", "ay"}
+    for name, per_speed in (("yaw_rate", 0.01), ("ax", 0.1), ("ay", 0.2)):
+        for part in (slice(1_000, 3_000), slice(17_000, 19_000)):
+            expected = per_speed * np.sqrt((motion.wheel_speed[part, 0] ** 2).mean())
+            assert shaken[name][part].std() == pytest.approx(expected, rel=0.06), name
+    louder = measure(motion, only(vibration=Vibration(ax=0.1)), seed=3)
+    np.testing.assert_array_equal(louder["ax"], shaken["ax"])
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
@@ -405,7 +432,7 @@ def test_streams_of_all_errors_differ() -> None:
         reference = Reference("gnss", vx=quiet["vx"], vy=quiet["vx"], yaw_rate=quiet["vx"])
         shown = measure(motion_of(1), only(**quiet, reference=reference), seed=0)
         first += [samples[0] / (math.sqrt(50.0) if kind == "noise" else 1.0) for name, samples in shown.items() if name != "sideslip_ref"]
-    assert len({round(value, 9) for value in first}) == len(first) == 3 * 26
+    assert len({round(value, 9) for value in first}) == len(first) == 3 * 28
 
 
 def test_switching_off_takes_parts_wholes_and_kinds() -> None:
@@ -501,8 +528,8 @@ def test_reference_kinds_are_different() -> None:
         ("{tilt: {bank: 0}}", "sensors: tilt.bank is on or off, not 0"),
         ("{imu: {lever_x: .inf}}", "sensors: imu: lever_x must be finite"),
         ("{imu: {misalignment: -1}}", "misalignment must be zero or positive"),
-        ("{reference: radar}", "sensors: reference 'radar' is not one of: optical, gnss, ideal"),
-        ("{reference: {kind: [radar]}}", "is not one of: optical, gnss, ideal"),
+        ("{reference: radar}", "sensors: reference 'radar' is not one of: optical, gnss, motion_capture, ideal"),
+        ("{reference: {kind: [radar]}}", "is not one of: optical, gnss, motion_capture, ideal"),
         ("{reference: {vz: {noise: 1}}}", "sensors: reference: 'vz' is not one of"),
         ("{reference: {heading: {delay: 1}}}", "sensors: reference: heading has noise, offset and drift only"),
         ("{switched_off: [ay.bias]}", "sensors: cannot switch off 'ay.bias': 'bias' is not one of: noise, offset"),

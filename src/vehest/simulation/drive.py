@@ -21,7 +21,7 @@ from vehest.simulation.motion import Motion
 from vehest.simulation.parameters import Vehicle
 from vehest.simulation.plant import MultiBodyPlant, PlantState, road_gravity
 from vehest.simulation.regimes import GRAVITY, STEER, VX, VY, YAW, YAW_RATE, X, Y
-from vehest.simulation.sensors import SensorLevels, measure
+from vehest.simulation.sensors import SensorLevels, described, measure
 from vehest.simulation.stability import StabilityControl, StabilityState
 from vehest.simulation.stability import stability_control as make_stability_control
 from vehest.simulation.surface import SURFACES, Surface
@@ -126,7 +126,7 @@ def simulate_drive(
         start_time=0.0,
         channels=measure(trip.motion, sensors, seed),
         kind="simulated",
-        provenance=_as_json(
+        provenance=as_json(
             {
                 "plant": "CommonRoad multi-body",
                 "library": f"{LIBRARY} {LIBRARY_VERSION}",
@@ -138,7 +138,7 @@ def simulate_drive(
                 "surface": asdict(surface),
                 "stability_control": stability_control,
                 "seed": seed,
-                "sensors": asdict(sensors),
+                "sensors": described(sensors, trip.motion),
                 "flags": asdict(trip.flags),
             }
         ),
@@ -160,8 +160,8 @@ def drive(
         ConfigurationError: rate or step make no sense, or the car cannot do the manoeuvre.
         SimulationError: the car rolled over, or a state is not finite.
     """
-    per_command = _whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
-    per_sample = _whole_steps(rate_hz, plant.step, "sampling")
+    per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
+    per_sample = whole_steps(rate_hz, plant.step, "sampling")
     car, surface = car_of(plant), surface or SURFACES["dry"]
     controller = manoeuvre.controller(car, surface, seed)
     half_width = float(getattr(manoeuvre, "half_width", math.inf))
@@ -298,12 +298,17 @@ class _Log:
         return Trip(motion, lateral_error.copy(), flags, drawn)
 
 
-def _as_json(values: dict[str, Any]) -> dict[str, Any]:
+def as_json(values: dict[str, Any]) -> dict[str, Any]:
     """The values as they come back from a JSON file: lists for tuples."""
     return json.loads(json.dumps(values))  # type: ignore[no-any-return]
 
 
-def _whole_steps(rate_hz: float, step: float, what: str) -> int:
+def whole_steps(rate_hz: float, step: float, what: str) -> int:
+    """Steps of the plant [s] between two ticks of a rate.
+
+    Raises:
+        ConfigurationError: no whole number of steps lies between them; ``what`` names the rate.
+    """
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(

@@ -10,6 +10,7 @@ import numpy as np
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.parameters import REAR_TYRE, Vehicle, is_number, library_parameters, rear_tyre
+from vehest.simulation.planar_car import PlanarCar, scaled_car
 from vehest.simulation.sensor_levels import SensorLevel, SensorLevels
 
 _STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
@@ -76,6 +77,21 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
                 target = target.setdefault(part, {})
             target[last] = scaled[name]
     return replace(vehicle, overrides=overrides)
+
+
+def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
+    """The same for a car of the planar plant.
+
+    Raises:
+        ConfigurationError: a name is no parameter of the plant.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+    factors: dict[str, float] = {}
+    for variation in variations:
+        factor = float(generator.uniform(*variation.factor))
+        for name in variation.parameters:
+            factors[name] = factors.get(name, 1.0) * factor
+    return scaled_car(car, factors)
 
 
 @dataclass(frozen=True)

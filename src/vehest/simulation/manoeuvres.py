@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.circles import BrakingInTurn, SteadyCircle
@@ -21,6 +21,11 @@ from vehest.simulation.manoeuvre import Manoeuvre
 from vehest.simulation.open_loop import RandomSteer, Spiral, StepSteer
 from vehest.simulation.parameters import is_number
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Made = TypeVar("Made", bound="DataclassInstance")
+
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
     made.name: made
     for made in (Laps, SpeedLaps, FastLap, DoubleLaneChange, Slalom, SteadyCircle, BrakingInTurn, StepSteer, Spiral, RandomSteer)
@@ -29,24 +34,37 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 
 
 def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
+    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters.
+
+    Raises:
+        ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
+    """
+    return one_of(configuration, MANOEUVRES)
+
+
+def one_of(configuration: Mapping[str, Any], among: Mapping[str, type[Made]]) -> Made:
     """A manoeuvre from its ``name`` and any of its parameters.
+
+    Args:
+        configuration: name and parameters.
+        among: the manoeuvres that the plant has, dataclasses by name.
 
     Raises:
         ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
     """
     values = {key: _tupled(value) for key, value in configuration.items()}
     name = values.pop("name", None)
-    if not isinstance(name, str) or name not in MANOEUVRES:
-        raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(MANOEUVRES))}")
-    known = {entry.name for entry in fields(MANOEUVRES[name])}
+    if not isinstance(name, str) or name not in among:
+        raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(among))}")
+    known = {entry.name for entry in fields(among[name])}
     unknown = sorted(set(values) - known)
     if unknown:
         raise ConfigurationError(f"manoeuvre '{name}': unknown keys {unknown}; it has {sorted(known)}")
-    for entry in fields(MANOEUVRES[name]):
+    for entry in fields(among[name]):
         if entry.name in values and not _fits(values[entry.name], str(entry.type)):
             shown = _KINDS.get(str(entry.type).removesuffix(" | None"), str(entry.type))
             raise ConfigurationError(f"manoeuvre '{name}': {entry.name} must be {shown}, not {configuration[entry.name]}")
-    return MANOEUVRES[name](**values)
+    return among[name](**values)
 
 
 _KINDS = {

@@ -37,6 +37,8 @@ class Motion:
         friction: scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road.
         bank: of the road, positive with its left side higher [rad].
         grade: of the road, positive downhill [rad].
+        motor_speed: of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such motor.
+        motor_current: its torque-producing current [A]; likewise.
     """
 
     rate_hz: float
@@ -60,6 +62,8 @@ class Motion:
     friction: FloatArray
     bank: FloatArray
     grade: FloatArray
+    motor_speed: FloatArray | None = None
+    motor_current: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.x)

@@ -98,6 +98,28 @@ class Tilt:
 
 
 @dataclass(frozen=True)
+class Vibration:
+    """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed.
+
+    Args:
+        yaw_rate: standard deviation of a sample per speed of the wheels [1].
+        ax, ay: the same [m/s² per rad/s].
+
+    Raises:
+        ConfigurationError: a value is negative or not finite.
+    """
+
+    yaw_rate: float = 0.0
+    ax: float = 0.0
+    ay: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_finite(self, not_negative="yaw_rate")
+        _require_finite(self, not_negative="ax")
+        _require_finite(self, not_negative="ay")
+
+
+@dataclass(frozen=True)
 class Reference:
     """The sensor that gives vx_ref, vy_ref, yaw_rate_ref and, as atan2(vy_ref, vx_ref), sideslip_ref.
 
@@ -105,7 +127,7 @@ class Reference:
     own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
 
     Args:
-        kind: what it stands for, ``optical``, ``gnss`` or ``ideal``.
+        kind: what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``.
         vx, vy: errors of the velocity along its axes [m/s].
         yaw_rate: errors of its gyro [rad/s].
         heading: errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here.
@@ -160,7 +182,16 @@ OPTICAL = Reference(
 )
 """Optical sensor over the road, in the front bumper: more noise, a delay, and errors of the place where it sits."""
 
-REFERENCES: dict[str, Reference] = {reference.kind: reference for reference in (OPTICAL, GNSS, Reference())}
+MOTION_CAPTURE = Reference(
+    kind="motion_capture",
+    # Second differences of the references of iros_hoons_1 give 0.007 m/s, 0.012 m/s and 0.012 rad/s at 100 Hz, jolts of the car included.
+    vx=SensorLevel(noise=0.001),
+    vy=SensorLevel(noise=0.001),
+    yaw_rate=SensorLevel(noise=0.002),
+)
+"""Cameras around a small test area: markers' poses, differentiated."""
+
+REFERENCES: dict[str, Reference] = {reference.kind: reference for reference in (OPTICAL, GNSS, MOTION_CAPTURE, Reference())}
 
 
 @dataclass(frozen=True)
@@ -187,6 +218,10 @@ class SensorLevels:
             place; misalignment 0.2°, assumed.
         tilt: which angles let gravity in.
         reference: of the reference channels.
+        motor_speed: of an electric motor, referred to the wheels: all assumed; only cars that have such
+            a motor show it.
+        motor_current: the same; assumed.
+        vibration: of the inertial unit with the wheels' speed; none.
     """
 
     vx: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.0028, delay=0.02, scale=0.005)
@@ -203,6 +238,10 @@ class SensorLevels:
     imu: Mounting = Mounting(misalignment=0.0035)
     tilt: Tilt = Tilt()
     reference: Reference = GNSS
+    # What came later stands last: a fleet draws its scales in this order.
+    motor_speed: SensorLevel = SensorLevel(noise=0.01, delay=0.01, scale=0.002)
+    motor_current: SensorLevel = SensorLevel(noise=0.1, offset=0.5, delay=0.01, scale=0.02)
+    vibration: Vibration = Vibration()
 
 
 NO_ERRORS = ("kind", "drift_time")
@@ -238,10 +277,31 @@ RACE = SensorLevels(
 """A race car of the sixties with good instruments."""
 
 
+# Read off the F1TENTH recordings that the learned-dynamics UKF trains on, iros_hoons_1, where the comment says so: vibration and noise of
+# ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by the motor's speed
+# (docs/compare_tyre_sets.py).
+SMALL_CAR = SensorLevels(
+    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which nobody measures there.
+    yaw_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # noise, offset read off; delay assumed
+    roll_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # assumed, as yaw_rate
+    pitch_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # assumed, as yaw_rate
+    ax=SensorLevel(noise=0.17, offset=0.1, delay=0.005),  # noise read off; offset and delay assumed
+    ay=SensorLevel(noise=0.17, offset=0.15, delay=0.005),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed
+    steer=SensorLevel(noise=2e-4, offset=0.005),  # assumed: the servo's command, and how well its neutral is trimmed
+    wheel_speed=SensorLevel(),  # none is there
+    imu=Mounting(misalignment=0.01),  # assumed
+    reference=MOTION_CAPTURE,
+    motor_speed=SensorLevel(noise=0.03, delay=0.01, scale=0.005),  # noise read off; delay one message; scale, the tyre's radius, assumed
+    motor_current=SensorLevel(noise=0.24, delay=0.01, scale=0.02),  # noise read off; delay one message; scale assumed
+    vibration=Vibration(yaw_rate=0.009, ax=0.063, ay=0.115),  # read off
+)
+"""A model race car of 5 kg: little noise at rest, an inertial unit that shakes with the wheels."""
+
+
 def ideal_sensors() -> SensorLevels:
     """Sensors without any error: they show the true motion of the centre of gravity in the road's axes."""
     levels: SensorLevels = without_errors(SensorLevels())
     return levels
 
 
-PRESETS: dict[str, SensorLevels] = {"default": SensorLevels(), "race": RACE, "ideal": ideal_sensors()}
+PRESETS: dict[str, SensorLevels] = {"default": SensorLevels(), "race": RACE, "ideal": ideal_sensors(), "small_car": SMALL_CAR}

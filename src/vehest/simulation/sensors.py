@@ -5,13 +5,16 @@ How large the errors are stands in ``sensor_levels``, how they are changed in ``
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.simulation.motion import WHEELS, Motion
 from vehest.simulation.sensor_config import sensor_levels_from_config, switched_off
 from vehest.simulation.sensor_errors import shown, stream
-from vehest.simulation.sensor_levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, ideal_sensors
+from vehest.simulation.sensor_levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
 
 __all__ = [
     "GRAVITY",
@@ -21,7 +24,9 @@ __all__ = [
     "SensorLevel",
     "SensorLevels",
     "Tilt",
+    "Vibration",
     "body_rates",
+    "described",
     "ideal_sensors",
     "measure",
     "sensor_levels_from_config",
@@ -54,8 +59,19 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
         for place, wheel in enumerate(WHEELS):
             true[f"{sensor}_{wheel}"] = values[:, place]
             sensor_of[f"{sensor}_{wheel}"] = sensor
+    for name, of_motor in (("motor_speed", motion.motor_speed), ("motor_current", motion.motor_current)):
+        if of_motor is not None:
+            true[name], sensor_of[name] = of_motor, name
     channels = {name: shown(values, getattr(levels, sensor_of[name]), motion.rate_hz, seed, name) for name, values in true.items()}
     return channels | _reference(motion, levels.reference, seed)
+
+
+def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
+    """What provenance says of the sensors that measured a motion: all but those of a motor, and a vibration, that are not there."""
+    absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
+    if levels.vibration == Vibration():
+        absent.add("vibration")
+    return {name: value for name, value in asdict(levels).items() if name not in absent}
 
 
 def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
@@ -113,7 +129,13 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
         angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(3)
     roll_rate, pitch_rate, yaw_rate = _turned(rates, *angles)
     ax, ay, _ = _turned(force, *angles)
-    return {"yaw_rate": yaw_rate, "roll_rate": roll_rate, "pitch_rate": pitch_rate, "ax": ax, "ay": ay}
+    felt = {"yaw_rate": yaw_rate, "roll_rate": roll_rate, "pitch_rate": pitch_rate, "ax": ax, "ay": ay}
+    for name in ("yaw_rate", "ax", "ay"):
+        by_speed = getattr(levels.vibration, name)
+        if by_speed:
+            shaking = stream(seed, f"vibration.{name}").standard_normal(len(motion))
+            felt[name] = felt[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
+    return felt
 
 
 def _lever_acceleration(rates: FloatArray, lever: FloatArray, rate_hz: float) -> FloatArray:

@@ -1,10 +1,11 @@
-"""Drives simulated on the spot: CommonRoad's multi-body plant, a driver, manoeuvres, surfaces and sensors."""
+"""Drives simulated on the spot: a plant, a driver, manoeuvres, surfaces and sensors."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -49,9 +50,7 @@ class SimulatedSource(Source):
     slow = True
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
-        from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
-        from vehest.simulation.manoeuvres import manoeuvre_from_config
-        from vehest.simulation.parameters import vehicle_from_configuration
+        from vehest.simulation.fleet import SensorVariation, variations_from_config
         from vehest.simulation.sensors import sensor_levels_from_config
         from vehest.simulation.surface import surface_from_config
 
@@ -64,19 +63,21 @@ class SimulatedSource(Source):
         self.vehicles = self._vehicles()
         self.drives = self._drives()
         try:
-            for vehicle in self.vehicles.values():
-                varied(vehicle_from_configuration(vehicle), variations_from_config(dataset.get("vary") or []), 0)
-            self.sensors = sensor_levels_from_config(dataset.get("sensors"))
             self.variations = variations_from_config(dataset.get("vary") or [])
+            for vehicle in self.vehicles.values():
+                _simulator_of(vehicle, self.variations, 0)
+            self.sensors = sensor_levels_from_config(dataset.get("sensors"))
             self.sensor_variation = SensorVariation.from_config(dataset.get("vary_sensors") or {})
             for drive in self.drives.values():
-                manoeuvre_from_config(drive.manoeuvre)
+                _manoeuvre_of(drive)
                 surface_from_config(drive.surface)
         except ConfigurationError as error:
             raise ConfigurationError(f"data set '{self.name}': {error}") from None
 
     def inputs(self) -> dict[str, str | Path]:
-        """The plant's library and its version; there are no files."""
+        """The multi-body plant's library and its version, where a vehicle is driven by it; there are no files."""
+        if all(_is_planar(vehicle) for vehicle in self.vehicles.values()):
+            return {}
         return {"commonroad-vehicle-models": metadata.version("commonroad-vehicle-models")}
 
     def ids(self) -> list[str]:
@@ -85,19 +86,14 @@ class SimulatedSource(Source):
 
     def read(self, recording_id: str) -> Recording:
         """Simulate one drive."""
-        from vehest.simulation.drive import simulate_drive
-        from vehest.simulation.fleet import varied
-        from vehest.simulation.manoeuvres import manoeuvre_from_config
-        from vehest.simulation.parameters import vehicle_from_configuration
         from vehest.simulation.surface import surface_from_config
 
         if recording_id not in self.drives:
             raise MissingError(f"data set '{self.name}' has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)")
         drive = self.drives[recording_id]
-        return simulate_drive(
+        return _simulator_of(drive.vehicle, self.variations, drive.seed)(
             id=recording_id,
-            vehicle=varied(vehicle_from_configuration(drive.vehicle), self.variations, drive.seed),
-            manoeuvre=manoeuvre_from_config(drive.manoeuvre),
+            manoeuvre=_manoeuvre_of(drive),
             seed=drive.seed,
             rate_hz=self.rate_hz,
             sensors=self.sensor_variation.applied(self.sensors, drive.seed),
@@ -154,6 +150,36 @@ class SimulatedSource(Source):
         if not isinstance(name, str | int) or str(name) not in self.vehicles:
             raise ConfigurationError(f"{where}: vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
         return self.vehicles[str(name)]
+
+
+def _is_planar(vehicle: Mapping[str, Any]) -> bool:
+    from vehest.simulation.planar_car import PLANAR
+
+    return vehicle.get("plant") == PLANAR
+
+
+def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int) -> Callable[..., Recording]:
+    """What simulates drives of a vehicle, varied as the seed of a drive draws it."""
+    from vehest.simulation.drive import simulate_drive
+    from vehest.simulation.fleet import varied, varied_planar
+    from vehest.simulation.parameters import vehicle_from_configuration
+    from vehest.simulation.planar_car import planar_car_from_configuration
+    from vehest.simulation.planar_drive import simulate_planar_drive
+
+    if _is_planar(vehicle):
+        return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
+    return partial(simulate_drive, vehicle=varied(vehicle_from_configuration(vehicle), variations, seed))
+
+
+def _manoeuvre_of(drive: Drive) -> Any:
+    """The manoeuvre, among those of the vehicle's plant."""
+    from vehest.simulation.manoeuvres import manoeuvre_from_config, one_of
+    from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
+
+    planar = _is_planar(drive.vehicle)
+    if planar and drive.stability_control:
+        raise ConfigurationError(f"vehicle '{drive.vehicle.get('name')}' has no stability control; leave stability_control out")
+    return one_of(drive.manoeuvre, PLANAR_MANOEUVRES) if planar else manoeuvre_from_config(drive.manoeuvre)
 
 
 def _ids_of(entry: Mapping[str, Any], where: str) -> list[str]:

@@ -1,0 +1,143 @@
+"""One simulated drive of a small car on the planar plant, as its own sensors record it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.data.recording import Recording
+from vehest.simulation.drive import Flags, Trip, as_json, whole_steps
+from vehest.simulation.driver import Observation
+from vehest.simulation.errors import SimulationError
+from vehest.simulation.freestyle import COMMAND_RATE_HZ, Freestyle
+from vehest.simulation.manoeuvre import SETTLING_TIME
+from vehest.simulation.planar_car import PlanarCar
+from vehest.simulation.planar_plant import STEER, VX, VY, YAW, YAW_RATE, PlanarPlant, X, Y
+from vehest.simulation.sensors import PRESETS, SensorLevels, described, measure
+from vehest.simulation.surface import SURFACES, Surface
+
+PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
+"""Manoeuvres of the planar plant's cars by name."""
+
+CHANNELS = (
+    "vx",
+    "yaw_rate",
+    "ax",
+    "ay",
+    "steer",
+    "motor_speed",
+    "motor_current",
+    "vx_ref",
+    "vy_ref",
+    "yaw_rate_ref",
+)
+"""What such a car records: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
+
+SPUN = np.pi / 2.0
+"""Sideslip angle beyond which a drive counts as one with a spin [rad]."""
+
+
+def simulate_planar_drive(
+    *,
+    id: str,
+    car: PlanarCar,
+    manoeuvre: Freestyle,
+    seed: int,
+    rate_hz: float = 100.0,
+    sensors: SensorLevels | None = None,
+    stability_control: bool = False,
+    surface: Surface | None = None,
+    step: float = 1e-3,
+) -> Recording:
+    """A recording of one drive; the same arguments give the same samples, bit by bit.
+
+    ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels slip. Spins are driven on from.
+
+    Args:
+        id: name of the recording.
+        car: what is driven.
+        manoeuvre: what it does.
+        seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
+        rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
+        sensors: levels of the sensors' errors; by default the preset ``small_car``.
+        stability_control: such a car has none; anything but False is refused.
+        surface: of the floor; by default dry.
+        step: of the plant [s].
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+        SimulationError: a state is not finite.
+    """
+    if seed < 0:
+        raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
+    if stability_control:
+        raise ConfigurationError(f"drive '{id}': vehicle '{car.name}' has no stability control")
+    sensors, surface = sensors or PRESETS["small_car"], surface or SURFACES["dry"]
+    try:
+        trip = drive_freely(PlanarPlant(car, step), manoeuvre, seed, rate_hz=rate_hz, surface=surface)
+    except SimulationError as error:
+        raise SimulationError(f"drive '{id}' with seed {seed}: {error}") from error
+    shown = measure(trip.motion, sensors, seed)
+    shown["vx"] = car.wheel_radius * shown["motor_speed"]
+    return Recording(
+        id=id,
+        vehicle=car.name,
+        rate_hz=rate_hz,
+        start_time=0.0,
+        channels={name: shown[name] for name in CHANNELS},
+        kind="simulated",
+        provenance=as_json(
+            {
+                "plant": "planar, four wheels",
+                "parameters": car.parameters,
+                "plant_step": step,
+                "manoeuvre": manoeuvre.description(),
+                "drawn": trip.drawn,
+                "surface": asdict(surface),
+                "stability_control": False,
+                "seed": seed,
+                "sensors": described(sensors, trip.motion),
+                "flags": asdict(trip.flags),
+            }
+        ),
+    )
+
+
+def drive_freely(plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = 100.0, surface: Surface | None = None) -> Trip:
+    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before the first sample.
+
+    Raises:
+        ConfigurationError: rate or step make no sense.
+        SimulationError: a state is not finite.
+    """
+    per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
+    per_sample = whole_steps(rate_hz, plant.step, "sampling")
+    stride = int(np.gcd(per_command, per_sample))
+    driver = manoeuvre.driver(plant.car, surface or SURFACES["dry"], seed)
+    first_sample = round(SETTLING_TIME / plant.step)
+    state, kept, acting = plant.initial_state(), [], []
+    for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):
+        if now % per_command == 0:
+            inputs = driver.inputs(now * plant.step, Observation(*state[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist()))
+        if now >= first_sample and (now - first_sample) % per_sample == 0:
+            kept.append(state)
+            acting.append(inputs)
+        state = plant.advance(state, inputs, stride)
+    motion = plant.motion(kept, acting, rate_hz)
+    moving = np.hypot(motion.vx, motion.vy) > 1.0
+    sideslip = float(np.abs(motion.sideslip[moving]).max(initial=0.0))
+    flags = Flags(
+        spun=sideslip > SPUN,
+        left_road=False,
+        stood=False,
+        completed=True,
+        gave_up_at=None,
+        largest_lateral_error=None,
+        largest_sideslip=sideslip,
+        largest_ay=float(np.abs(motion.ay).max()),
+        stability_share=None,
+    )
+    return Trip(motion, np.full(len(motion), np.nan), flags, driver.drawn)
