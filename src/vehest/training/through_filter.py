@@ -87,11 +87,11 @@ class ThroughFilterSettings:
 
     one_step: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine")  # noqa: RUF009
     one_step_batch: int = 2048
-    through: PhaseSettings = PhaseSettings(max_epochs=400, validate_every=5, schedule="cosine")  # noqa: RUF009
-    noise: PhaseSettings = PhaseSettings(max_epochs=100, validate_every=5, schedule="cosine")  # noqa: RUF009
+    through: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine")  # noqa: RUF009
+    noise: PhaseSettings = PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine")  # noqa: RUF009
     steps: int = 500
     drop_steps: int = 0
-    batch_size: int = 7
+    batch_size: int = 6
     placing: str = "random"
     curriculum: Sequence[int] = ()
     curriculum_epochs: int = 100
