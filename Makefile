@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -79,6 +79,9 @@ bench-training: $(INSTALLED) ## compiled recursions and members against the plai
 
 bench-ksnn: $(INSTALLED) ## 64 seeds of a KS-NN trained together against one after another in plain PyTorch
 	$(BIN)/python benchmarks/ksnn.py
+
+bench-ukf: $(INSTALLED) ## a training step through the unscented filter against plain PyTorch, online steps (VEHEST_DATA, if you have it; minutes)
+	$(BIN)/python benchmarks/ukf.py
 
 bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 columns against a bare pyarrow.csv.read_csv
 	$(BIN)/python benchmarks/ingest.py
