@@ -222,7 +222,7 @@ def test_recordings_too_short_or_with_gaps_are_one_clear_error() -> None:
     with pytest.raises(
         DataError, match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it"
     ):
-        _estimator("velocity_gru").fit(DATA, SequenceSettings(sequence_steps=300))
+        _estimator("velocity_gru").fit(DATA, SequenceSettings())
     with pytest.raises(DataError, match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60"):
         _estimator("velocity_gru").fit(FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60))
     with pytest.raises(ConfigurationError, match=r"sequence_steps must be more than dropped_steps \(200\), not 100"):

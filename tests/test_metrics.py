@@ -35,6 +35,13 @@ def test_accuracy_has_the_values_of_a_hand_calculation():
     assert set(figures) <= set(UNITS)
 
 
+def test_sideslip_errors_are_never_more_than_half_a_turn():
+    part = Scored(np.arange(2.0), np.ones(2), np.array([1.0, 2.0]), np.radians([179.0, -170.0]), np.radians([-178.0, 170.0]), np.zeros(2))
+    figures = accuracy([part])
+    assert figures["max_error_sideslip"] == pytest.approx(20.0)
+    assert figures["rmse_sideslip"] == pytest.approx(math.sqrt((3.0**2 + 20.0**2) / 2))
+
+
 def test_a_constant_offset_does_not_count_in_fvu_but_does_in_rmse(drive):
     part = Scored(drive.time, drive["vy_ref"] + 0.5, drive["vy_ref"], drive["sideslip_ref"], drive["sideslip_ref"], drive["ay"])
     figures = accuracy([part])

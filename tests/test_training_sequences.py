@@ -210,6 +210,18 @@ def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error() -> None:
         train_phases([phase], 0, FitContext())
 
 
+def test_bad_steps_with_good_ones_between_them_end_nothing() -> None:
+    network, calls = _network(), 0
+
+    def loss(batch):
+        nonlocal calls
+        calls += 1
+        return (network(batch[0]) - batch[1]).square().mean() * (1.0 if calls % 3 == 0 else math.nan)
+
+    (record,) = train_phases([_phase(network, loss=loss)], 0, FitContext())
+    assert record.skipped_steps == 24, "two of three in twelve epochs"
+
+
 def test_phase_without_a_finite_validation_is_an_error() -> None:
     with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
         train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())

@@ -20,10 +20,11 @@ class VelocityLstmSettings(VelocityNetworkSettings):
         inputs: measured channels that the network sees.
         outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates.
         n_states: size of the hidden state; 64 is assumed.
-        dropout: share of the hidden state that is hidden from the dense layers in training.
+        dropout: share of the hidden state that is hidden from the dense layers in training; that of the GRU is assumed.
         n_dense: neurons of the hidden dense layer; 64 is assumed.
     """
 
+    dropout: float = 0.075
     n_dense: int = 64
 
     def __post_init__(self) -> None:
@@ -37,7 +38,8 @@ class VelocityLstmNetwork(VelocityNetwork):
 
     h⁺, c⁺ = LSTM(h, c, x),  y⁺ = W₂ relu(W₁ [d(h⁺), y] + b₁) + b₂         x, y standardised, d dropout
 
-    The structure is the paper's as Węgrzynowski et al. 2024 describe it; one hidden dense layer, its rectifier and all sizes are assumed.
+    The structure is the paper's as Węgrzynowski et al. 2024 describe it; one hidden dense layer, its rectifier, dropout and all
+    sizes are assumed.
 
     Source: Bou Ghosn et al., Robust LSTM-based vehicle velocity observer for regular and near-limits applications, IEEE IV 2023.
     """

@@ -270,7 +270,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """
     vy = np.concatenate([part.vy for part in parts])
     vy_ref = np.concatenate([part.vy_ref for part in parts])
-    error = np.degrees(np.concatenate([part.sideslip - part.sideslip_ref for part in parts]))
+    error = np.degrees(np.concatenate([_turned(part.sideslip - part.sideslip_ref) for part in parts]))
     nonlinear = np.abs(np.concatenate([part.ay for part in parts])) >= NONLINEAR_AY
     variance = float(np.var(vy_ref))
     fvu = float(np.var(vy_ref - vy)) / variance if variance > 0 else float("nan")
@@ -345,3 +345,8 @@ def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
         nis, dof = (np.concatenate(columns) for columns in zip(*innovations, strict=True))
         figures["nis"] = normalised_innovation_squared(nis, dof)
     return figures
+
+
+def _turned(angle: FloatArray) -> FloatArray:
+    """The same angle within a half turn [rad]: a car that slides backwards is not a full turn off."""
+    return np.where(np.abs(angle) > np.pi, np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi, angle)

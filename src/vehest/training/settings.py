@@ -100,7 +100,7 @@ class SequenceSettings:
     """
 
     phase: PhaseSettings = PhaseSettings()
-    sequence_steps: int = 500
+    sequence_steps: int = 300
     validation_steps: int = 1000
     dropped_steps: int = 200
     batch_size: int = 4
