@@ -14,6 +14,7 @@ MARKS = {
     "done": "[green]done   [/]",
     "skip": "[dim]skipped[/]",
     "plan": "[cyan]would  [/]",
+    "once": "[cyan]once   [/]",
     "fail": "[red]failed [/]",
     "stop": "[yellow]stopped[/]",
 }

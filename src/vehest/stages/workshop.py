@@ -20,6 +20,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import kind_of
 from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
+from vehest.stages.compiling import has_to_compile
 from vehest.stages.config import Config, compose_config
 from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
@@ -159,6 +160,9 @@ class Workshop:
                 for job in group.jobs:
                     self.messages.line("plan", "train", job.plan.label, "then evaluate" if group.evaluation else "")
             raise NotThereYet
+        for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
+            if has_to_compile(name):
+                self.messages.line("once", "compile", name, "about a minute before its first training; later ones load it")
         failures: list[tuple[str, Failure]] = []
         tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
         with self.messages.bars() as bars:

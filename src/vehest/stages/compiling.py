@@ -1,0 +1,18 @@
+"""Whether a training has to wait for compilation first, so that people can be told."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+SLOW = {"learned_ukf": "vehest.estimators.kernels.tyre_network"}
+"""Estimators that compile for tens of seconds, and what of them takes longest."""
+
+
+def has_to_compile(estimator: str) -> bool:
+    """Whether an estimator's training compiles on this machine before it starts; what it leaves is loaded from then on."""
+    if estimator not in SLOW:
+        return False
+    kernel = importlib.import_module(SLOW[estimator])
+    folder = kernel._transition.stats.cache_path
+    return folder is not None and not any(Path(folder).glob(f"{kernel.__name__.rpartition('.')[2]}._transition-*.nbi"))
