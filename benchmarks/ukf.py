@@ -378,7 +378,7 @@ def tell(row: dict[str, Any]) -> None:
     )
     print(
         f"{row['ratio']:6.1f} x (at least {row['least_ratio']:.0f})  {row['case']}  ({row['baseline_seconds']:.2f} s -> "
-        f"{row['ours_seconds']:.2f} s, of the processor {row['baseline_processor_seconds']:.2f} s -> {row['ours_processor_seconds']:.2f} s; "
+        f"{row['ours_seconds']:.2f} s, processor {row['baseline_processor_seconds']:.2f} s -> {row['ours_processor_seconds']:.2f} s; "
         f"{row['baseline_mb']:.0f} MB -> {row['ours_mb']:.0f} MB; losses differ by {row['relative_difference_of_losses']:.1e}, "
         f"gradients by {row['relative_difference_of_gradients']:.1e}; target {'met' if met else 'MISSED'})",
         flush=True,
