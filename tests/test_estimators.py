@@ -8,18 +8,21 @@ import yaml
 
 from conftest import planar_drive
 from single_track_drive import linear_drive
+from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
 from vehest.training.settings import DirectSearchSettings, NoTraining, PhaseSettings, SequenceSettings, SupervisedSettings
+from vehest.training.through_filter import ThroughFilterSettings
 
 VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
 CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
     "factor_graph": {"window": 0.05},
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
+    "learned_ukf": {"width": 8},
 }
 
 
@@ -33,6 +36,10 @@ def _fitted(name, dtype="float64", **config):
     elif estimator.training_type is SequenceSettings:
         training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
         estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
+    elif estimator.training_type is ThroughFilterSettings:
+        once = PhaseSettings(learning_rate=5e-3, max_epochs=1)
+        training = ThroughFilterSettings(once, 100, once, once, steps=50, validation_steps=100, validation_drop_steps=20, dtype=dtype)
+        estimator.fit(FitData([small_car_drive(2.0)], [small_car_drive(1.5, 1)]), training)
     elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
@@ -43,6 +50,8 @@ def _fitted(name, dtype="float64", **config):
 
 
 def _drive_for(estimator):
+    if "motor_current" in estimator.channels:
+        return small_car_drive(3.0, 4).without_references()
     if "steer" in estimator.channels:
         return linear_drive(12.0, estimator.settings.rate_hz, seed=4)[0].without_references()
     return planar_drive(12.0, estimator.settings.rate_hz, seed=4, noise=0.02).without_references()

@@ -31,6 +31,7 @@ def settings(**changes) -> ThroughFilterSettings:
         "batch_size": 3,
         "validation_steps": 60,
         "validation_drop_steps": 10,
+        "mirrored": 0.0,
         "dtype": "float64",
     }
     return ThroughFilterSettings(**known | changes)
@@ -48,9 +49,9 @@ def weights_of(made: LearnedUkf) -> np.ndarray:
 
 def drives(made: LearnedUkf, steps: int = 40) -> Drive:
     """Sequences, and the filter made ready for them."""
-    parts = [made._drive(recording, torch.float64) for recording in DATA.train]
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     made.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
-    made.filter.begin_noise(parts)
+    made.filter.begin_noise(parts, 0.0)
     return sequences_of(parts, steps)
 
 
@@ -88,7 +89,7 @@ def test_random_places_are_reproducible_fit_and_keep_each_drives_share() -> None
 def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others() -> None:
     made = estimator()
     drives(made)
-    parts = [made._drive(recording, torch.float64) for recording in DATA.train]
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     for placing, same in (("fixed", True), ("random", False)):
         (phase,) = phases_of(made, parts, settings(placing=placing, start_spread=0.0))
         generator = torch.Generator().manual_seed(0)
@@ -106,13 +107,32 @@ def phases_of(made: LearnedUkf, parts: list[Drive], training: ThroughFilterSetti
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true() -> None:
     made = estimator()
     drives(made)
-    parts = [made._drive(recording, torch.float64) for recording in DATA.train]
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     (phase,) = phases_of(made, parts, settings(start_spread=0.2, placing="fixed"))
     batches = list(phase.batches(torch.Generator().manual_seed(0)))
     off = torch.cat([start - batch.states[:, 0] for batch, start in batches])
     assert (off[:, :4] == 0.0).all()
     assert 0.05 < float(off[:, 4].abs().max()) <= 0.2
     assert off[:, 4].unique().numel() == len(off)
+
+
+def test_a_share_of_sequences_is_seen_in_a_mirror() -> None:
+    made = estimator()
+    drives(made)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    signs = [torch.tensor(part, dtype=torch.float64) for part in made.filter.mirror]
+    for share, allowed in ((0.0, {False}), (1.0, {True}), (0.5, {False, True})):
+        (phase,) = phases_of(made, parts, settings(mirrored=share, start_spread=0.0, placing="fixed"))
+        known = sequences_of(parts, 40)
+        seen = set()
+        for batch, start in phase.batches(torch.Generator().manual_seed(0)):
+            for row in range(len(start)):
+                (at,) = torch.nonzero((known.states[:, 0, 0] == start[row, 0]) & (known.states[:, 0, 3] == start[row, 3]))[0]
+                turned = bool(batch.states[row, 0, 1] != known.states[at, 0, 1])
+                for own, whole, sign in zip(batch, known, signs, strict=True):
+                    assert torch.equal(own[row], whole[at] * sign if turned else whole[at])
+                seen.add(turned)
+        assert seen == allowed
 
 
 # Truncation
@@ -149,8 +169,8 @@ def test_truncated_gradients_do_not_reach_the_start() -> None:
 
 def test_noise_starts_where_the_models_residuals_say() -> None:
     made = estimator(dynamics="pacejka", noise="constant")
-    parts = [made._drive(recording, torch.float64) for recording in DATA.train]
-    made.filter.to(torch.float64).begin_noise(parts)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    made.filter.to(torch.float64).begin_noise(parts, 0.0)
     with torch.no_grad():
         model = made.filter.dynamics
         steps = torch.cat([model.transition(d.states[:-1], d.inputs[:-1], 0.01) - d.states[1:] for d in parts])
@@ -199,7 +219,7 @@ def test_through_the_filter_dynamics_and_noise_learn() -> None:
 def test_a_curriculum_trains_on_shorter_sequences_first() -> None:
     made = estimator()
     drives(made)
-    parts = [made._drive(recording, torch.float64) for recording in DATA.train]
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     phases = phases_of(made, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
     assert [phase.name for phase in phases] == ["through_filter_10", "through_filter_20", "through_filter"]
     assert [phase.settings.max_epochs for phase in phases] == [3, 3, 2]
