@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -86,6 +87,20 @@ def test_in_single_precision_it_agrees_to_a_ten_thousandth() -> None:
     assert mean.double() == pytest.approx(known, abs=1e-4)
     for name, gradient in gradients.items():
         assert float((own[name].double() - gradient).norm() / gradient.norm()) < 1e-3, name
+
+
+def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense() -> None:
+    """At 5 cm/s and sliding: squashed values have reached their ends, and what rounding leaves of their slopes must not count."""
+    car = network_car(True, False, torch.float64)
+    states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(200, 5) * torch.tensor([0.004, 1.0, 0.5, 0.3, 0.05])
+    inputs = drawn(200, 2, seed=2) * torch.tensor([0.25, 6.0])
+    slopes = []
+    for dtype in (torch.float64, torch.float32):
+        model = CompiledTyreNetwork(car.to(dtype), STEP, LOWER, dtype)
+        points, own = (part.to(dtype).reshape(20, 10, -1).contiguous().numpy() for part in (states, inputs))
+        gradients = [np.zeros(parameter.shape, points.dtype) for parameter in model.parameters]
+        slopes.append(model.observation_adjoint(points, np.ascontiguousarray(own[:, 0]), np.ones((20, 10, 4), points.dtype), gradients))
+    assert np.abs(slopes[1] - slopes[0]).max() < 1e-3 * np.abs(slopes[0]).max()
 
 
 def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:

@@ -46,7 +46,8 @@ class CompiledTyreNetwork(PointModel):
         self.parameters = tensors if self._learning else ()
         self.lower = lower
         scalar = self._arrays[0].dtype.type
-        self._constants = np.array([mass, wheelbase, radius, step, TURN, UNSCALED, STILL], scalar)
+        flat = 4.0 * np.finfo(scalar).eps
+        self._constants = np.array([mass, wheelbase, radius, step, TURN, UNSCALED, STILL, flat], scalar)
         self._scaled = dynamics.friction_scaled
 
     def transition(self, points: Array, inputs: Array) -> Array:
@@ -108,9 +109,18 @@ def _squash(rows):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _rise(above, below, flat):  # type: ignore[no-untyped-def]
+    """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
+
+    At a crawl slips change by a million per m/s, and rounding would count.
+    """
+    return above * below if min(above, below) > flat else above * 0
+
+
+@compiled
 def _motion(x, u, W1, b1, W2, b2, W3, b3, theta, constants, scaled, f, h1, h2, o, forces, out):  # type: ignore[no-untyped-def]
     """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is kept for the adjoint."""
-    mass, wheelbase, radius, _, turn, unscaled, still = constants
+    mass, wheelbase, radius, _, turn, unscaled, still, _ = constants
     lr, inertia, drag0, drag1, drag2, powertrain, torque, viscous, coulomb = theta
     lf = wheelbase - lr
     points = x.shape[1]
@@ -158,7 +168,7 @@ def _motion_adjoint(  # type: ignore[no-untyped-def]
     x, u, W1, W2, W3, theta, constants, scaled, f, h1, h2, o, forces, out, out_bar, x_bar, learning, dW1, db1, dW2, db2, dW3, db3, dtheta
 ):
     """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
-    mass, wheelbase, radius, _, turn, unscaled, still = constants
+    mass, wheelbase, radius, _, turn, unscaled, still, flat = constants
     lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta
     lf = wheelbase - lr
     points = x.shape[1]
@@ -199,7 +209,7 @@ def _motion_adjoint(  # type: ignore[no-untyped-def]
                 size = max(value, value * 0) + math.log1p(math.exp(-abs(value)))
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
-                slope[4 + k, p] = through * size * turn * (1 - direction * direction)
+                slope[4 + k, p] = through * size * turn * _rise(1 - direction, 1 + direction, flat)
                 x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
     else:
         for k in range(4):
@@ -210,11 +220,11 @@ def _motion_adjoint(  # type: ignore[no-untyped-def]
     np.dot(W3.T, o_bar, h2_bar)
     for i in range(h2.shape[0]):
         for p in range(points):
-            h2_bar[i, p] *= h2[i, p] * (1 - h2[i, p])
+            h2_bar[i, p] *= _rise(h2[i, p], 1 - h2[i, p], flat)
     np.dot(W2.T, h2_bar, h1_bar)
     for i in range(h1.shape[0]):
         for p in range(points):
-            h1_bar[i, p] *= h1[i, p] * (1 - h1[i, p])
+            h1_bar[i, p] *= _rise(h1[i, p], 1 - h1[i, p], flat)
     np.dot(W1.T, h1_bar, f_bar)
     if learning:
         _add_layer(o_bar, h2, dW3, db3)
