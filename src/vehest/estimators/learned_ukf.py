@@ -207,7 +207,7 @@ class LearnedUkf(Estimator):
             assert isinstance(member, LearnedUkf)
             if member._seed in trained:
                 twin, phases = trained[member._seed]
-                member.filter.load_state_dict(twin.filter.state_dict())
+                member.load_weights(twin.weights())
             else:
                 twins = [other for other, seed in enumerate(seeds) if other > index and seed == member._seed]
                 phases = member._train(data, training, context, index, twins)
