@@ -48,7 +48,8 @@ def estimator(seed: int = 0, **config) -> LearnedUkf:
 def trained(dtype: str = "float64") -> LearnedUkf:
     """NNTF_UH, trained for a moment; tests leave it as it is."""
     made = estimator()
-    made.fit(data(), quick(3, 150, dtype=dtype))
+    drives = FitData([small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)])
+    made.fit(drives, quick(3, 200, dtype=dtype, one_step_batch=256))
     return made
 
 
