@@ -44,6 +44,12 @@ class CarFilter(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
+    mirror: tuple[Sequence[float], Sequence[float], Sequence[float]] = (  # left for right
+        (1.0, -1.0, -1.0, 1.0, 1.0),
+        (-1.0, 1.0),
+        (1.0, -1.0, -1.0, 1.0),
+    )
+
     def __init__(
         self, dynamics: Dynamics, noise: NoiseKind, *, step: float, least: tuple[float, float], kappa: float = -2.0, repair: bool = True
     ) -> None:
@@ -119,10 +125,11 @@ class CarFilter(nn.Module):
             share=partial(over_members, pieces=1),
         )
 
-    def begin_noise(self, drives: Sequence[Drive]) -> None:
+    def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
 
-        The friction, which the true states hold as a constant, and the initial state keep the variances that they have.
+        The friction, which the true states hold as a constant, and the initial state keep the variances that they have, but for a friction
+        that may start anywhere within a spread: it has the variance of that.
         """
         with torch.no_grad():
             steps = torch.cat([self.moved(d.states[:-1], d.inputs[:-1]) - d.states[1:] for d in drives])
@@ -137,7 +144,9 @@ class CarFilter(nn.Module):
                 noise.begin(covariance, PACE, size)
             else:
                 noise.begin(covariance, PACE)  # type: ignore[operator]
-        self.initial_noise.begin(self.initial_covariance(), PACE)
+        initial = self.initial_covariance().detach().clone()
+        initial[friction, friction] = torch.clamp(initial[friction, friction], min=start_spread**2 / 3.0)
+        self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""

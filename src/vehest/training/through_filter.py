@@ -34,14 +34,20 @@ class Drive(NamedTuple):
 
 
 class Filtering(Protocol):
-    """A filter that can be trained."""
+    """A filter that can be trained.
+
+    Attributes:
+        mirror: signs of states (n,), inputs (p,) and measurements (m,) in a mirror, in which what is filtered obeys the same laws.
+    """
+
+    mirror: tuple[Sequence[float], Sequence[float], Sequence[float]]
 
     def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
         """States one sample later, (..., n)."""
         ...
 
-    def begin_noise(self, drives: Sequence[Drive]) -> None:
-        """Start noise from what the model, as it is, leaves unexplained in drives."""
+    def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
+        """Start noise from what the model, as it is, leaves unexplained in drives, and from how far off the last state may start."""
         ...
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
@@ -72,6 +78,7 @@ class ThroughFilterSettings:
         validation_steps: samples of a validation sequence.
         validation_drop_steps: first samples of it that do not count.
         start_spread: by how much the last state (friction) is off at the start of a training sequence, at most, up or down.
+        mirrored: share of sequences and pairs that are seen in a mirror, left for right.
         start_noise: ``residuals`` starts the noise from what the pre-trained model leaves unexplained and learns it in units of that;
             ``given`` from the authors' values, in SI units.
         dtype: ``float32`` or ``float64``.
@@ -80,11 +87,11 @@ class ThroughFilterSettings:
 
     one_step: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine")  # noqa: RUF009
     one_step_batch: int = 2048
-    through: PhaseSettings = PhaseSettings(max_epochs=400, validate_every=5, schedule="cosine")  # noqa: RUF009
-    noise: PhaseSettings = PhaseSettings(max_epochs=100, validate_every=5, schedule="cosine")  # noqa: RUF009
+    through: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine")  # noqa: RUF009
+    noise: PhaseSettings = PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine")  # noqa: RUF009
     steps: int = 500
     drop_steps: int = 0
-    batch_size: int = 7
+    batch_size: int = 6
     placing: str = "random"
     curriculum: Sequence[int] = ()
     curriculum_epochs: int = 100
@@ -92,6 +99,7 @@ class ThroughFilterSettings:
     validation_steps: int = 1000
     validation_drop_steps: int = 200
     start_spread: float = 0.2
+    mirrored: float = 0.5
     start_noise: str = "residuals"
     dtype: str = "float32"
     checkpoint_seconds: float = 15.0
@@ -109,6 +117,8 @@ class ThroughFilterSettings:
             raise ConfigurationError(f"training.placing '{self.placing}' is not one of: fixed, random")
         if self.dtype not in ("float32", "float64"):
             raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+        if not 0.0 <= self.mirrored <= 1.0:
+            raise ConfigurationError(f"training.mirrored must lie between 0 and 1, not at {self.mirrored}")
         if self.start_noise not in ("residuals", "given"):
             raise ConfigurationError(f"training.start_noise '{self.start_noise}' is not one of: residuals, given")
         if any(isinstance(steps, bool) or not isinstance(steps, int) or steps <= self.drop_steps for steps in self.curriculum):
@@ -143,11 +153,16 @@ def one_step_phase(
     before, inputs, after = (torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in train), strict=True))
     judged = [torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in validation), strict=True)]
 
-    def batches(generator: torch.Generator) -> Iterable[Tensor]:
-        return torch.randperm(len(before), generator=generator).split(settings.one_step_batch)
+    signs = [before.new_tensor(list(filtering.mirror[part])) for part in (0, 1)]
 
-    def loss(rows: Tensor) -> Tensor:
-        return _weighted(filtering.moved(before[rows], inputs[rows]) - after[rows], weights.one_step)
+    def batches(generator: torch.Generator) -> Iterable[tuple[Tensor, Tensor]]:
+        for rows in torch.randperm(len(before), generator=generator).split(settings.one_step_batch):
+            yield rows, _chosen(len(rows), settings.mirrored, generator)
+
+    def loss(batch: tuple[Tensor, Tensor]) -> Tensor:
+        rows, turned = batch
+        states, own = torch.where(turned, signs[0], 1.0), torch.where(turned, signs[1], 1.0)
+        return _weighted(filtering.moved(states * before[rows], own * inputs[rows]) - states * after[rows], weights.one_step)
 
     def judge() -> float:
         return float(_weighted(filtering.moved(judged[0], judged[1]) - judged[2], weights.one_step))
@@ -180,7 +195,7 @@ def filter_phases(
 
     def prepare() -> None:
         if settings.start_noise == "residuals":
-            filtering.begin_noise(train)
+            filtering.begin_noise(train, settings.start_spread)
 
     def phase(steps: int, epochs: int, label: str, first: bool) -> Phase:
         fixed = sequences_of(train, steps)
@@ -189,11 +204,18 @@ def filter_phases(
             drives = fixed if settings.placing == "fixed" else placed(train, steps, generator)
             order = torch.randperm(len(drives.states), generator=generator)
             for rows in order.split(settings.batch_size):
-                start = drives.states[rows, 0].clone()
+                turned = _chosen(len(rows), settings.mirrored, generator).unsqueeze(-1)
+                own = Drive(
+                    *(
+                        part[rows] * torch.where(turned, part.new_tensor(list(s)), 1.0)
+                        for part, s in zip(drives, filtering.mirror, strict=True)
+                    )
+                )
+                start = own.states[:, 0].clone()
                 if settings.start_spread:
                     off = 2.0 * torch.rand(len(rows), generator=generator, dtype=start.dtype) - 1.0
                     start[:, -1] = start[:, -1] + settings.start_spread * off
-                yield Drive(*(part[rows] for part in drives)), start
+                yield own, start
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
             drives, start = batch
@@ -232,6 +254,11 @@ def _stacked(starts: Sequence[tuple[Drive, int]], steps: int) -> Drive:
     if not starts:
         raise DataError(f"no drive is {steps} samples long, as a sequence for training through a filter is; lower training.steps")
     return Drive(*(torch.stack([drive[part][first : first + steps] for drive, first in starts]) for part in range(3)))
+
+
+def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
+    """Which of so many are mirrored, (count, 1)."""
+    return torch.rand(count, 1, generator=generator) < share
 
 
 def _pairs(drive: Drive) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,7 +1,8 @@
 """Sigma points through the car whose tyres are a network (`TyreNetworkCar`), compiled, with the adjoint.
 
 Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes
-stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache, and for the matrix products to stay on their thread.
+stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache, and for the matrix products to
+stay on their thread.
 """
 
 from __future__ import annotations
