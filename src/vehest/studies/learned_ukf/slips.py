@@ -13,7 +13,7 @@ from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure, paper_
 from vehest.studies.learned_ukf import paper
 
 LEAST_SPEED = 0.5  # [m/s] below which an angle of slip says little
-LIMIT = 60.0  # [deg] of the axis; what lies beyond counts in the outermost bins
+LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)
 
