@@ -201,6 +201,7 @@ class LearnedUkf(Estimator):
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Train one seed after the other; members that differ only in their use get the same weights."""
         trained: dict[int, tuple[LearnedUkf, list[PhaseRecord]]] = {}
+        seeds = [member._seed for member in members if isinstance(member, LearnedUkf)]
         records = []
         for index, member in enumerate(members):
             assert isinstance(member, LearnedUkf)
@@ -208,12 +209,15 @@ class LearnedUkf(Estimator):
                 twin, phases = trained[member._seed]
                 member.filter.load_state_dict(twin.filter.state_dict())
             else:
-                phases = member._train(data, training, context, index)
+                twins = [other for other, seed in enumerate(seeds) if other > index and seed == member._seed]
+                phases = member._train(data, training, context, index, twins)
                 trained[member._seed] = (member, phases)
             records.append(_record_of(phases, len(members)))
         return records
 
-    def _train(self, data: FitData, training: ThroughFilterSettings, context: FitContext, index: int) -> list[PhaseRecord]:
+    def _train(
+        self, data: FitData, training: ThroughFilterSettings, context: FitContext, index: int, twins: Sequence[int]
+    ) -> list[PhaseRecord]:
         dtype = getattr(torch, training.dtype)
         train, validation = ([self.drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
         self.filter = self._new_filter(repair=True).to(dtype)
@@ -238,7 +242,7 @@ class LearnedUkf(Estimator):
                 "through_filter" if learns_dynamics else "noise",
             ),
         ]
-        records = train_phases(phases, self._seed, context, index, training.checkpoint_seconds)
+        records = train_phases(phases, self._seed, context, index, training.checkpoint_seconds, twins)
         self.filter.repair = self.settings.repair
         return records
 

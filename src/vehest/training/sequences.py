@@ -79,7 +79,12 @@ class PhaseRecord:
 
 
 def train_phases(
-    phases: Sequence[Phase], seed: int, context: FitContext, folder_index: int = 0, checkpoint_seconds: float = 15.0
+    phases: Sequence[Phase],
+    seed: int,
+    context: FitContext,
+    folder_index: int = 0,
+    checkpoint_seconds: float = 15.0,
+    twins: Sequence[int] = (),
 ) -> list[PhaseRecord]:
     """Train one member through its phases by AdamW; each phase ends with the parameters of its best validation.
 
@@ -95,6 +100,7 @@ def train_phases(
         context: where the checkpoint is kept, if anywhere, whether to stop (asked before every batch), whom to tell after every epoch.
         folder_index: which of ``context.checkpoint_folders`` is this member's, where several train one after the other.
         checkpoint_seconds: time between two checkpoints [s].
+        twins: other members' folders that keep the same checkpoint, since they get the same weights.
 
     Returns:
         One record for every phase that was begun.
@@ -106,7 +112,7 @@ def train_phases(
     Source:
         Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
     """
-    run = _Run(phases, seed, context, folder_index, checkpoint_seconds)
+    run = _Run(phases, seed, context, folder_index, checkpoint_seconds, twins)
     run.resume()
     while run.position < len(phases) and not run.interrupted:
         run.train_phase()
@@ -138,12 +144,20 @@ class _Progressing:
 class _Run:
     """State of a training: phases done, the phase under way, parameters, best ones, moments, generator."""
 
-    def __init__(self, phases: Sequence[Phase], seed: int, context: FitContext, folder_index: int, checkpoint_seconds: float) -> None:
+    def __init__(
+        self,
+        phases: Sequence[Phase],
+        seed: int,
+        context: FitContext,
+        folder_index: int,
+        checkpoint_seconds: float,
+        twins: Sequence[int],
+    ) -> None:
         if len({phase.name for phase in phases}) != len(phases):
             raise ConfigurationError(f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}")
         self.phases, self.seed, self.context = phases, seed, context
         self.folder_index, self.checkpoint_seconds = folder_index, checkpoint_seconds
-        self.folder = context.checkpoint_folders[folder_index] if folder_index < len(context.checkpoint_folders) else None
+        self.folders = [context.checkpoint_folders[i] for i in (folder_index, *twins) if i < len(context.checkpoint_folders)]
         self.state = _shared_state(phases)
         self.records: list[PhaseRecord] = []
         self.interrupted = False
@@ -303,12 +317,12 @@ class _Run:
 
     def _save(self, checkpoint: Checkpoint) -> None:
         self.saved = time.monotonic()
-        if self.folder is not None:
-            save_checkpoint(self.folder, checkpoint)
+        for folder in self.folders:
+            save_checkpoint(folder, checkpoint)
 
     def resume(self) -> None:
         """Go on from the checkpoint, if there is one and it is of these phases and modules."""
-        checkpoint = load_checkpoint(self.folder) if self.folder is not None else None
+        checkpoint = load_checkpoint(self.folders[0]) if self.folders else None
         if checkpoint is None or not self._fits(checkpoint):
             return
         for record in checkpoint.values["records"]:
