@@ -126,7 +126,7 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
         data_titles=job.data_titles,
         metrics=pd.concat(tables, ignore_index=True)[list(METRIC_COLUMNS)],
         models=models,
-        references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in scored_spans(e.split)},
+        references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in (*e.split.train, *scored_spans(e.split))},
         facts=list(job.training),
     )
 

@@ -89,7 +89,7 @@ class StudyArtefacts:
         data_titles: data set -> title, for people.
         metrics: long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range.
         models: evaluated models, in the order of the pipeline file.
-        references: (data set, recording) -> Parquet file at the evaluation rate, references included.
+        references: (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split.
         facts: further lines on how it was made: training budget, versions, machine.
     """
 

@@ -161,7 +161,7 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
             name == "real"
         )
         blocks += [
-            f"### {tyre.capitalize()}, {'learnt on' if test == 'tyre_a' else 'unseen'}",
+            f"### {tyre[0].upper()}{tyre[1:]}, {'learnt on' if test == 'tyre_a' else 'unseen'}",
             tables.accuracy(
                 runs,
                 test,
@@ -182,8 +182,8 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
     blocks += _figure_4(part, name, runs, where, data)
     blocks += _figures_5_and_6(part, name, where, data)
     caption = (
-        f"What was spent: seeds, epochs and time as medians of seeds, side by side with other work on the machine that `provenance.json` "
-        f"names. {paper.NNTF_UH_LOW} is {paper.NNTF_UH} with another start and shares its training. An online step is one sample through "
+        f"What was spent: seeds, epochs and time as medians of seeds, on the machine that `provenance.json` names."
+        f" {paper.NNTF_UH_LOW} is {paper.NNTF_UH} with another start and shares its training. An online step is one sample through "
         f"`step()`. Data: {kind}."
     )
     return [*blocks, "### Budget", tables.budget(part, runs, f"budget_{name}", caption)]
@@ -195,8 +195,7 @@ def _slips(part: StudyArtefacts, name: str, where: str, data: dict[str, pd.DataF
         return []
     distance = loaded(filters[0]).settings.car.cg_to_rear_axle
     sets = {"training": part.split.train, **{f"test, {tyre}": part.split.tests[test] for test, tyre in SETS.items()}}
-    spans = {label: [span for span in own if (span.dataset, span.recording) in part.references] for label, own in sets.items()}
-    angles = {label: slips.rear_slip(recordings_of(part, own), distance) for label, own in spans.items() if own}
+    angles = {label: slips.rear_slip(recordings_of(part, own), distance) for label, own in sets.items()}
     note = f"The rear axle lies {distance:g} m behind the centre of gravity, where learning starts from."
     figure, table, drawn = slips.distribution(angles, name, where, note)
     data[f"slip_density_{name}"] = drawn
@@ -208,8 +207,8 @@ def _errors_and_consistency(name: str, runs: pd.DataFrame, kind: str) -> list[Bl
     state = f"Root mean square errors by state; in brackets what the paper reports{known}. Data: {kind}."
     consistent = (
         f"Consistency of the filters, which the paper does not report: normalised estimation errors squared over vx, vy and yaw rate "
-        f"(NEES) and normalised innovations squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of vy's errors "
-        f"within one and two of the filter's own standard deviations. Networks without covariances are left out. Data: {kind}."
+        f"(NEES) and normalised innovations squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of "
+        f"vy's errors within one and two of the filter's own standard deviations. Networks without covariances are left out. Data: {kind}."
     )
     return [
         "### Errors by state, and whether filters know them",

@@ -96,7 +96,8 @@ def drives_of(part: StudyArtefacts, estimator: LearnedUkf, test: str) -> Drive:
             f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "
             f"have it, not {part.protocol.rate_hz:g}"
         )
-    recordings = {key: read_recording(file) for key, file in part.references.items()}
+    wanted = dict.fromkeys((span.dataset, span.recording) for span in part.split.tests[test])
+    recordings = {key: read_recording(part.references[key]) for key in wanted}
     pieces = sequences(part.split.tests[test], lambda span: recordings[span.dataset, span.recording], part.protocol)
     dtype = next(estimator.filter.parameters()).dtype
     drives = [estimator.drive(recordings[piece.dataset, piece.recording].cut(piece.start, piece.stop), dtype) for piece in pieces]

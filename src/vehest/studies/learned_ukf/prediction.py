@@ -75,16 +75,17 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table,
             axes.set_xticks(range(len(MOVING)), ["$v_x$", "$v_y$", "yaw rate", "rim speed"])
             axes.set_title(SETS[test], loc="left")
             axes.grid(visible=False, axis="x")
-            axes.set_yscale("symlog", linthresh=100.0)
-            axes.set_yticks(_ticks(states["decrease"].to_numpy()))
-            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-            axes.minorticks_off()
+            if states["decrease"].min() < -100.0:
+                axes.set_yscale("symlog", linthresh=100.0)
+                axes.set_yticks(_ticks(states["decrease"].to_numpy()))
+                axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+                axes.minorticks_off()
         grid[0].set_ylabel(f"decrease of the MSE, {BEFORE} to {AFTER} [%]")
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
     caption = (
         f"By how much the mean squared error is lower with {AFTER} than with {BEFORE}, Figure 5 of the paper; negative: higher. Prediction "
-        f"of the next sample from the true state, and estimation by the filter. Bars: median of seeds, dots: seeds; the "
-        f"axis is linear to 100 % and logarithmic beyond. The paper draws differences; here they are divided by the error of {BEFORE}. "
+        f"of the next sample from the true state, and estimation by the filter. Bars: median of seeds, dots: seeds; where values go below "
+        f"−100 %, the axis is logarithmic beyond. The paper draws differences; here they are divided by the error of {BEFORE}. "
         f"Data: {data}."
     )
     rows = []
@@ -105,7 +106,7 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table,
 
 def _figure_5_in_words(states: pd.DataFrame, tests: Sequence[str]) -> str:
     sentences = [
-        "The paper: as a predictor a little better for vx, the same for vy, worse for yaw rate and rim speed; as an estimator better for all."
+        "The paper: as a predictor a little better for vx, as before for vy, worse for the others; as an estimator better for all."
     ]
     for test in tests:
         own = states[states["test_set"] == test]

@@ -9,11 +9,11 @@ import pandas as pd
 
 from vehest.data.recording import FloatArray, Recording
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure, paper_style
 from vehest.studies.learned_ukf import paper
 
 LEAST_SPEED = 0.5  # [m/s] below which an angle of slip says little
-LIMIT = 60.0  # [deg] of the axis; what lies beyond counts in the outermost bins
+LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)
 
@@ -60,7 +60,7 @@ def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: st
         axes.set_xlim(-LIMIT, LIMIT)
         axes.set_xlabel("slip angle of the rear axle [deg]")
         axes.set_ylabel("density [1/deg]")
-        axes.legend(loc="upper right")
+        legend_above(figure, axes)
     caption = (
         f"Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. Data: {data}. Samples with v_x of "
         f"{LEAST_SPEED:g} m/s and more; angles beyond {LIMIT:g}° count in the outermost bins. {note}"
