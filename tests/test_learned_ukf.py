@@ -141,7 +141,7 @@ def test_recordings_together_are_what_they_are_alone() -> None:
 def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it() -> None:
     recording = drive()
     free, given = (trained().estimate([recording], state)[0] for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5}))
-    assert abs(given["vy"][0] - 0.4) < 0.05 < abs(free["vy"][0] - 0.4)
+    assert abs(given["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
     assert given.covariance[0, 1, 1] < free.covariance[0, 1, 1]
     assert abs(given["vy"][-1] - free["vy"][-1]) < 0.02
 
