@@ -118,7 +118,7 @@ def test_online_is_batch_through_gaps_and_a_stop(config, drive):
     stepper = estimator.online()
     steps = [stepper.step({name: gappy[name][k] for name in estimator.channels}) for k in range(len(gappy))]
     for name in steps[0]:
-        assert np.abs(np.array([step[name] for step in steps]) / estimate[name] - 1.0).max() < 1e-9
+        assert np.allclose([step[name] for step in steps], estimate[name], rtol=1e-9, atol=1e-9)
 
 
 def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncertainty(drive):
