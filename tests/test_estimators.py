@@ -209,9 +209,10 @@ def test_window_network_has_no_state_to_start_from(drive):
 
 
 def test_registry_knows_names_and_modules():
-    assert set(estimator_names()) >= {"luenberger", "ksnn", "gru", "lstm", "kalman", "factor_graph"}
+    assert set(estimator_names()) >= {"luenberger", "ksnn", "gru", "lstm", "kalman", "factor_graph", "learned_ukf", "rational_ekf"}
     assert estimator_module("ksnn") == "vehest.estimators.ksnn"
-    with pytest.raises(ConfigurationError, match="is not one of: factor_graph, gru, kalman, ksnn, lstm, luenberger"):
+    names = "factor_graph, gru, kalman, ksnn, learned_ukf, lstm, luenberger, rational_ekf, velocity_gru, velocity_lstm"
+    with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):
         estimator_class("kalman_filter_from_the_future")
     with pytest.raises(ConfigurationError, match="'windowed' is not one of"):
         estimator_class("windowed")
