@@ -21,10 +21,15 @@ QUANTITIES: dict[str, str] = {
     "yaw_rate": "rad/s",
     "friction": "1",
     "rim_speed": "m/s",
+    "cornering_stiffness_front": "N/rad",
+    "cornering_stiffness_rear": "N/rad",
+    "tyre_c1_front": "rad²",
+    "tyre_c1_rear": "rad²",
     "nis": "1",
     "nis_dof": "1",
 }
-"""What an estimate may hold, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; ``nis`` the normalised
+"""What an estimate may hold, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
+axle's force per slip angle where there is none, ``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
 innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class SingleTrackEstimator(Estimator):
 
     channels = ("yaw_rate", "vx", "ay", "steer")
     skippable = ("yaw_rate", "ay")
-    training_type = NoTraining
+    training_type: ClassVar[type] = NoTraining
     settings: SingleTrackSettings
 
     def seed(self, seed: int) -> None:

@@ -15,7 +15,12 @@ from typing import Literal
 from vehest.stages.artefacts import library_versions
 from vehest.stages.config_files import packaged_conf, packaged_pipelines
 
-EXTRAS = {"ros": ("rosbags", "ROS 2 bags"), "mdf": ("asammdf", "MDF files"), "factor-graph": ("gtsam", "factor graphs")}
+EXTRAS = {
+    "ros": ("rosbags", "ROS 2 bags"),
+    "mdf": ("asammdf", "MDF files"),
+    "factor-graph": ("gtsam", "factor graphs"),
+    "tuning": ("optuna", "noise levels tuned by Optuna"),
+}
 """Extra -> the package it brings, and what needs it."""
 
 

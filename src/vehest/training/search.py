@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
+from vehest.data.errors import MissingError
 from vehest.data.recording import FloatArray
 from vehest.training.context import FitContext, Progress
 from vehest.training.settings import DirectSearchSettings
@@ -93,3 +94,43 @@ def _simplex(start: FloatArray, box: Sequence[tuple[float, float]]) -> FloatArra
         step = FIRST_STEP * (high - low)
         vertices[k + 1, k] += step if start[k] + step <= high else -step
     return vertices
+
+
+def optuna_search(
+    cost: Callable[[FloatArray], float], box: Sequence[tuple[float, float]], trials: int, seed: int, context: FitContext
+) -> SearchRecord:
+    """Minimise a cost inside a box by Optuna's tree-structured Parzen estimator.
+
+    Args:
+        cost: function of the parameters, shape (K,).
+        box: admissible range of each parameter.
+        trials: evaluations.
+        seed: of the random numbers that are drawn.
+        context: progress and the wish to stop.
+
+    Raises:
+        MissingError: Optuna is not installed.
+
+    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019.
+    """
+    try:
+        import optuna
+    except ImportError:
+        raise MissingError(
+            "training.method=optuna needs Optuna: pip install 'vehest[tuning]', or set training.method=nelder_mead"
+        ) from None
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
+    distributions = {str(k): optuna.distributions.FloatDistribution(low, high) for k, (low, high) in enumerate(box)}
+    rows: list[FloatArray] = []
+    for number in range(trials):
+        if context.should_stop() and rows:
+            break
+        trial = study.ask(distributions)
+        values = np.array([trial.params[name] for name in distributions])
+        rows.append(np.concatenate([values, values, [cost(values)]]))
+        study.tell(trial, float(rows[-1][-1]))
+        context.on_progress(Progress(number + 1, trials, 1, 1, float(min(row[-1] for row in rows))))
+    table = np.array(rows)
+    best = table[np.argmin(table[:, -1])]
+    return SearchRecord(best[: len(box)], float(best[-1]), table, len(rows), len(rows) < trials)

@@ -1,0 +1,563 @@
+"""Extended Kalman filter with a tyre model that adapts: Di Biase, Lenzo & Timpone, IEEE Access 8, 2020."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import FloatArray, Recording
+from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
+from vehest.estimators.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, checked_sample, require_positive
+from vehest.estimators.tyre_fit import fit_tyres
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.noise_levels import high_passed_level
+from vehest.filters.nonlinear import NonlinearModel, unscented_filter
+from vehest.filters.sigma_points import cubature_rule
+from vehest.training.context import FitContext
+from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.settings import NoiseTuningSettings
+from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
+
+LEVELS = ("yaw_rate", "ay", "steer", "tyres")
+CURVES = TYRE_PARAMETERS[:4]
+ASSUMED = {"steer": 0.02, "tyres": 0.003}  # rad √s, 1/√s: where nothing is tuned
+CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
+ROLLING = (0.05, 0.2, 1.0, 2.0)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
+LARGEST = (1.5, 5.0, 20.0, 100.0)  # the same units: what estimates are kept within
+FRICTION_START = 0.1  # standard deviation of its logarithm
+BOXES = {"ay": (0.5, 4.0), "steer": (-2.0, 2.0), "tyres": (-4.0, -1.0)}  # powers of ten: ay and steer over yaw_rate, tyres as it is
+STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
+FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
+BAD = 1e6  # rad², instead of a cost that is not finite
+
+Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
+KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "linear": ("lint", "LINT", ("c2_front", "c2_rear")),
+    "rational": ("ratt", "RATT", ()),
+    "rational_adaptive": ("ratte", "RATTE", CURVES),
+    "rational_friction": ("ratmu", "RATT with friction", ("friction",)),
+}
+"""Tyres -> variant, its name in the paper, tyre parameters that are states."""
+
+
+@dataclass(frozen=True)
+class TrackNoise:
+    """Standard deviations, those of the three sensors all or none; where they are not given, the fit finds them.
+
+    Args:
+        yaw_rate: of the gyroscope [rad/s].
+        ay: of the accelerometer, and of what the model misses [m/s²].
+        steer: of the steering angle, over a second's step [rad √s].
+        tyres: by which logarithms of tyre parameters wander [1/√s]. Training drives on one set of tyres and one road say little of it.
+    """
+
+    yaw_rate: float | None = None
+    ay: float | None = None
+    steer: float | None = None
+    tyres: float | None = None
+
+    def __post_init__(self) -> None:
+        require_positive("estimator.noise", asdict(self))
+
+
+@dataclass(frozen=True)
+class AxleCurves:
+    """Axle curves at friction 1, all that the tyres need or none; where they are not given, the fit finds them.
+
+    Args:
+        c1_front: where the front axle's curve bends [rad²]; not of linear tyres.
+        c2_front: cornering stiffness of the front axle [N/rad].
+        c1_rear: of the rear axle.
+        c2_rear: of the rear axle.
+        deviation: standard deviation of their logarithms at the start.
+    """
+
+    c1_front: float | None = None
+    c2_front: float | None = None
+    c1_rear: float | None = None
+    c2_rear: float | None = None
+    deviation: float = 0.1
+
+    def __post_init__(self) -> None:
+        require_positive("estimator.curves", asdict(self))
+
+
+@dataclass(frozen=True)
+class RationalSettings(SingleTrackSettings):
+    """Settings of the filter.
+
+    Args:
+        tyres: ``linear`` (LINT: cornering stiffnesses are states), ``rational`` (RATT: fixed), ``rational_adaptive`` (RATTE: c₁ and c₂ of
+            both axles are states) or ``rational_friction`` (beyond the paper: the friction is).
+        filter: ``extended`` or ``unscented``.
+        bound: factor by which tyre parameters may leave those that the filter started with.
+        noise: levels of noise.
+        curves: axle curves.
+    """
+
+    rate_hz: float = 20.0
+    tyres: Tyres = "rational_adaptive"
+    filter: Literal["extended", "unscented"] = "extended"
+    bound: float = 3.0
+    noise: TrackNoise = TrackNoise()
+    curves: AxleCurves = AxleCurves()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.tyres not in KINDS:
+            raise ConfigurationError(f"estimator.tyres '{self.tyres}' is not one of: {', '.join(KINDS)}")
+        if self.filter not in ("extended", "unscented"):
+            raise ConfigurationError(f"estimator.filter '{self.filter}' is not one of: extended, unscented")
+        if not self.bound > 1.0:
+            raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
+        for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
+            given = [name for name in names if getattr(getattr(self, group), name) is not None]
+            if given and len(given) < len(names):
+                raise ConfigurationError(f"estimator.{group}: give all of {', '.join(names)}, or none of them")
+
+    @property
+    def adapted(self) -> tuple[str, ...]:
+        """Tyre parameters that are states."""
+        return KINDS[self.tyres][2]
+
+    @property
+    def level_names(self) -> tuple[str, ...]:
+        """Levels of noise that these tyres need."""
+        return LEVELS if self.adapted else LEVELS[:3]
+
+    @property
+    def curve_names(self) -> tuple[str, ...]:
+        """Parameters that these tyres' curves have."""
+        return tuple(name for name in CURVES if self.tyres != "linear" or name.startswith("c2"))
+
+
+class FilteredDrive(NamedTuple):
+    """What the filter knows after T samples.
+
+    Attributes:
+        mean: states in the order of `TyreTrack`, (T, n).
+        deviation: their standard deviations, (T, n).
+        sideslip_covariance: of sideslip angle and yaw rate, (T, 2, 2).
+        innovation: of yaw rate and lateral acceleration, 0 where nothing was measured, (T, 2).
+        innovation_covariance: that of the identity where nothing was measured, (T, 2, 2).
+        measured: bool, (T, 2).
+        last: state after the last sample.
+    """
+
+    mean: FloatArray
+    deviation: FloatArray
+    sideslip_covariance: FloatArray
+    innovation: FloatArray
+    innovation_covariance: FloatArray
+    measured: NDArray[np.bool_]
+    last: Gaussian[FloatArray]
+
+    def nis(self) -> tuple[FloatArray, FloatArray]:
+        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured; (T,) each."""
+        (first, both), (_, second) = np.moveaxis(self.innovation_covariance, 0, 2)
+        one, other = self.innovation.T
+        nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (first * second - both**2)
+        return nis, np.sum(self.measured, axis=1, dtype=np.float64)
+
+
+class RationalFilter(SingleTrackEstimator):
+    """Filter of sideslip angle, yaw rate, their rates and, if wanted, tyre parameters, over `TyreTrack`.
+
+    Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process noise Δt B Λ Bᵀ comes from the steering
+    angle and the wandering parameters. Below the minimum speed wheels roll without slip, and tyre parameters are held.
+
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60; friction as a state and the unscented filter are beyond it.
+    """
+
+    name = "rational_ekf"
+    title = "EKF with tyres"
+    settings_type = RationalSettings
+    training_type = NoiseTuningSettings
+    settings: RationalSettings
+
+    def __init__(self, settings: RationalSettings) -> None:
+        super().__init__(settings)
+        curves = {name: getattr(settings.curves, name) for name in settings.curve_names}
+        self.curves = np.array([_number(curves.get(name, math.inf)) for name in CURVES])
+        self.curve_covariance = settings.curves.deviation**2 * np.eye(len(CURVES))
+        self.levels = {name: _number(getattr(settings.noise, name) if name in settings.level_names else 0.0) for name in LEVELS}
+        self._seed = 0
+
+    @property
+    def variant(self) -> str:
+        """The paper's name for these tyres, and whether the filter is another one."""
+        return KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")
+
+    @property
+    def full_title(self) -> str:
+        """The paper's name for these tyres, and the filter."""
+        return f"{KINDS[self.settings.tyres][1]}, {'unscented' if self.settings.filter == 'unscented' else 'extended'} Kalman filter"
+
+    @property
+    def learns(self) -> bool:
+        """Whether curves or levels are not given."""
+        return not (self._curves_given and self._levels_given)
+
+    @property
+    def n_parameters(self) -> int:
+        """Parameters of curves and levels of noise that are not given."""
+        settings = self.settings
+        unknown = [name for name in settings.level_names if getattr(settings.noise, name) is None]
+        return len(settings.curve_names) * (not self._curves_given) + len(unknown)
+
+    @property
+    def _curves_given(self) -> bool:
+        return self.settings.curves.c2_front is not None
+
+    @property
+    def _levels_given(self) -> bool:
+        return all(getattr(self.settings.noise, name) is not None for name in self.settings.level_names)
+
+    @property
+    def _searched(self) -> tuple[str, ...]:
+        """Levels that are tuned: the sensors' as ratios to the first, whose size follows from the innovations."""
+        return tuple(name for name in self.settings.level_names[1:] if getattr(self.settings.noise, name) is None)
+
+    def seed(self, seed: int) -> None:
+        """Seed of Optuna's trials; nothing else is random."""
+        self._seed = seed
+
+    def track(self) -> TyreTrack:
+        """The model in torch, at the curves that the filter starts with."""
+        self._require_fitted()
+        adapted = tuple(TYRE_PARAMETERS.index(name) for name in self.settings.adapted)
+        return TyreTrack(self.settings.car, (*self.curves.tolist(), 1.0), adapted, 1.0 / self.settings.rate_hz)  # type: ignore[arg-type]
+
+    @classmethod
+    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+        """Fit axle curves to the reference sideslip of the training recordings, then find the noise levels; see `NoiseTuningSettings`.
+
+        Members of one seed cannot differ, others only by Optuna's trials.
+        """
+        return [member._fit_one(data, training, context) for member in members if isinstance(member, RationalFilter)]
+
+    def _fit_one(self, data: FitData, training: NoiseTuningSettings, context: FitContext) -> FitRecord:
+        started = time.monotonic()
+        metrics: dict[str, float] = {"epochs": 0}
+        history: dict[str, list[float]] = {}
+        interrupted = False
+        if not self._curves_given:
+            metrics |= self._fit_curves(data.train)
+        if training.method == "data":
+            self.levels = self._levels_of(data.train)
+        elif self._searched:
+            search = self._tune(data.train, training, context)
+            n = len(self._searched)
+            columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
+            history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+            metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
+            self.levels = self._calibrated(search.best[:n], [_samples(r) for r in data.train])
+            interrupted = search.interrupted
+        if data.validation and all(_has_reference(recording) for recording in data.validation):
+            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
+        metrics |= {f"noise_{name}": self.levels[name] for name in self.settings.level_names}
+        metrics["train_seconds"] = time.monotonic() - started
+        return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
+
+    def _fit_curves(self, recordings: Sequence[Recording]) -> dict[str, float]:
+        """Set curves and the covariance of their logarithms; returns them with half the width of their 95 % intervals."""
+        linear = self.settings.tyres == "linear"
+        kind: Literal["linear", "rational"] = "linear" if linear else "rational"
+        fit = fit_tyres(recordings, self.settings.car, kind, minimum_speed=self.settings.minimum_speed)
+        rows = [1, 3] if linear else [0, 1, 2, 3]
+        self.curves[rows] = [*fit.front, *fit.rear]
+        self.curve_covariance = np.zeros((len(CURVES), len(CURVES)))
+        for axle, (values, covariance) in enumerate(zip((fit.front, fit.rear), fit.covariance, strict=True)):
+            own = rows[axle * len(values) : (axle + 1) * len(values)]
+            self.curve_covariance[np.ix_(own, own)] = covariance / np.outer(values, values)
+        found = {CURVES[row]: float(self.curves[row]) for row in rows}
+        intervals = dict(zip((f"{CURVES[row]}_interval" for row in rows), fit.interval.ravel().tolist(), strict=True))
+        rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
+        return {**found, **intervals, **rms}
+
+    def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
+        unknown = [name for name in self.settings.level_names if getattr(self.settings.noise, name) is None]
+        levels = {**self.levels, **{name: value for name, value in ASSUMED.items() if name in unknown}}
+        for name in ("yaw_rate", "ay"):
+            if name not in unknown:
+                continue
+            try:
+                levels[name] = high_passed_level([recording[name] for recording in recordings], CUTOFF)
+            except ValueError as error:
+                raise DataError(f"channel '{name}' of the training recordings: {error}; give estimator.noise") from None
+            if not levels[name] > 0.0:
+                raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
+        return levels
+
+    def _tune(self, recordings: Sequence[Recording], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
+        """Levels with the smallest error of sideslip, as powers of ten."""
+        pairs = [_samples(recording) for recording in recordings]
+        wanted = [_reference(recording) for recording in recordings]
+        skip = round(training.skip_seconds * self.settings.rate_hz)
+
+        def cost(powers: FloatArray) -> float:
+            levels = self._calibrated(powers, pairs)
+            return self._cost(pairs, wanted, levels, skip)
+
+        boxes = [BOXES[name] for name in self._searched]
+        if training.method == "optuna":
+            return optuna_search(cost, boxes, training.trials, self._seed, context)
+        return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in self._searched], training.search, context)
+
+    def _calibrated(self, powers: FloatArray, pairs: Sequence[FloatArray]) -> dict[str, float]:
+        """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
+        found = dict(zip(self._searched, (10.0**powers).tolist(), strict=True))
+        tyres = found.get("tyres", self.settings.noise.tyres or 0.0)
+        if "ay" not in found:
+            return {**self.levels, "tyres": tyres}
+
+        def scaled(scale: float) -> dict[str, float]:
+            return {"yaw_rate": scale, "ay": scale * found["ay"], "steer": scale * found["steer"], "tyres": tyres}
+
+        scale = FIRST_SCALE
+        for _ in range(CALIBRATIONS):
+            levels, total, count = scaled(scale), 0.0, 0.0
+            for samples in pairs:
+                nis, n_measured = self.filter_samples(samples, levels=levels).nis()
+                total, count = total + float(nis.sum()), count + float(n_measured.sum())
+            if not (math.isfinite(total) and total > 0.0):
+                break
+            scale *= math.sqrt(total / max(count, 1.0))
+        return scaled(scale)
+
+    def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float) -> float:
+        pairs, wanted = [_samples(r) for r in recordings], [_reference(r) for r in recordings]
+        return self._cost(pairs, wanted, self.levels, round(skip_seconds * self.settings.rate_hz))
+
+    def _cost(self, pairs: Sequence[FloatArray], wanted: Sequence[FloatArray], levels: Mapping[str, float], skip: int) -> float:
+        """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
+        total, count = 0.0, 0
+        for samples, reference in zip(pairs, wanted, strict=True):
+            error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
+            counted = (samples[skip:, 1] >= self.settings.minimum_speed) & np.isfinite(reference[skip:])
+            total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
+        value = total / max(count, 1)
+        return value if math.isfinite(value) else BAD
+
+    def start(self, sample: FloatArray, initial_state: Mapping[str, float] | None = None) -> Gaussian[FloatArray]:
+        """State before the first sample: at rest on its course, or what a protocol hands over; parameters as they were fitted."""
+        given = dict(initial_state or {})
+        adapted = self.settings.adapted
+        mean = np.zeros(len(MOTION) + len(adapted))
+        covariance = np.zeros((len(mean), len(mean)))
+        covariance[range(4), range(4)] = np.square(ROLLING)
+        if "vy" in given:
+            mean[0], covariance[0, 0] = math.atan2(given["vy"], max(sample[1], self.settings.minimum_speed)), KNOWN**2
+        if "yaw_rate" in given:
+            mean[1], covariance[1, 1] = given["yaw_rate"], KNOWN**2
+        if adapted == ("friction",):
+            covariance[4, 4] = FRICTION_START**2
+        elif adapted:
+            rows = [CURVES.index(name) for name in adapted]
+            covariance[4:, 4:] = self.curve_covariance[np.ix_(rows, rows)]
+        return Gaussian(mean, covariance)
+
+    def bounds(self) -> FloatArray:
+        """Largest absolute value of each state, (n,)."""
+        return np.array([*LARGEST, *[math.log(self.settings.bound)] * len(self.settings.adapted)])
+
+    def filter_samples(
+        self, samples: FloatArray, first: Gaussian[FloatArray] | None = None, levels: Mapping[str, float] | None = None
+    ) -> FilteredDrive:
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
+
+        Raises:
+            ConfigurationError: curves or levels are neither given nor fitted.
+        """
+        levels = self.levels if levels is None else levels
+        self._require_fitted(levels)
+        first = self.start(samples[0]) if first is None else first
+        if self.settings.filter == "unscented":
+            return self._unscented(samples, first, levels)
+        from vehest.estimators.kernels.rational_ekf import scan
+
+        car, adapted, bound = self.settings.car, self.settings.adapted, self.bounds()
+        mean, covariance = first.mean.copy(), first.covariance.copy()
+        out = _empty(len(samples), len(mean))
+        scan(
+            np.ascontiguousarray(samples),
+            np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle]),
+            np.array([*self.curves, 1.0]),
+            np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
+            np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted)]),
+            -bound,
+            bound,
+            np.square(ROLLING),
+            1.0 / self.settings.rate_hz,
+            self.settings.minimum_speed,
+            mean,
+            covariance,
+            *out,
+        )
+        return FilteredDrive(*out, Gaussian(mean, covariance))
+
+    def nonlinear_model(self, levels: Mapping[str, float] | None = None) -> NonlinearModel:
+        """The same for the filters of `vehest.filters.nonlinear`; inputs are speed and steering angle."""
+        levels = self.levels if levels is None else levels
+        track, bound = self.track(), torch.as_tensor(self.bounds())
+        tyres = torch.full((len(self.settings.adapted),), levels["tyres"], dtype=torch.float64)
+        noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
+        return NonlinearModel(
+            track.transition,
+            track.observation,
+            lambda states, inputs: track.process_noise(states, inputs, levels["steer"], tyres),
+            lambda states, inputs: noise.expand(*states.shape[:-1], 2, 2),
+            lambda states: torch.maximum(torch.minimum(states, bound), -bound),
+        )
+
+    def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredDrive:
+        """Stretch by stretch: where the car moves the filter, where it hardly does the rolling car."""
+        model, slow = self.nonlinear_model(levels), samples[:, 1] < self.settings.minimum_speed
+        n, state, at = len(first.mean), first, 0
+        out = _empty(len(samples), n)
+        rule = cubature_rule(n)
+        while at < len(samples):
+            if slow[at]:
+                state = self._rolled(samples[at], state)
+                nothing = (np.zeros((1, 2)), np.eye(2)[None], np.zeros((1, 2), np.bool_))
+                _write(out, slice(at, at + 1), state.mean[None], state.covariance[None], *nothing)
+                at += 1
+                continue
+            end = at + int(np.argmax(slow[at:])) if slow[at:].any() else len(samples)
+            before = 1 if at else 0  # one more sample, whose measurements the state holds already
+            rows = samples[at - before : end].copy()
+            rows[:before, [0, 2]] = np.nan
+            inputs = torch.as_tensor(np.stack([np.maximum(rows[:, 1], self.settings.minimum_speed), rows[:, 3]], 1))
+            initial = Gaussian(torch.as_tensor(state.mean), torch.as_tensor(state.covariance))
+            with torch.no_grad():
+                steps = unscented_filter(model, torch.as_tensor(rows[:, [0, 2]]), inputs, initial, rule).steps
+            parts = (*steps.filtered, steps.innovation, steps.innovation_covariance, torch.as_tensor(steps.measured))
+            _write(out, slice(at, end), *(part.numpy()[before:] for part in parts))
+            state = Gaussian(steps.filtered.mean[-1].numpy(), steps.filtered.covariance[-1].numpy())
+            at = end
+        return FilteredDrive(*out, state)
+
+    def _rolled(self, sample: FloatArray, state: Gaussian[FloatArray]) -> Gaussian[FloatArray]:
+        car = self.settings.car
+        turn = sample[3] / (car.cg_to_front_axle + car.cg_to_rear_axle)
+        mean, covariance = state.mean.copy(), state.covariance.copy()
+        mean[:4] = [car.cg_to_rear_axle * turn, sample[1] * turn, 0.0, 0.0]
+        covariance[:4], covariance[:, :4] = 0.0, 0.0
+        covariance[range(4), range(4)] = np.square(ROLLING)
+        return Gaussian(mean, covariance)
+
+    def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
+        """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""
+        values = dict(zip(TYRE_PARAMETERS, np.repeat([*self.curves, 1.0], len(states)).reshape(5, -1), strict=True))
+        for column, name in enumerate(self.settings.adapted, len(MOTION)):
+            values[name] = values[name] * np.exp(states[:, column])
+        return values
+
+    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+        samples = _samples(recording)
+        filtered = self.filter_samples(samples, self.start(samples[0], initial_state))
+        nis, n_measured = filtered.nis()
+        others = {**self._quantities(filtered.mean), "nis": nis, "nis_dof": n_measured}
+        return self.wrapped_state(recording, filtered.mean[:, :2], filtered.sideslip_covariance, **others)
+
+    def _quantities(self, states: FloatArray) -> dict[str, FloatArray]:
+        """What an estimate says of the tyres."""
+        tyres = self.parameters_of(states)
+        found = {f"cornering_stiffness_{axle}": tyres[f"c2_{axle}"] * tyres["friction"] for axle in ("front", "rear")}
+        if self.settings.tyres != "linear":
+            found |= {f"tyre_c1_{axle}": tyres[f"c1_{axle}"] for axle in ("front", "rear")}
+        if self.settings.tyres == "rational_friction":
+            found["friction"] = tyres["friction"]
+        return found
+
+    def _require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
+        if np.isnan(self.curves).any() or any(math.isnan(level) for level in (levels or {}).values()):
+            raise ConfigurationError(
+                f"estimator '{self.name}' has no {'axle curves' if np.isnan(self.curves).any() else 'noise levels'} yet; "
+                "fit or load it first, or give estimator.curves and estimator.noise"
+            )
+
+    def online(self) -> RationalStepper:
+        """A stepper that starts as an estimate does."""
+        self._require_fitted(self.levels)
+        return RationalStepper(self)
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Curves c₁ and c₂ of the front, then of the rear axle, the covariance of their logarithms, and the levels of noise."""
+        levels = np.array([self.levels[name] for name in LEVELS])
+        return {"curves": self.curves.copy(), "curve_covariance": self.curve_covariance.copy(), "levels": levels}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take curves and levels back."""
+        shapes = {name: values.shape for name, values in self.weights().items()}
+        if {name: values.shape for name, values in weights.items()} != shapes:
+            raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)}, not {', '.join(weights)}")
+        self.curves = np.array(weights["curves"], dtype=np.float64)
+        self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)
+        self.levels = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
+
+
+class RationalStepper(Stepper):
+    """The filter, one sample at a time."""
+
+    def __init__(self, estimator: RationalFilter) -> None:
+        self._estimator = estimator
+        self._last: FloatArray | None = None
+        self._state: Gaussian[FloatArray] | None = None
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Lateral velocity [m/s], yaw rate [rad/s] and tyre parameters at the time of the sample; NaN in yaw_rate or ay is skipped."""
+        estimator = self._estimator
+        row = checked_sample(sample, estimator.channels, estimator.skippable)
+        if self._last is None or self._state is None:
+            rows, state = row[None], estimator.start(row)
+        else:  # the last sample's measurements are part of the state already
+            rows, state = np.stack([self._last, row]), self._state
+            rows[0, [0, 2]] = np.nan
+        filtered = estimator.filter_samples(rows, state)
+        self._last, self._state = row, filtered.last
+        tyres = {name: float(values[-1]) for name, values in estimator._quantities(filtered.mean[-1:]).items()}
+        return {"vy": float(row[1] * math.tan(filtered.mean[-1, 0])), "yaw_rate": float(filtered.mean[-1, 1]), **tyres}
+
+
+def _samples(recording: Recording) -> FloatArray:
+    return recording.stack(SingleTrackEstimator.channels)
+
+
+def _has_reference(recording: Recording) -> bool:
+    return "sideslip_ref" in recording or "vy_ref" in recording
+
+
+def _reference(recording: Recording) -> FloatArray:
+    """Reference sideslip [rad], (T,)."""
+    if not _has_reference(recording):
+        raise DataError(f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data")
+    return recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], recording["vx"])
+
+
+def _empty(steps: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Room for everything in a `FilteredDrive` but the last state."""
+    pairs = (np.empty((steps, 2, 2)), np.empty((steps, 2)), np.empty((steps, 2, 2)))
+    return (np.empty((steps, n)), np.empty((steps, n)), *pairs, np.empty((steps, 2), np.bool_))
+
+
+def _write(out: Sequence[Any], at: slice, mean: Any, covariance: Any, innovation: Any, innovation_covariance: Any, measured: Any) -> None:
+    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    for target, values in zip(out, (mean, deviation, covariance[:, :2, :2], innovation, innovation_covariance, measured), strict=True):
+        target[at] = values
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+ESTIMATOR = RationalFilter

@@ -1,0 +1,45 @@
+"""Axle curves of a single track: lateral force over slip angle, linear or rational, with their derivatives.
+
+    F = c₂ μ α c₁(μ + 1)/(α² + c₁(μ + 1)) = c₂ μ α/(1 + q),   q = α²/(c₁(μ + 1))
+
+At friction μ = 1: cornering stiffness c₂ [N/rad], largest force c₂ √(2c₁)/2 at the slip angle √(2c₁), none as the slip grows without end.
+With c₁ = ∞ the tyre is linear, F = c₂ μ α. The axle carries its load at rest. Source: Di Biase, Lenzo & Timpone 2020, Eqs. 3 and 4.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+
+class AxleForce(NamedTuple):
+    """Lateral force of an axle and what it changes by.
+
+    Attributes:
+        force: positive to the left [N].
+        per_slip: ∂F/∂α [N/rad]; ∂F/∂α = c₂ μ (1 - q)/(1 + q)², negative beyond the peak.
+        per_log_c1: ∂F/∂ln c₁ [N].
+        per_log_c2: ∂F/∂ln c₂ [N].
+        per_log_friction: ∂F/∂ln μ [N].
+    """
+
+    force: Any
+    per_slip: Any
+    per_log_c1: Any
+    per_log_c2: Any
+    per_log_friction: Any
+
+
+def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:
+    """Force and derivatives; tensors, arrays or numbers that broadcast, and compiled code.
+
+    Args:
+        slip: slip angle α of the axle, positive where it makes a force to the left [rad].
+        c1: where the curve bends [rad²]; infinite: nowhere.
+        c2: cornering stiffness at friction 1 [N/rad].
+        friction: between tyre and road, μ [1].
+    """
+    bend = slip * slip / (c1 * (friction + 1.0))
+    share = 1.0 / (1.0 + bend)
+    force = c2 * friction * slip * share
+    bent = force * bend * share
+    return AxleForce(force, c2 * friction * (1.0 - bend) * share * share, bent, force, force + bent * friction / (friction + 1.0))

@@ -1,0 +1,94 @@
+"""The single track of tyres that adapt: state, motion and measurements of the filters of Di Biase, Lenzo & Timpone 2020, in torch.
+
+State (β, r, β', r', θ…): sideslip angle [rad], yaw rate [rad/s], their rates, and logarithms of tyre parameters over nominal ones.
+Inputs (u, δ): forward speed [m/s] and road-wheel angle [rad]. In steps of Δt (Eqs. 22 to 25, 47, 48), forward Euler:
+
+    β⁺ = β + Δt β',   r⁺ = r + Δt r',   θ⁺ = θ
+    β'⁺ = (F_F + F_R)/(M u) - r,   r'⁺ = (a_F F_F - a_R F_R)/J
+    α_F = δ - β - a_F r/u,   α_R = -β + a_R r/u
+    measured: r and a_y = u (β' + r)
+
+Logarithms keep parameters positive and put them all on one scale; the paper has the parameters themselves as states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.rational_tyres import AxleForce, rational_axle
+
+MOTION = ("sideslip", "yaw_rate", "sideslip_rate", "yaw_acceleration")
+TYRE_PARAMETERS = ("c1_front", "c2_front", "c1_rear", "c2_rear", "friction")
+
+
+@dataclass(frozen=True)
+class TyreTrack:
+    """A single track whose tyre parameters may be part of its state.
+
+    Args:
+        car: mass, inertia and the places of the axles; its cornering stiffnesses are not used.
+        nominal: c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of `TYRE_PARAMETERS`.
+        adapted: which of them are states, as indices.
+        step: Δt [s].
+    """
+
+    car: SingleTrackParameters
+    nominal: tuple[float, float, float, float, float]
+    adapted: Sequence[int]
+    step: float
+
+    def parameters(self, states: Tensor) -> list[Tensor]:
+        """Tyre parameters in the order of `TYRE_PARAMETERS`, of states (..., n): five of shape (...)."""
+        values = [states.new_full(states.shape[:-1], value) for value in self.nominal]
+        for column, index in enumerate(self.adapted, len(MOTION)):
+            values[index] = values[index] * torch.exp(states[..., column])
+        return values
+
+    def axles(self, states: Tensor, inputs: Tensor) -> tuple[AxleForce, AxleForce]:
+        """Forces of the front and the rear axle, of states (..., n) and inputs (..., 2)."""
+        c1_front, c2_front, c1_rear, c2_rear, friction = self.parameters(states)
+        sideslip, turn = states[..., 0], states[..., 1] / inputs[..., 0]
+        front = inputs[..., 1] - sideslip - self.car.cg_to_front_axle * turn
+        rear = -sideslip + self.car.cg_to_rear_axle * turn
+        return rational_axle(front, c1_front, c2_front, friction), rational_axle(rear, c1_rear, c2_rear, friction)
+
+    def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """States one step later, (..., n) under inputs (..., 2)."""
+        front, rear = self.axles(states, inputs)
+        car = self.car
+        rates = [
+            (front.force + rear.force) / (car.mass * inputs[..., 0]) - states[..., 1],
+            (car.cg_to_front_axle * front.force - car.cg_to_rear_axle * rear.force) / car.yaw_inertia,
+        ]
+        moved = states[..., :2] + self.step * states[..., 2:4]
+        return torch.cat([moved, torch.stack(rates, -1), states[..., 4:]], -1)
+
+    def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n), (..., 2); Eqs. 38 to 40."""
+        return torch.stack([states[..., 1], inputs[..., 0] * (states[..., 2] + states[..., 1])], -1)
+
+    def steering_slope(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """By how much a steering angle changes the next state, (..., n); the first column of B in Eqs. 45, 52 and 60."""
+        front, _ = self.axles(states, inputs)
+        slope = torch.zeros_like(states)
+        slope[..., 2] = front.per_slip / (self.car.mass * inputs[..., 0])
+        slope[..., 3] = self.car.cg_to_front_axle * front.per_slip / self.car.yaw_inertia
+        return slope
+
+    def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: Tensor) -> Tensor:
+        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n).
+
+        Args:
+            states: (..., n).
+            inputs: (..., 2).
+            steer: standard deviation of the steering angle for a second's step [rad √s].
+            tyres: of the logarithms of the adapted parameters, (n - 4,) [1/√s].
+        """
+        slope = steer * self.steering_slope(states, inputs)
+        wander = torch.cat([tyres.new_zeros(len(MOTION)), tyres]).square().diag()
+        return self.step * (slope.unsqueeze(-1) * slope.unsqueeze(-2) + wander)
