@@ -22,6 +22,7 @@ from scipy import optimize, signal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray, Recording
 from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.rational_tyres import rational_axle
 
 Kind = Literal["linear", "rational"]
 
@@ -93,9 +94,9 @@ def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArr
     Returns:
         Forces (...) [N].
     """
-    if kind == "linear":
-        return parameters[0] * slip
-    return parameters[1] * slip * 2.0 * parameters[0] / (slip**2 + 2.0 * parameters[0])
+    c1, c2 = (math.inf, parameters[0]) if kind == "linear" else parameters
+    force: FloatArray = rational_axle(slip, c1, c2, 1.0).force
+    return force
 
 
 def axle_motion(recordings: Sequence[Recording], parameters: SingleTrackParameters, minimum_speed: float = 3.0) -> AxleMotion:
