@@ -174,7 +174,9 @@ class LearnedUkf(Estimator):
         """Title with what is learnt."""
         s = self.settings
         how = [TITLES[s.dynamics]] + ["learnt through the filter"] * s.through_filter + ["noise by state"] * (s.noise == "state_dependent")
-        how += [f"friction from {s.start_friction:g}"] * (s.start_friction not in (None, s.friction)) + ["no repair"] * (not s.repair)
+        if s.start_friction not in (None, s.friction):
+            how.append(f"friction from {s.start_friction:g}")
+        how += ["no repair"] * (not s.repair)
         return f"{self.title}, {', '.join(how)}"
 
     @property
@@ -213,7 +215,7 @@ class LearnedUkf(Estimator):
 
     def _train(self, data: FitData, training: ThroughFilterSettings, context: FitContext, index: int) -> list[PhaseRecord]:
         dtype = getattr(torch, training.dtype)
-        train, validation = ([self._drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
+        train, validation = ([self.drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
         self.filter = self._new_filter(repair=True).to(dtype)
         if self.settings.scaled:
             self._scale(train)
@@ -281,16 +283,6 @@ class LearnedUkf(Estimator):
         network.input_scale.copy_(torch.tensor(scales))
         network.output_scale.copy_(torch.tensor(given))
 
-    def _drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
-        for name in (*REFERENCES, "motor_speed", *INPUTS):
-            if name not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' learns from")
-            if np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
-        measurements, inputs = self._samples(recording)
-        states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.settings.friction)]
-        return Drive(*(torch.as_tensor(part, dtype=dtype) for part in (np.stack(states, 1), inputs, measurements)))
-
     def _samples(self, recording: Recording) -> tuple[FloatArray, FloatArray]:
         """Measurements (T, 4) with the rim speed last, and inputs (T, 2), held where they are missing."""
         measurements = recording.stack(MEASURED)
@@ -341,6 +333,21 @@ class LearnedUkf(Estimator):
             extra = {"nis": nis[row].double().numpy(), "nis_dof": dof[row].double().numpy()}
             estimates.append(self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra))
         return estimates
+
+    def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
+        """A recording as its filter takes it: true states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
+
+        Raises:
+            DataError: a reference, an input or the motor's speed is missing or has gaps.
+        """
+        for name in (*REFERENCES, "motor_speed", *INPUTS):
+            if name not in recording:
+                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' learns from")
+            if np.isnan(recording[name]).any():
+                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
+        measurements, inputs = self._samples(recording)
+        states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.settings.friction)]
+        return Drive(*(torch.as_tensor(part, dtype=dtype) for part in (np.stack(states, 1), inputs, measurements)))
 
     def online(self) -> LearnedUkfStepper:
         """A stepper that starts from the first sample it sees."""
@@ -421,6 +428,7 @@ def _record_of(phases: Sequence[PhaseRecord], members: int) -> FitRecord:
             "start_validation_loss": last.start_loss,
             "skipped_steps": sum(phase.skipped_steps for phase in phases),
             "train_seconds": sum(phase.seconds for phase in phases),
+            **{f"{phase.name}_seconds": phase.seconds for phase in phases},
         },
         interrupted=last.interrupted,
     )

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -164,6 +164,15 @@ def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> MatplotlibF
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:
+    """One legend over the figure with every label of some axes once."""
+    entries: dict[str, Any] = {}
+    for own in axes:
+        for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
+
+
 def with_unit(quantity: str, unit: str) -> str:
     """Header of a column or label of an axis: ``RMSE(β) [deg]``; no brackets where there is no unit."""
     return quantity if unit in {"", "1"} else f"{quantity} [{unit}]"
@@ -193,6 +202,11 @@ def fixed(value: float, decimals: int) -> str:
 def percent_below(value: float, other: float) -> str:
     """By how much ``value`` lies below ``other``, in whole per cent, for example ``12 %``."""
     return f"{100 * (1 - value / other):.0f} %"
+
+
+def listed(words: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def _grouped(value: float, decimals: int) -> str:

@@ -111,6 +111,7 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
                 seed=member.job.seed,
                 model_folder=member.model.folder,
                 evaluation_folder=member.evaluation.folder,
+                training=dict(member.job.training),
             )
         )
     e = job.evaluation

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,7 @@ class EvaluatedModel:
         seed: its seed.
         model_folder: what the train stage wrote (``history.csv`` in it, where there is one).
         evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence.
+        training: how it was trained, as configured.
     """
 
     estimator: str
@@ -53,11 +54,20 @@ class EvaluatedModel:
     seed: int
     model_folder: Path
     evaluation_folder: Path
+    training: Mapping[str, Any] = field(default_factory=dict)
 
     def history(self) -> pd.DataFrame | None:
         """Training history, one row an epoch (or a search); none if the method has none."""
         path = self.model_folder / "history.csv"
         return pd.read_csv(path) if path.is_file() else None
+
+    def fit_metrics(self) -> dict[str, float]:
+        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``; none where nothing was written."""
+        path = self.model_folder / "fit.csv"
+        if not path.is_file():
+            return {}
+        table = pd.read_csv(path)
+        return dict(zip(table["metric"].astype(str), table["value"].astype(float), strict=True))
 
     def estimate(self, test_set: str, position: int) -> Estimate:
         """The stored estimate of the n-th range of a test set, or of the n-th sequence (`sequences`)."""

@@ -11,8 +11,8 @@ from vehest.data.recording import Recording
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.ksnn_linear import LocalModels
 from vehest.report.document import Block, Figure
-from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
-from vehest.studies.ksnn.subjects import Trained, kinds_of, listed
+from vehest.report.style import DOUBLE_COLUMN, fixed, listed, new_figure, paper_style
+from vehest.studies.ksnn.subjects import Trained, kinds_of
 
 LOCAL_COLOURS = ("#0b4f9c", "#b8480b", "#00876c", "#8e24aa", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8")
 LOCAL_DASHES = ("solid", "dashed", "dashdot", "dotted")

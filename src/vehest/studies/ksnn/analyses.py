@@ -15,10 +15,10 @@ from vehest.studies.ksnn.activation import activation
 from vehest.studies.ksnn.candidates import chosen_by_category
 from vehest.studies.ksnn.data_quality import data_quality
 from vehest.studies.ksnn.interpretation import interpretation
-from vehest.studies.ksnn.reading import recordings_of, words_of_kinds
 from vehest.studies.ksnn.residuals import Panel, Residuals, residuals
 from vehest.studies.ksnn.sensitivities import sensitivities
 from vehest.studies.ksnn.subjects import Trained
+from vehest.studies.reading import recordings_of, words_of_kinds
 
 STRETCH_SECONDS = 30.0
 TRAINED_ON = {"scheme_1": "Corvette C-1", "scheme_2": "Ferrari F-1"}

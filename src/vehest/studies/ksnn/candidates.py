@@ -11,6 +11,7 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.studies import artefacts
 from vehest.studies.ksnn import paper
+from vehest.studies.reading import metric_values
 
 METRICS = ("rmse_vy", "fvu", "r2", "rmse_sideslip")
 OF_MODEL = ("n_parameters", "epochs", "train_seconds")
@@ -38,11 +39,7 @@ def runs_of(part: artefacts.StudyArtefacts) -> pd.DataFrame:
     Raises:
         DataError: a metric is missing.
     """
-    metrics = part.metrics[(part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")]
-    known = {
-        (str(row["estimator"]), str(row["variant"]), int(row["seed"]), str(row["test_set"]), str(row["metric"])): float(row["value"])
-        for row in metrics.to_dict("records")
-    }
+    known = metric_values(part)
     sets = [*([VALIDATION] if part.split.validation else []), *part.split.tests]
     rows = []
     for model in part.models:

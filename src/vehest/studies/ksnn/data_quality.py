@@ -12,8 +12,8 @@ import pandas as pd
 from vehest.data.recording import FloatArray, Recording
 from vehest.evaluation.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure, paper_style
-from vehest.studies.ksnn.subjects import car_colours, car_title, kinds_of, legend_above, listed, plain_frequencies
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure, paper_style
+from vehest.studies.ksnn.subjects import car_colours, car_title, kinds_of, plain_frequencies
 
 NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)

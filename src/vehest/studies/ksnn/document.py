@@ -14,8 +14,8 @@ from vehest.report.style import fixed, percent_below
 from vehest.studies.artefacts import PartsArtefacts
 from vehest.studies.ksnn import analyses, paper, scatter, tables
 from vehest.studies.ksnn.candidates import chosen_by_category, runs_of, seeds_like
-from vehest.studies.ksnn.reading import words_of_kinds
 from vehest.studies.ksnn.tilted import tilted
+from vehest.studies.reading import spans_in_words, words_of_kinds
 from vehest.studies.sweep import interval, mean_and_half
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
@@ -118,9 +118,9 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
             {
                 "part": artefacts.titles[name],
                 "kind": words_of_kinds(part),
-                "train": _spans_in_words(part.split.train),
-                "validation": _spans_in_words(part.split.validation),
-                **{"tests": "; ".join(f"{test}: {_spans_in_words(spans)}" for test, spans in part.split.tests.items())},
+                "train": spans_in_words(part.split.train),
+                "validation": spans_in_words(part.split.validation),
+                **{"tests": "; ".join(f"{test}: {spans_in_words(spans)}" for test, spans in part.split.tests.items())},
             }
             for name, part in artefacts.parts.items()
         ]
@@ -131,16 +131,6 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
         "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines),
         Table("table_2", caption, ranges, columns | {"tests": Column("tests")}),
     ]
-
-
-def _spans_in_words(spans: Sequence[Span]) -> str:
-    if not spans:
-        return "–"
-    words = []
-    for span in spans:
-        whole = span.start == -math.inf and span.stop == math.inf
-        words.append(span.recording if whole else f"{span.recording} ({span.start:g} to {span.stop:g} s)")
-    return ", ".join(words)
 
 
 def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:

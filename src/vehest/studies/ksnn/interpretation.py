@@ -14,9 +14,19 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.ksnn_linear import LocalModels, LpvModel, SubModels, decomposed_estimate
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, new_figure, paper_style, significant, with_unit
+from vehest.report.style import (
+    DOUBLE_COLUMN,
+    REFERENCE_COLOUR,
+    fixed,
+    legend_above,
+    listed,
+    new_figure,
+    paper_style,
+    significant,
+    with_unit,
+)
 from vehest.studies.ksnn.activation import LOCAL_COLOURS, LOCAL_DASHES
-from vehest.studies.ksnn.subjects import Trained, legend_above, listed
+from vehest.studies.ksnn.subjects import Trained
 
 MODEL_COLOURS = ("#0b4f9c", "#c2182b", "#00876c", "#a6761d", "#8e24aa")
 PART_COLOURS = {"slip_rate": "#0b4f9c", "pseudo_measurement": "#00876c", "speed": "#b8480b", "bias": "#8e24aa"}

@@ -17,8 +17,8 @@ from vehest.estimators.ksnn_linear import LocalModels
 from vehest.estimators.luenberger import Luenberger
 from vehest.estimators.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, new_figure, paper_style, percent_below
-from vehest.studies.ksnn.subjects import Trained, legend_above, listed
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure, paper_style, percent_below
+from vehest.studies.ksnn.subjects import Trained
 
 YAW_RATES = (0.2, 0.4)
 """As in the paper: about the median of |ω| in its drives, and twice that [rad/s]."""

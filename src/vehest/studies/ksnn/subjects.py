@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model
 from vehest.report.style import MISSING
 from vehest.studies.artefacts import EvaluatedModel
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 CAR_COLOURS = {
     ("corvette", "real"): "#0b4f9c",
@@ -92,15 +89,6 @@ def kinds_of(recordings: Sequence[Recording]) -> str:
     return " and ".join(sorted({recording.kind for recording in recordings})) or MISSING
 
 
-def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:
-    """One legend over the figure with every label of some axes once."""
-    entries: dict[str, Any] = {}
-    for own in axes:
-        for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
-
-
 def plain_frequencies(axes: Any) -> None:
     """Marks of a logarithmic axis in plain numbers, from 0.1 Hz."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
@@ -108,8 +96,3 @@ def plain_frequencies(axes: Any) -> None:
     axes.xaxis.set_major_locator(FixedLocator([0.1, 0.2, 0.5, 1.0, 2.0, 5.0]))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-
-
-def listed(words: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)

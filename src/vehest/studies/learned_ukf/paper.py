@@ -1,0 +1,80 @@
+"""What Węgrzynowski et al. 2024 report, by table, and what their public code makes of the files at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+PC, PCR, NN, NN_U = "PC", "PCR", "NN", "NN_U"
+NNT, NNT_U, NNTF, NNTF_U, NNTF_UH = "NNT", "NNT_U", "NNTF", "NNTF_U", "NNTF_UH"
+NNTF_UH_LOW = "NNTF_UH*"
+GRU, LSTM = "GRU", "LSTM"
+
+CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW, GRU, LSTM)
+"""In the order of Table II."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A column of Tables I or II.
+
+    Args:
+        mse: mean weighted squared error.
+        mae: mean weighted absolute error.
+        ae99: 99th percentile of the weighted absolute error.
+    """
+
+    mse: float
+    mae: float
+    ae99: float
+
+
+TABLE_I: Mapping[str, Published] = {
+    PC: Published(0.0654, 0.1459, 0.5893),
+    PCR: Published(0.0089, 0.0543, 0.2512),
+    NN: Published(0.0078, 0.0558, 0.2385),
+    NN_U: Published(0.0058, 0.0464, 0.1681),
+    NNT: Published(0.0088, 0.0578, 0.24),
+    NNT_U: Published(0.0087, 0.0564, 0.2444),
+    NNTF: Published(0.0085, 0.0574, 0.2184),
+    NNTF_U: Published(0.0072, 0.0539, 0.1777),
+    NNTF_UH: Published(0.0063, 0.0493, 0.1743),
+    GRU: Published(0.0076, 0.0524, 0.2608),
+    LSTM: Published(0.0338, 0.1277, 0.3825),
+}
+"""Tyre A, which was learnt on."""
+
+TABLE_II: Mapping[str, Published] = {
+    PC: Published(0.489, 0.255, 2.621),
+    PCR: Published(0.0769, 0.159, 0.758),
+    NN: Published(0.0770, 0.154, 0.763),
+    NN_U: Published(0.0781, 0.162, 0.734),
+    NNTF: Published(0.0311, 0.105, 0.596),
+    NNTF_U: Published(0.0259, 0.0991, 0.553),
+    NNTF_UH: Published(0.0237, 0.0939, 0.504),
+    NNTF_UH_LOW: Published(0.0188, 0.0810, 0.377),
+    GRU: Published(0.0967, 0.1811, 0.8735),
+    LSTM: Published(0.1328, 0.2224, 1.0165),
+}
+"""Tyre C, which was not; NNT and NNT_U have a dash, since their filters became unstable."""
+
+TABLES: Mapping[str, Mapping[str, Published]] = {"tyre_a": TABLE_I, "tyre_d": TABLE_II}
+"""Test set -> the paper's table; its unseen tyre is C where ours is D."""
+
+RMS: Mapping[tuple[str, str], tuple[float, float]] = {("tyre_a", NNTF_UH): (0.062, 0.070), ("tyre_d", NNTF_UH_LOW): (0.176, 0.128)}
+"""(test set, candidate) -> root mean square errors of vx and vy [m/s] (Sections IV-B and IV-C)."""
+
+AUTHORS_CODE: Mapping[str, Published] = {"tyre_a": Published(0.0158, 0.0847, 0.275), "tyre_d": Published(0.0441, 0.127, 0.600)}
+"""Test set -> NNTF_UH of the authors' public code on the files of split ``f1tenth_tyres``, as printed when it was run."""
+
+AUTHORS_CODE_RMS: Mapping[str, tuple[float, float]] = {"tyre_a": (0.128, 0.121)}
+"""Test set -> root mean square errors of vx and vy [m/s] of the same."""
+
+NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}
+"""Friction of the tyres (Section III-C)."""
+
+SLIP_99 = 40.0
+"""[deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)."""
+
+SWAP_GAIN = 18.0
+"""[%] by how much the MSE falls where the model that predicts is learnt through the filter (Section IV-D)."""
