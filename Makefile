@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ekf
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -88,6 +88,9 @@ bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 column
 
 bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data sets on all cores against one (10 minutes)
 	$(BIN)/python benchmarks/simulation.py
+
+bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
+	$(BIN)/python benchmarks/ekf.py
 
 clean: ## remove what can be made again (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

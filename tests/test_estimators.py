@@ -13,13 +13,21 @@ from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
-from vehest.training.settings import DirectSearchSettings, NoTraining, PhaseSettings, SequenceSettings, SupervisedSettings
+from vehest.training.settings import (
+    DirectSearchSettings,
+    NoiseTuningSettings,
+    NoTraining,
+    PhaseSettings,
+    SequenceSettings,
+    SupervisedSettings,
+)
 
 VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
 CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
     "factor_graph": {"window": 0.05},
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
+    "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
 }
 
 
@@ -33,6 +41,8 @@ def _fitted(name, dtype="float64", **config):
     elif estimator.training_type is SequenceSettings:
         training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
         estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
+    elif estimator.training_type is NoiseTuningSettings:
+        estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
     elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
