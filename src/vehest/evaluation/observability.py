@@ -106,8 +106,8 @@ def observability_along(
         raise ValueError("sizes of states and noise of measurements must be positive")
     A, H = jacobians_along(transition, observation, states, inputs)
     A, H = A * sizes / np.asarray(sizes)[:, None], H * sizes / np.asarray(noise)[:, None]
-    _, values, directions = np.linalg.svd(observability_matrices(A, H, steps), full_matrices=True)
-    n = A.shape[-1]
+    matrices, n = observability_matrices(A, H, steps), A.shape[-1]
+    _, values, directions = np.linalg.svd(matrices, full_matrices=matrices.shape[1] < n)
     full = np.zeros((len(values), n))
     full[:, : values.shape[1]] = values
     full[full <= 1e-13 * full[:, :1]] = 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import load_model
 from vehest.estimators.rational_ekf import RationalFilter
+from vehest.estimators.tyre_fit import TyreFit, axle_force, axle_motion
 from vehest.report.style import REFERENCE, Line
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.studies.heavy_ekf import paper
@@ -23,8 +24,7 @@ LINES = {
     paper.RATT: Line("#00876c", "dashdot", "o"),
     paper.RATTE: Line("#d6336c", "solid", "^"),
     "RATT with friction": Line("#a6761d", "dotted", "D"),
-    "RATT, unscented": Line("#5b8c00", "dotted", "v"),
-    "RATTE, unscented": Line("#8e24aa", "dotted", "P"),
+    paper.QUICK: Line("#8e24aa", "dotted", "v"),
 }
 MEASURED = REFERENCE
 TYRES = {"nominal": "nominal tyres", "worn": "worn tyres", "wet": "wet road"}
@@ -51,22 +51,24 @@ class Filter:
 
 
 def filters_of(part: StudyArtefacts) -> dict[str, Filter]:
-    """Name -> filter, in the order of `paper.VARIANTS`.
+    """Name -> filter, in the order of `paper.VARIANTS`; no two of one variant may have the same seed.
 
     Raises:
         DataError: one of the paper's three is not there.
     """
-    found = {}
-    for variant, name in paper.VARIANTS.items():
-        for model in part.models:
-            if model.estimator == "rational_ekf" and model.variant == variant and name not in found:
-                fitted = load_model(model.model_folder)
-                assert isinstance(fitted, RationalFilter)
-                found[name] = Filter(name, model, fitted)
+    found: dict[str, Filter] = {}
+    for model in part.models:
+        if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:
+            fitted = load_model(model.model_folder)
+            assert isinstance(fitted, RationalFilter)
+            quick = model.variant == "ratte" and fitted.settings.noise.tyres is not None
+            name = paper.QUICK if quick else paper.VARIANTS[model.variant]
+            found.setdefault(name, Filter(name, model, fitted))
     missing = [name for name in paper.ORDER if name not in found]
     if missing:
         raise DataError(f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three")
-    return found
+    order = [*paper.VARIANTS.values(), paper.QUICK]
+    return {name: found[name] for name in sorted(found, key=order.index)}
 
 
 def whole_drive(part: StudyArtefacts, test: str) -> Recording:
@@ -75,9 +77,20 @@ def whole_drive(part: StudyArtefacts, test: str) -> Recording:
     return read_recording(part.references[span.dataset, span.recording])
 
 
-def training_drives(part: StudyArtefacts) -> list[Recording]:
-    """What the filters were fitted to."""
-    return recordings_of(part, part.split.train)
+def validation_drives(part: StudyArtefacts) -> list[Recording]:
+    """Drives on the tyres that the filters were fitted on, which they were not fitted to."""
+    return recordings_of(part, part.split.validation)
+
+
+def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
+    """The curves that a rational filter was fitted with, beside what the axles do in other drives."""
+    car, slowest = own.settings.car, own.settings.minimum_speed
+    motion = axle_motion(drives, car, slowest)
+    axles = own.curves.reshape(2, 2)
+    blocks = [own.curve_covariance[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
+    left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
+    rms = np.sqrt(np.mean(np.square(left), axis=1))
+    return TyreFit("rational", axles[0], axles[1], np.stack(blocks), rms, motion.slip, motion.force)
 
 
 def moving(drive: Recording, minimum_speed: float) -> FloatArray:
@@ -85,19 +98,15 @@ def moving(drive: Recording, minimum_speed: float) -> FloatArray:
     return np.where(drive["vx"] >= minimum_speed, 1.0, np.nan)
 
 
-def degrees(values: FloatArray) -> FloatArray:
-    """From radians."""
-    return np.degrees(values)
-
-
 def rmse_of(part: StudyArtefacts, filters: Mapping[str, Filter]) -> dict[tuple[str, str], float]:
     """(name, test set) -> RMSE(β) [deg], as evaluated."""
     metrics = part.metrics[
         (part.metrics["metric"] == "rmse_sideslip") & (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")
     ]
-    names = {own.model.variant: name for name, own in filters.items()}
-    return {
-        (names[str(row["variant"])], str(row["test_set"])): float(row["value"])
-        for row in metrics.to_dict("records")
-        if str(row["variant"]) in names
-    }
+    names = {(own.model.variant, own.model.seed): name for name, own in filters.items()}
+    found = {}
+    for row in metrics.to_dict("records"):
+        name = names.get((str(row["variant"]), int(row["seed"])))
+        if name is not None:
+            found[name, str(row["test_set"])] = float(row["value"])
+    return found

@@ -107,8 +107,9 @@ def order_in_words(
     fit: TyreFit,
     own: Mapping[str, OwnCurves],
     drives: Mapping[str, Recording],
+    wander: float,
 ) -> str:
-    """Where the order of the three is the paper's, where it is not, and why."""
+    """Where the order of the three is the paper's, where it is not, and why; ``wander`` is RATTE's level of noise of its tyres [1/√s]."""
     tests = [f"{tyres}_{drive}" for tyres in TYRES for drive in DRIVES]
     orders = {test: tuple(sorted(paper.ORDER, key=lambda name, on=test: rmse[name, on])) for test in tests}  # type: ignore[misc]
     same = [test.replace("_", " ") for test in tests if orders[test] == paper.ORDER]
@@ -121,6 +122,10 @@ def order_in_words(
     sentences.append("It differs on " + listed([f"{test.replace('_', ' ')} ({' < '.join(orders[test])})" for test in other]) + ". Why:")
     reasons = [f"- **Little to tell a linear tyre from a rational one.** {_curvature(fit)}"]
     reasons.append(f"- **What the parameters start from.** {_starts(own)}")
+    reasons.append(
+        "- **How fast parameters may move.** The level at which the training drives, all on nominal tyres, are estimated best lets RATTE's "
+        f"parameters wander by {100.0 * wander * math.sqrt(60.0):.2g} % in a minute (one standard deviation)." + _quick(rmse)
+    )
     worst = [test for test in other if rmse[paper.RATTE, test] > rmse[paper.RATT, test]]
     if worst:
         parts = []
@@ -156,7 +161,19 @@ def _curvature(fit: TyreFit) -> str:
         reach = float(np.quantile(np.abs(fit.slip[row]), 0.999))
         lost = reach**2 / (reach**2 + 2.0 * float(values[0]))
         words.append(f"{axle} {fixed(math.degrees(reach), 1)}°, where the fitted curve lies {fixed(100 * lost, 0)} % below its tangent")
-    return f"In the training drives the slip angles reach (99.9 % of samples) {'; '.join(words)}."
+    return f"In the validation drives the slip angles reach (99.9 % of samples) {'; '.join(words)}."
+
+
+def _quick(rmse: Rmse) -> str:
+    """What a filter whose tyres may move faster makes of the drives."""
+    if (paper.QUICK, "nominal_laps") not in rmse:
+        return ""
+    words = [
+        f"{tyres} {drive} {fixed(rmse[paper.QUICK, f'{tyres}_{drive}'], 2)}° against {fixed(rmse[paper.RATTE, f'{tyres}_{drive}'], 2)}°"
+        for tyres in TYRES
+        for drive in DRIVES
+    ]
+    return f" With quick tyres, a level that was set and not tuned, it has {'; '.join(words)}."
 
 
 def _starts(own: Mapping[str, OwnCurves]) -> str:

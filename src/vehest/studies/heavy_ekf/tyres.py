@@ -83,11 +83,12 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
         legend_above(figure, panels[0])
     left = " and ".join(f"{significant(1e-3 * float(rms), 2)} kN" for rms in fit.residual_rms)
     caption = (
-        f"Fit of the rational tyre to the training drives (Figure 3 of the paper), {data}: axle forces from lateral and yaw acceleration, "
-        f"slip angles from the reference, {fit.slip.shape[1]} samples of which {len(chosen)} are drawn. What is left has an rms of {left}."
+        f"Rational tyres fitted to the training drives (Figure 3 of the paper), {data}, and the axle forces of the validation drives, from "
+        f"lateral and yaw acceleration, over slip angles from the reference: {fit.slip.shape[1]} samples, {len(chosen)} of them drawn. "
+        f"What is left in them has an rms of {left}."
     )
     if own is not None:
-        caption += " Dashed: rational curves fitted to the plant's own tyre forces in the same drives."
+        caption += " Dashed: rational curves fitted to the plant's own tyre forces in the test drives on nominal tyres."
     return Figure(name, caption, figure)
 
 

@@ -139,12 +139,12 @@ def monitor(nis: FloatArray, dof: FloatArray, rate_hz: float) -> FloatArray:
 
 
 def bad_input_table(
-    filters: Mapping[str, Filter], drive: Recording, fitted_on: list[Recording], wheels: SpeedFromWheels, minimum_speed: float, data: str
+    filters: Mapping[str, Filter], drive: Recording, sound: list[Recording], wheels: SpeedFromWheels, minimum_speed: float, data: str
 ) -> list[Block]:
     """What each fault does to each filter, and who says so."""
     limits = {}
     for name, own in filters.items():
-        means = [monitor(*_nis(own, other), other.rate_hz) for other in fitted_on]
+        means = [monitor(*_nis(own, other), other.rate_hz) for other in sound]
         limits[name] = MARGIN * float(np.nanmax(np.concatenate(means)))
     clean = {(finding.check, finding.channel) for finding in checks_of_recording(drive)}
     rows, silent = [], []
@@ -179,7 +179,7 @@ def bad_input_table(
     caption = (
         f"Bad input, on '{drive.id}', {data}. The monitor takes the mean of the normalised innovation squared over the measured numbers in "
         f"windows of {MONITOR_SECONDS:g} s, about one where filter and drive agree; its limit is {MARGIN:g} times the largest mean in the "
-        f"training drives: {listed_limits}. RMSE(β) against the true reference at {minimum_speed:g} m/s and more, forwards."
+        f"validation drives: {listed_limits}. RMSE(β) against the true reference at {minimum_speed:g} m/s and more, forwards."
     )
     words = "Neither the monitor nor the check says anything of: " + "; ".join(silent) + "." if silent else ""
     return [Table("bad_input", caption, pd.DataFrame(rows), columns), *([words] if words else [])]
