@@ -191,9 +191,22 @@ def fit_tyres(
 
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
+    return fit_motion(axle_motion(recordings, parameters, minimum_speed, measured_forces=measured_forces), kind)
+
+
+def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
+    """The same of slips and forces that are at hand already.
+
+    Args:
+        motion: of both axles.
+        kind: ``linear`` or ``rational``.
+
+    Raises:
+        ConfigurationError: no such kind.
+        DataError: forces run against slips.
+    """
     if kind not in PARAMETERS:
         raise ConfigurationError(f"a tyre curve of kind '{kind}' is not one of: {', '.join(PARAMETERS)}")
-    motion = axle_motion(recordings, parameters, minimum_speed, measured_forces=measured_forces)
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
     (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
     covariance = np.stack([front_covariance, rear_covariance])

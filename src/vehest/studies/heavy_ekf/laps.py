@@ -87,9 +87,10 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
             axes.set_title(letter, loc="left", fontweight="bold", color=colour)
         legend_above(figure, whole)
     caption = (
-        f"Three laps (Figure 6 of the paper), {data}, '{drive.id}': a, the track, from the reference's velocities and yaw rate, its start "
-        f"as a dot; b, sideslip angle, measured and estimated; c, detail on the calmest {STRAIGHT_SECONDS:g} s (red in a); d, in the "
-        f"{HANDLING_SECONDS:g} s with the largest lateral acceleration (green in a). Slower than {minimum_speed:g} m/s nothing is drawn."
+        f"Three laps (Figure 6 of the paper), {data}, '{drive.id}': a, the track, by dead reckoning from the reference's velocities and "
+        f"yaw rate, which drifts, its start as a dot; b, sideslip angle, measured and estimated; c, detail on the calmest "
+        f"{STRAIGHT_SECONDS:g} s (red in a); d, in the {HANDLING_SECONDS:g} s with the largest lateral acceleration (green in a). Slower "
+        f"than {minimum_speed:g} m/s nothing is drawn."
     )
     return Figure("figure_6", caption, figure)
 
@@ -145,12 +146,12 @@ def _sideslip(
     first, last = drive.index_range(*stretch) if stretch else (0, len(drive))
     shown = moving(drive, minimum_speed)[first:last]
     time = drive.time[first:last]
+    measured = np.degrees(drive["sideslip_ref"][first:last]) * shown
+    axes.plot(*decimated(time, measured, POINTS), color="#8a8a8a", linewidth=0.8, label="measured")
     for label, estimate in estimates.items():
         line = LINES[label]
         values = np.degrees(estimate["sideslip"][first:last]) * shown
         axes.plot(*decimated(time, values, POINTS), color=line.colour, linestyle=line.dash, linewidth=0.9, label=label)
-    measured = np.degrees(drive["sideslip_ref"][first:last]) * shown
-    axes.plot(*decimated(time, measured, POINTS), color=MEASURED.colour, linewidth=0.7, label="measured")
     low, high = np.nanquantile(measured, [0.001, 0.999])
     room = 0.35 * (high - low) + 0.2
     axes.set_ylim(low - room, high + room)

@@ -121,7 +121,7 @@ def order_in_words(
         return sentences[0]
     sentences.append("It differs on " + listed([f"{test.replace('_', ' ')} ({' < '.join(orders[test])})" for test in other]) + ". Why:")
     reasons = [f"- **Little to tell a linear tyre from a rational one.** {_curvature(fit)}"]
-    reasons.append(f"- **What the parameters start from.** {_starts(own)}")
+    reasons.append(f"- **What the parameters start from.** {_starts(own, fit)}")
     reasons.append(
         "- **How fast parameters may move.** The level at which the training drives, all on nominal tyres, are estimated best lets RATTE's "
         f"parameters wander by {100.0 * wander * math.sqrt(60.0):.2g} % in a minute (one standard deviation)." + _quick(rmse)
@@ -140,6 +140,17 @@ def order_in_words(
             + "; ".join(parts)
             + ". A filter that may move its tyres lays errors of the sensors and of the model upon them; offsets of sensors are no states."
         )
+    shared = {
+        drive.id: float(np.degrees(curves.offsets[drive.id][1]))
+        for curves in own.values()
+        for drive in drives.values()
+        if drive.id in curves.offsets
+    }
+    reasons.append(
+        "- **Offsets of the reference.** The rear axle of the plant makes no force where the sensors show a slip angle of, in degrees: "
+        + "; ".join(f"{name.replace('_', ' ')} {fixed(value, 2)}" for name, value in shared.items())
+        + ". That much of every filter's error is the reference's, with the opposite sign, and no filter can be better than it."
+    )
     offsets = [f"{test.replace('_', ' ')} {fixed(_offset(drive), 2)}" for test, drive in drives.items()]
     reasons.append(
         f"- **Offsets of the sensors.** The mean of a_y - u r - dv/dt is, in m/s²: {'; '.join(offsets)}. A filter that believes a_y turns "
@@ -176,7 +187,7 @@ def _quick(rmse: Rmse) -> str:
     return f" With quick tyres, a level that was set and not tuned, it has {'; '.join(words)}."
 
 
-def _starts(own: Mapping[str, OwnCurves]) -> str:
+def _starts(own: Mapping[str, OwnCurves], fit: TyreFit) -> str:
     words = []
     for tyres, curves in own.items():
         if tyres == "nominal":
@@ -187,10 +198,13 @@ def _starts(own: Mapping[str, OwnCurves]) -> str:
             for after, before in ((curves.linear.front, nominal.front), (curves.linear.rear, nominal.rear))
         ]
         words.append(f"{TYRES[tyres]} {changes[0]} front and {changes[1]} rear")
+    start = [
+        percent_below(float(plant[0]), float(values[1]))
+        for plant, values in ((own["nominal"].linear.front, fit.front), (own["nominal"].linear.rear, fit.rear))
+    ]
     return (
-        "The plant's own stiffness, by a straight line through its forces, lies below the nominal one by: "
-        + "; ".join(words)
-        + ". Fixed tyres are right on the nominal drives and that far out on the others."
+        f"The plant's own nominal stiffness, by a straight line through its forces, lies {start[0]} front and {start[1]} rear below what "
+        f"the fit to accelerations starts the rational filters with; below the plant's nominal one are: {'; '.join(words)}."
     )
 
 

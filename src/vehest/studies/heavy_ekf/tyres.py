@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
-from vehest.estimators.tyre_fit import TyreFit, fit_tyres
+from vehest.estimators.tyre_fit import AxleMotion, TyreFit, axle_force, axle_motion, fit_motion
 from vehest.report.document import Column, Figure, Table
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style, significant
@@ -22,6 +23,7 @@ from vehest.vehicle.parameters import SingleTrackParameters
 
 BAND = 0.10  # of the plant's own value, within which a parameter counts as found
 DOTS = 1500
+AXLES: tuple[Literal["front", "rear"], ...] = ("front", "rear")
 QUANTITIES = {
     "cornering_stiffness_front": ("c2_front", "$c_{2F}$ [kN/rad]", 1e-3),
     "cornering_stiffness_rear": ("c2_rear", "$c_{2R}$ [kN/rad]", 1e-3),
@@ -39,18 +41,24 @@ class OwnCurves:
     Args:
         rational: fit of rational curves.
         linear: fit of straight lines.
+        offsets: recording -> slip angle of the front and of the rear axle by its sensors where the axle makes no force, (2,) [rad].
     """
 
     rational: TyreFit
     linear: TyreFit
+    offsets: Mapping[str, FloatArray]
 
     @classmethod
     def of(cls, drives: Sequence[Recording], car: SingleTrackParameters, minimum_speed: float) -> OwnCurves:
-        """Both fits to drives on the same tyres, which hold their forces."""
-        rational, linear = (
-            fit_tyres(drives, car, kind, minimum_speed=minimum_speed, measured_forces=True) for kind in ("rational", "linear")
-        )
-        return cls(rational, linear)
+        """Both fits to drives on the same tyres, which hold their forces; each drive's offsets of slip are taken off before."""
+        motions, offsets = [], {}
+        for number, drive in enumerate(drives):
+            motion = axle_motion([drive], car, minimum_speed, measured_forces=True)
+            offsets[drive.id] = np.array([_no_force(slip, force) for slip, force in zip(motion.slip, motion.force, strict=True)])
+            motions.append(AxleMotion(motion.slip - offsets[drive.id][:, None], motion.force, motion.block + 10_000 * number))
+        slips, forces, blocks = (np.concatenate(parts, axis=-1) for parts in zip(*motions, strict=True))
+        together = AxleMotion(slips, forces, blocks)
+        return cls(fit_motion(together, "rational"), fit_motion(together, "linear"), offsets)
 
     def value(self, quantity: str, name: str) -> float:
         """What a quantity of an estimate of this filter should be."""
@@ -60,6 +68,13 @@ class OwnCurves:
         return float(axle[0 if "c1" in quantity else 1])
 
 
+def _no_force(slip: FloatArray, force: FloatArray) -> float:
+    """Slip angle at which a straight line through small forces is zero [rad]."""
+    small = np.abs(force) < 0.4 * np.abs(force).max()
+    slope, offset = np.polyfit(slip[small], force[small], 1)
+    return float(-offset / slope)
+
+
 def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figure:
     """Forces over slip angles with the fitted curve and its 95 % band, front and rear."""
     generator = np.random.default_rng(0)
@@ -67,7 +82,7 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 2.7)
         panels = figure.subplots(1, 2, sharey=True)
-        for row, (axes, axle) in enumerate(zip(panels, ("front", "rear"), strict=True)):
+        for row, (axes, axle) in enumerate(zip(panels, AXLES, strict=True)):
             slip, force = fit.slip[row], fit.force[row]
             reach = float(np.abs(slip).max())
             grid = np.linspace(-reach, reach, 201)
@@ -88,16 +103,17 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
         f"What is left in them has an rms of {left}."
     )
     if own is not None:
-        caption += " Dashed: rational curves fitted to the plant's own tyre forces in the test drives on nominal tyres."
+        caption += (
+            " Dashed: rational curves fitted to the plant's own tyre forces in the test drives on nominal tyres, the sensors' offsets of "
+            "slip taken off."
+        )
     return Figure(name, caption, figure)
 
 
-def _band(fit: TyreFit, axle: str, grid: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
+def _band(fit: TyreFit, axle: Literal["front", "rear"], grid: FloatArray, row: int) -> tuple[FloatArray, FloatArray]:
     """Curve ± 1.96 standard deviations to first order in the parameters."""
     values = getattr(fit, axle)
-    curve = fit.curve(axle, grid)  # type: ignore[arg-type]
-    from vehest.estimators.tyre_fit import axle_force
-
+    curve = fit.curve(axle, grid)
     slopes = np.stack(
         [(axle_force(fit.kind, values * _nudged(i, len(values)), grid) - curve) / (1e-4 * values[i]) for i in range(len(values))]
     )
