@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -61,11 +61,14 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: an hour or more
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
-learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and hours
+learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about an hour
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
 learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets
 	$(BIN)/vehest run pipelines/learned_ukf_sim.yaml
+
+heavy_ekf: $(INSTALLED) ## a heavy vehicle's laps by Kalman filters whose tyres adapt, simulated, and the real Ferrari with VEHEST_DATA: minutes
+	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml

@@ -348,3 +348,40 @@ def test_a_reference_sideslip_in_degrees_is_found_although_its_values_are_possib
     assert np.abs(gentle["sideslip_ref"]).max() < np.pi
     finding = only_complaint(gentle)
     assert (finding.level, finding.check, finding.channel) == ("error", "unit", "sideslip_ref")
+
+
+def with_wheels(recording: Recording) -> Recording:
+    """The same drive with four wheels that roll."""
+    wheels = {f"wheel_speed_{wheel}": recording["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
+    return replace(recording, channels={**recording.channels, **wheels})
+
+
+def fired(recording: Recording) -> set[tuple[str, str]]:
+    return {(finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"}
+
+
+def test_a_steering_offset_shows_straight_ahead() -> None:
+    whole = clean_drive()
+    assert ("offset", "steer") not in fired(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0)))
+    assert fired(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == {("offset", "steer")}
+
+
+def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
+    whole = with_wheels(clean_drive())
+    assert not fired(whole)
+
+    def interrupted(samples: np.ndarray) -> np.ndarray:
+        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), 0.0, samples)
+
+    def braked(samples: np.ndarray) -> np.ndarray:
+        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), -7.0, samples)
+
+    dropped = changed(whole, wheel_speed_rl=interrupted)
+    assert fired(dropped) == {("dropout", "wheel_speed_rl")}
+    assert not fired(changed(dropped, ax=braked)) & {("dropout", "wheel_speed_rl")}
+
+
+def test_bad_input_of_a_single_track_filter_is_told_apart() -> None:
+    whole = clean_drive()
+    assert ("sign", "yaw_rate") in fired(changed(whole, yaw_rate=np.negative))
+    assert ("saturated", "ay") in fired(changed(whole, ay=lambda samples: np.clip(samples, -4.0, 4.0)))

@@ -13,7 +13,15 @@ from hypothesis.extra.numpy import arrays
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.data.transforms import TRANSFORMS, LowPass, MountingCorrection, RemoveOutliers, Resample, transform_from_config
+from vehest.data.transforms import (
+    TRANSFORMS,
+    LowPass,
+    MountingCorrection,
+    RemoveOutliers,
+    Resample,
+    SpeedFromWheels,
+    transform_from_config,
+)
 
 PROPERTY = settings(max_examples=50, deadline=None, derandomize=True, database=None)
 RATE = 100.0
@@ -224,7 +232,7 @@ def test_transforms_are_built_from_plain_values() -> None:
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
-    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction"} | of_an_alignment
+    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction", "speed_from_wheels"} | of_an_alignment
 
 
 @pytest.mark.parametrize(
@@ -236,6 +244,7 @@ def test_transforms_are_built_from_plain_values() -> None:
         ({"name": "low_pass", "cutoff_hz": 5.0, "cutof": 1}, "cutof"),
         ({"name": "low_pass", "cutoff_hz": 5.0, "direction": "backward"}, "causal, zero_phase"),
         ({"name": "resample", "rate_hz": "fast"}, "resample"),
+        ({"name": "speed_from_wheels", "wheel_radius": 0, "track_front": 2, "track_rear": 2}, "wheel_radius must be a positive number"),
     ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:
@@ -243,3 +252,65 @@ def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], 
         transform_from_config(config)
     assert what in str(error.value)
     assert "\n" not in str(error.value)
+
+
+WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
+
+
+def rolling(**shown: np.ndarray) -> tuple[Recording, np.ndarray]:
+    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
+    time = np.arange(2000) / RATE
+    u = 8.0 + 3.0 * np.sin(0.7 * time)
+    yaw_rate, steer = 0.3 * np.sin(0.9 * time), 0.2 * np.sin(0.9 * time)
+    sides = {"fl": 1.05, "fr": -1.05, "rl": 1.0, "rr": -1.0}
+    wheels = {f"wheel_speed_{place}": (u - yaw_rate * side) / 0.48 for place, side in sides.items()}
+    for place in ("fl", "fr"):
+        wheels[f"wheel_speed_{place}"] /= np.cos(steer)
+    channels = {"yaw_rate": yaw_rate, "steer": steer, "ax": 2.1 * np.cos(0.7 * time), **wheels} | shown
+    gappy = frozenset(name for name, samples in channels.items() if np.isnan(samples).any())
+    return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
+
+
+def damaged(value: float, *wheels: str, start: int = 500, stop: int = 650) -> tuple[Recording, np.ndarray]:
+    """The same with some wheels that show another value for a while."""
+    whole, _ = rolling()
+    broken = {}
+    for wheel in wheels:
+        broken[f"wheel_speed_{wheel}"] = np.array(whole[f"wheel_speed_{wheel}"])
+        broken[f"wheel_speed_{wheel}"][start:stop] = value
+    return rolling(**broken)
+
+
+def test_speed_from_wheels_inverts_what_rolling_wheels_do() -> None:
+    drive, u = rolling()
+    np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 60.0, math.nan])
+def test_a_wheel_that_drops_out_or_spins_does_not_count(value: float) -> None:
+    drive, u = damaged(value, "fl")
+    np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
+    assert not WHEELS.plausible(drive)[0, 500:650].any()
+    assert WHEELS.plausible(drive)[1:].all()
+
+
+@pytest.mark.parametrize("wheels", [("rl", "rr"), ("fl", "fr", "rl"), ("fl", "fr", "rl", "rr")])
+def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels: tuple[str, ...]) -> None:
+    drive, u = damaged(math.nan if len(wheels) == 4 else 0.0, *wheels)
+    vx = WHEELS(drive)["vx"]
+    limited = np.abs(vx - u).max()
+    assert np.isfinite(vx).all()
+    assert limited < (0.1 if len(wheels) != 3 else 12.0)  # three that agree on zero outvote one: what remains is the limit of acceleration
+    assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
+
+
+def test_speed_from_wheels_knows_no_later_samples() -> None:
+    drive, _ = damaged(0.0, "rl", "rr")
+    np.testing.assert_array_equal(WHEELS(drive.cut(3.0, 9.0))["vx"], WHEELS(drive)["vx"][:600])
+
+
+def test_wheels_that_were_never_measured_are_refused() -> None:
+    missing = np.full(2000, math.nan)
+    with pytest.raises(DataError, match="no wheel speed was measured"):
+        WHEELS(rolling(yaw_rate=missing)[0])

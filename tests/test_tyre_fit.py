@@ -78,6 +78,13 @@ def test_wider_intervals_where_tyres_stay_in_their_linear_range():
     assert (gentle.interval[:, 0] > 5.0 * hard.interval[:, 0]).all()  # c1, which bends the curve
 
 
+def test_forces_that_were_measured_are_taken_as_they_are():
+    own = drive(noise=0.0)
+    wheels = {f"fy_{wheel}": np.full(len(own), value) for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))}
+    motion = axle_motion([replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True)
+    np.testing.assert_allclose(motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1))
+
+
 def test_several_drives_count_together():
     both = fit_tyres([drive(seed=1), drive(seed=2)], TRUCK)
     assert both.slip.shape[1] == 2 * fit_tyres([drive(seed=1)], TRUCK).slip.shape[1]

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import ndimage, signal
 
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import FloatArray, Recording
@@ -31,6 +31,15 @@ FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a record
 SIGN_CORRELATION = 0.3
 MAX_SCALE = 1.7  # between d(vy_ref)/dt and what it must equal; km/h for m/s makes 3.6 or 1/3.6
 DEGREES_PER_RADIAN = 180.0 / np.pi
+STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
+STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
+STRAIGHT_SECONDS = 3.0
+MOST_STEERING_OFFSET = np.deg2rad(3.0)
+DROPOUT_SPEED = 3.0  # m/s
+DROPOUT_SHARE = 0.1  # of the other wheels' median
+DROPOUT_SECONDS = 0.1
+DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
+DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 
 
 @dataclass(frozen=True)
@@ -326,6 +335,63 @@ def _saturated(recording: Recording) -> list[Finding]:
     return findings
 
 
+def _steering_offset(recording: Recording) -> list[Finding]:
+    """Straight ahead the steering angle must be about zero: its median where a moving car hardly turns."""
+    if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
+        return []
+    straight = (recording["vx"] > STRAIGHT_SPEED) & (np.abs(recording["yaw_rate"]) < STRAIGHT_YAW_RATE) & np.isfinite(recording["steer"])
+    seconds = straight.sum() / recording.rate_hz
+    if seconds < STRAIGHT_SECONDS:
+        return []
+    shown = recording["steer"][straight]
+    offset = float(np.median(shown))
+    if abs(offset) < max(MOST_STEERING_OFFSET, 2.0 * float(shown.std())):
+        return []
+    return [
+        Finding(
+            "warning",
+            "offset",
+            "steer",
+            f"shows {np.rad2deg(offset):.3g} deg where the car hardly turns ({seconds:.3g} s of it): "
+            f"take {offset:.3g} rad off with the transform offset_correction",
+        )
+    ]
+
+
+def _wheel_dropout(recording: Recording) -> list[Finding]:
+    """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard."""
+    names = [f"wheel_speed_{wheel}" for wheel in ("fl", "fr", "rl", "rr")]
+    if not {"vx", *names} <= set(recording.channels):
+        return []
+    rolling = recording["vx"] > DROPOUT_SPEED
+    if "ax" in recording:
+        around = 2 * round(DROPOUT_CLEAR_SECONDS * recording.rate_hz) + 1
+        rolling &= ~ndimage.maximum_filter1d(recording["ax"] < -DROPOUT_BRAKING, around)
+    wheels = np.abs(recording.stack(names))
+    findings = []
+    for place, name in enumerate(names):
+        others = np.median(np.delete(wheels, place, axis=1), axis=1)
+        starts, lengths = _long_runs(rolling & (wheels[:, place] < DROPOUT_SHARE * others), at_least=1)
+        out = [
+            (start, length)
+            for start, length in zip(starts.tolist(), lengths.tolist(), strict=True)
+            if rolling[start] and wheels[start, place] < DROPOUT_SHARE * others[start] and length > DROPOUT_SECONDS * recording.rate_hz
+        ]
+        if out:
+            longest = max(out, key=lambda run: run[1])
+            findings.append(
+                Finding(
+                    "warning",
+                    "dropout",
+                    name,
+                    f"shows next to nothing {len(out)} times while the other wheels turn, the longest for "
+                    f"{longest[1] / recording.rate_hz:.3g} s from {recording.time[longest[0]]:.12g} s; "
+                    f"the transform speed_from_wheels leaves such a wheel out",
+                )
+            )
+    return findings
+
+
 def _standstill(recording: Recording) -> BoolArray:
     """Where the car stands: the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
     standing = np.zeros(len(recording), dtype=bool)
@@ -369,4 +435,6 @@ _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     _not_measured,
     _stuck,
     _saturated,
+    _steering_offset,
+    _wheel_dropout,
 )

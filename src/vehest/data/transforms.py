@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.data.channels import CHANNELS
@@ -381,6 +382,103 @@ class SteeringRatio:
         return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
 
 
+@dataclass(frozen=True)
+class SpeedFromWheels:
+    """Make the forward speed ``vx`` from four wheel speeds, each brought to the centre of gravity, without those that slip or dropped out.
+
+        u_FL = ω_FL R cos δ + r t_F/2,   u_FR = ω_FR R cos δ - r t_F/2,   u_RL = ω_RL R + r t_R/2,   u_RR = ω_RR R - r t_R/2
+
+    A wheel counts while it is within ``tolerance`` of the median of the four, and ``vx`` is the mean of those that count, which moves by
+    no more than ``most_acceleration`` allows. Where fewer than two count, ``ax`` carries the speed on (or nothing, where there is no
+    ``ax``), for ``hold_seconds``; after them the median counts, since something must.
+
+    Args:
+        wheel_radius: rolling radius R [m].
+        track_front: t_F [m].
+        track_rear: t_R [m].
+        tolerance: absolute part of it [m/s]; 5 % of the median come on top.
+        most_acceleration: of the car, forwards or backwards [m/s²].
+        hold_seconds: for how long ``vx`` goes on without two wheels [s].
+
+    Source:
+        Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
+    """
+
+    wheel_radius: float
+    track_front: float
+    track_rear: float
+    tolerance: float = 0.3
+    most_acceleration: float = 12.0
+    hold_seconds: float = 2.0
+    mode: ClassVar[Mode] = "causal"
+    relative_tolerance: ClassVar[float] = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_radius", "track_front", "track_rear", "tolerance", "most_acceleration", "hold_seconds"):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
+                raise ConfigurationError(f"speed from wheels: {name} must be a positive number, not {value!r}")
+
+    def corrected(self, recording: Recording) -> FloatArray:
+        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right.
+
+        Raises:
+            DataError: a wheel speed, ``yaw_rate`` or ``steer`` is missing.
+        """
+        wheels = self.wheel_radius * recording.stack([f"wheel_speed_{wheel}" for wheel in ("fl", "fr", "rl", "rr")]).T
+        wheels[:2] *= np.cos(recording["steer"])
+        sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
+        return wheels + sides[:, None] * recording["yaw_rate"]
+
+    def plausible(self, recording: Recording) -> NDArray[np.bool_]:
+        """Which wheels count, (4, T).
+
+        Raises:
+            DataError: a channel is missing.
+        """
+        speeds = self.corrected(recording)
+        median = _known_median(speeds)
+        return np.abs(speeds - median) <= self.tolerance + self.relative_tolerance * np.abs(median)
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
+
+        Raises:
+            DataError: a channel is missing, or no wheel was ever measured.
+        """
+        speeds, counts = self.corrected(recording), self.plausible(recording)
+        if not np.isfinite(speeds).any():
+            raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
+        step = 1.0 / recording.rate_hz
+        most, patience = self.most_acceleration * step, round(self.hold_seconds * recording.rate_hz)
+        number = counts.sum(0)
+        mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
+        ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
+        vx, held, now = np.empty(len(recording)), 0, math.nan
+        rows = zip(mean.tolist(), number.tolist(), _known_median(speeds).tolist(), ahead.tolist(), strict=True)
+        for k, (wheels, agreeing, median, gain) in enumerate(rows):
+            held = 0 if agreeing >= 2 else held + 1
+            wanted = wheels if agreeing >= 2 else median
+            if math.isnan(now):
+                now = wanted
+            elif (held and held <= patience) or math.isnan(wanted):
+                now += gain
+            else:
+                now += min(max(wanted - now, -most), most)
+            vx[k] = now
+        vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
+        return replace(recording, channels={**recording.channels, "vx": vx}, gappy=recording.gappy - {"vx"})
+
+
+def _known_median(speeds: FloatArray) -> FloatArray:
+    """Median of the wheels that were measured, (4, T) -> (T,); NaN where none was."""
+    ranked = np.sort(speeds, axis=0)  # NaN last
+    number = np.isfinite(speeds).sum(0)
+    column = np.arange(speeds.shape[1])
+    middle: FloatArray = 0.5 * (ranked[np.maximum(number - 1, 0) // 2, column] + ranked[np.minimum(number // 2, 3), column])
+    return np.where(number > 0, middle, np.nan)
+
+
 TRANSFORMS: dict[str, type] = {
     "resample": Resample,
     "low_pass": LowPass,
@@ -389,6 +487,7 @@ TRANSFORMS: dict[str, type] = {
     "delay_correction": DelayCorrection,
     "offset_correction": OffsetCorrection,
     "steering_ratio": SteeringRatio,
+    "speed_from_wheels": SpeedFromWheels,
 }
 
 

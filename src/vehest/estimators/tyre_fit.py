@@ -22,6 +22,7 @@ from scipy import optimize, signal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray, Recording
 from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.rational_tyres import rational_axle
 
 Kind = Literal["linear", "rational"]
 
@@ -93,12 +94,14 @@ def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArr
     Returns:
         Forces (...) [N].
     """
-    if kind == "linear":
-        return parameters[0] * slip
-    return parameters[1] * slip * 2.0 * parameters[0] / (slip**2 + 2.0 * parameters[0])
+    c1, c2 = (math.inf, parameters[0]) if kind == "linear" else parameters
+    force: FloatArray = rational_axle(slip, c1, c2, 1.0).force
+    return force
 
 
-def axle_motion(recordings: Sequence[Recording], parameters: SingleTrackParameters, minimum_speed: float = 3.0) -> AxleMotion:
+def axle_motion(
+    recordings: Sequence[Recording], parameters: SingleTrackParameters, minimum_speed: float = 3.0, *, measured_forces: bool = False
+) -> AxleMotion:
     """Slip angles and forces of the axles along drives.
 
     Yaw acceleration is the slope of a second-order polynomial through half a second of the yaw rate (Savitzky and Golay); whatever else
@@ -108,6 +111,7 @@ def axle_motion(recordings: Sequence[Recording], parameters: SingleTrackParamete
         recordings: with ``yaw_rate``, ``vx``, ``ay``, ``steer`` and ``sideslip_ref``, or ``vy_ref`` in its place.
         parameters: mass, inertia and the places of the axles; cornering stiffnesses are not used.
         minimum_speed: slower samples are left out [m/s].
+        measured_forces: take forces from the channels ``fy_fl`` to ``fy_rr``, which simulated cars have, instead of from accelerations.
 
     Raises:
         DataError: a channel is missing, or hardly any samples are left.
@@ -120,7 +124,7 @@ def axle_motion(recordings: Sequence[Recording], parameters: SingleTrackParamete
             raise DataError(f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more")
         if len(recording) < length:
             continue
-        slip, force = _motion_of(recording, parameters, minimum_speed, length)
+        slip, force = _motion_of(recording, parameters, minimum_speed, length, measured_forces=measured_forces)
         block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
         first_block = int(block[-1]) + 1
         usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
@@ -137,7 +141,9 @@ def axle_motion(recordings: Sequence[Recording], parameters: SingleTrackParamete
     return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks))
 
 
-def _motion_of(recording: Recording, parameters: SingleTrackParameters, minimum_speed: float, length: int) -> tuple[FloatArray, FloatArray]:
+def _motion_of(
+    recording: Recording, parameters: SingleTrackParameters, minimum_speed: float, length: int, *, measured_forces: bool
+) -> tuple[FloatArray, FloatArray]:
     """Slips and forces of one drive, (2, T) each."""
     front, rear, mass, inertia = (
         float(value) for value in (parameters.cg_to_front_axle, parameters.cg_to_rear_axle, parameters.mass, parameters.yaw_inertia)
@@ -152,12 +158,20 @@ def _motion_of(recording: Recording, parameters: SingleTrackParameters, minimum_
     sideslip = recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], u)
     turn = recording["yaw_rate"] / u
     slip = np.stack([smoothed(recording["steer"] - sideslip - front * turn), smoothed(rear * turn - sideslip)])
+    if measured_forces:
+        wheels = [recording[f"fy_{wheel}"] for wheel in ("fl", "fr", "rl", "rr")]
+        return slip, np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])])
     total, moment = mass * smoothed(recording["ay"]), inertia * smoothed(recording["yaw_rate"], derivative=1)
     return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear)
 
 
 def fit_tyres(
-    recordings: Sequence[Recording], parameters: SingleTrackParameters, kind: Kind = "rational", *, minimum_speed: float = 3.0
+    recordings: Sequence[Recording],
+    parameters: SingleTrackParameters,
+    kind: Kind = "rational",
+    *,
+    minimum_speed: float = 3.0,
+    measured_forces: bool = False,
 ) -> TyreFit:
     """Least squares of both axle curves on measured drives.
 
@@ -169,6 +183,7 @@ def fit_tyres(
         parameters: mass, inertia and the places of the axles.
         kind: ``linear`` or ``rational``.
         minimum_speed: slower samples are left out [m/s].
+        measured_forces: as in `axle_motion`.
 
     Raises:
         ConfigurationError: no such kind.
@@ -176,9 +191,22 @@ def fit_tyres(
 
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
+    return fit_motion(axle_motion(recordings, parameters, minimum_speed, measured_forces=measured_forces), kind)
+
+
+def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
+    """The same of slips and forces that are at hand already.
+
+    Args:
+        motion: of both axles.
+        kind: ``linear`` or ``rational``.
+
+    Raises:
+        ConfigurationError: no such kind.
+        DataError: forces run against slips.
+    """
     if kind not in PARAMETERS:
         raise ConfigurationError(f"a tyre curve of kind '{kind}' is not one of: {', '.join(PARAMETERS)}")
-    motion = axle_motion(recordings, parameters, minimum_speed)
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
     (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
     covariance = np.stack([front_covariance, rear_covariance])

@@ -31,8 +31,14 @@ def spans_in_words(spans: Sequence[Span]) -> str:
     words = []
     for span in spans:
         whole = span.start == -math.inf and span.stop == math.inf
-        words.append(span.recording if whole else f"{span.recording} ({span.start:g} to {span.stop:g} s)")
+        words.append(span.recording if whole else f"{span.recording} ({_times(span)})")
     return ", ".join(words) if len(words) <= MOST_NAMED else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
+
+
+def _times(span: Span) -> str:
+    if span.start == -math.inf:
+        return f"up to {span.stop:g} s"
+    return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
 
 
 def metric_values(part: StudyArtefacts) -> dict[tuple[str, str, int, str, str], float]:

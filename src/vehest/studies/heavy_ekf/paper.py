@@ -1,0 +1,27 @@
+"""What Di Biase, Lenzo & Timpone 2020 report; their Table 3 did not survive in the text at hand, so its figures are those of the prose."""
+
+from __future__ import annotations
+
+LINT, RATT, RATTE = "LINT", "RATT", "RATTE"
+ORDER = (RATTE, RATT, LINT)
+"""From the smallest RMSE(β) to the largest."""
+
+VARIANTS = {
+    "lint": LINT,
+    "ratt": RATT,
+    "ratte": RATTE,
+    "ratmu": "RATT with friction",
+}
+"""Variant of the estimator -> what it is called in the report; the first three are the paper's."""
+
+QUICK = "RATTE, quick tyres"
+"""RATTE whose parameters wander as fast as they are told to, not as the training drives suggest."""
+
+LAPS = {RATTE: "below 0.5", RATT: "below 0.89", LINT: "below 1.43"}
+"""RMSE(β) of three laps at 30, 40 and 45 km/h [deg]: of the first it says so, the others follow from `GAINS`."""
+FAST = {RATTE: "0.62", RATT: "slightly above 1", LINT: "slightly above 1"}
+"""RMSE(β) of the fast lap [deg]."""
+GAINS = {(RATT, LINT): 37.0, (RATTE, RATT): 44.0, (RATTE, LINT): 65.0}
+"""By how much the first lies below the second on the three laps [%]."""
+CURVES = {"c1_front": 0.01286, "c2_front": 486735.0, "c1_rear": 0.00769, "c2_rear": 622319.0}
+"""Table 1: c₁ [rad²], c₂ [N/rad]."""
