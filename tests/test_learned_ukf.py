@@ -97,6 +97,8 @@ def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics: str) -
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
     record = made.fit(short, quick(one_step=2, steps=40, validation_steps=60, validation_drop_steps=10))
     assert record.metrics["epochs"] == 3
+    assert record.history["epoch"] == [1, 2, 3], "whole numbers, over all phases, as a tracker wants them"
+    assert record.history["phase"] == [0, 0, 1]
     assert record.metrics["skipped_steps"] == 0
     assert record.metrics["best_validation_loss"] <= record.metrics["start_validation_loss"] < 10.0
     estimate = made.estimate([small_car_drive(1.0, 3).without_references()])[0]

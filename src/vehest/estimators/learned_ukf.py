@@ -418,8 +418,8 @@ def _held(values: FloatArray) -> FloatArray:
 def _record_of(phases: Sequence[PhaseRecord], members: int) -> FitRecord:
     history: dict[str, list[float]] = {"phase": [], "epoch": [], "train_loss": [], "validation_loss": []}
     for number, phase in enumerate(phases):
-        history["phase"] += [float(number)] * phase.epochs
-        history["epoch"] += [float(epoch) for epoch in range(1, phase.epochs + 1)]
+        history["phase"] += [number] * phase.epochs
+        history["epoch"] += range(len(history["epoch"]) + 1, len(history["epoch"]) + phase.epochs + 1)
         history["train_loss"] += phase.train_loss
         history["validation_loss"] += phase.validation_loss
     last = phases[-1]
