@@ -10,6 +10,7 @@ import pandas as pd
 from vehest.estimators.model_files import load_model
 from vehest.report.style import listed
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.learned_ukf import paper
 from vehest.studies.learned_ukf.candidates import models_by_candidate
 
 PAPER_STEP_SIZE = 5e-4
@@ -38,6 +39,10 @@ def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
         *_of_training(filters),
         *_of_settings(filters),
     ]
+    shown = {name for part in parts.values() for name in models_by_candidate(part)}
+    absent = [name for name in paper.CANDIDATES if name not in shown]
+    if absent:
+        lines.append(f"Not part of this run: {listed(absent)}, which the paper compares as well.")
     networks = [model for part in parts.values() for model in part.models if model.estimator.startswith("velocity_")]
     if networks:
         lines.append("GRU and LSTM: what their papers leave open (the LSTM's sizes, the leaky rectifier's slope) is assumed.")
@@ -82,6 +87,9 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
         lines.append(
             f"In training sequences start with the friction off by up to {_either(values('start_spread'))} (paper: at its nominal value)."
         )
+    if any(values("mirrored")):
+        share = _either([100.0 * float(value) for value in values("mirrored")])
+        lines.append(f"{share} % of training sequences and pairs are seen in a mirror, left for right (paper: none).")
     if "residuals" in values("start_noise"):
         lines.append(
             "Noise starts from what the pre-trained dynamics leave unexplained in the training drives, and is learnt in units of that (the "

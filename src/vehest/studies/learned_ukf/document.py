@@ -161,7 +161,7 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
             name == "real"
         )
         blocks += [
-            f"### {tyre.capitalize()}, {'learnt on' if test == 'tyre_a' else 'unseen'}",
+            f"### {tyre[0].upper()}{tyre[1:]}, {'learnt on' if test == 'tyre_a' else 'unseen'}",
             tables.accuracy(
                 runs,
                 test,
