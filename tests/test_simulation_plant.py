@@ -417,7 +417,7 @@ def test_spin_is_survived_and_ends_at_standstill(spin: tuple[Motion, list[PlantS
     assert not states[0].spun
     assert states[-1].stands
     assert math.degrees(np.abs(motion.sideslip[motion.vx**2 + motion.vy**2 > 1.0]).max()) > 60.0
-    for name in (field.name for field in fields(Motion) if field.name != "rate_hz"):
+    for name in (field.name for field in fields(Motion) if field.name != "rate_hz" and not field.name.startswith("motor_")):
         assert np.isfinite(getattr(motion, name)).all(), name
     p = MultiBodyPlant(CORVETTE).parameters
     energy = 0.5 * p.m * (motion.vx**2 + motion.vy**2) + 0.5 * p.I_z * motion.yaw_rate**2

@@ -10,6 +10,7 @@ import pandas as pd
 from vehest.estimators.model_files import load_model
 from vehest.report.style import listed
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.learned_ukf import paper
 from vehest.studies.learned_ukf.candidates import models_by_candidate
 
 PAPER_STEP_SIZE = 5e-4
@@ -38,6 +39,10 @@ def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
         *_of_training(filters),
         *_of_settings(filters),
     ]
+    shown = {name for part in parts.values() for name in models_by_candidate(part)}
+    absent = [name for name in paper.CANDIDATES if name not in shown]
+    if absent:
+        lines.append(f"Not part of this run: {listed(absent)}, which the paper compares as well.")
     networks = [model for part in parts.values() for model in part.models if model.estimator.startswith("velocity_")]
     if networks:
         lines.append("GRU and LSTM: what their papers leave open (the LSTM's sizes, the leaky rectifier's slope) is assumed.")
@@ -68,12 +73,12 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
         epochs = values(phase, "max_epochs")
         if epochs != [PAPER_EPOCHS]:
             differing.append(f"{_either(sorted(epochs))} epochs (paper: {PAPER_EPOCHS}{', of one batch each' * (phase != 'one_step')})")
-        sizes, falling = values(phase, "learning_rate"), "cosine" in values(phase, "schedule")
-        if sizes != [PAPER_STEP_SIZE] or falling:
-            size = f"a step size of {_either(sizes)}{' that falls to zero along a cosine' if falling else ''}"
-            differing.append(f"{size} (paper: {PAPER_STEP_SIZE:g}{', constant' if falling else ''})")
+        if values(phase, "learning_rate") != [PAPER_STEP_SIZE]:
+            differing.append(f"a step size of {_either(values(phase, 'learning_rate'))} (paper: {PAPER_STEP_SIZE:g})")
+        if values(phase, "schedule") != ["constant"]:
+            differing.append("which falls to zero along a cosine (paper: constant)")
         if differing:
-            lines.append(f"{words}: {'; '.join(differing)}.")
+            lines.append(f"{words}: {', '.join(differing)}.")
     if values("batch_size") != [PAPER_BATCH]:
         lines.append(f"Batches of {_either(values('batch_size'))} sequences (the authors' code: {PAPER_BATCH}).")
     if "random" in values("placing"):
@@ -83,7 +88,8 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
             f"In training sequences start with the friction off by up to {_either(values('start_spread'))} (paper: at its nominal value)."
         )
     if any(values("mirrored")):
-        lines.append(f"A share of {_either(values('mirrored'))} of sequences and pairs is seen in a mirror, left for right (paper: none).")
+        share = _either([100.0 * float(value) for value in values("mirrored")])
+        lines.append(f"{share} % of training sequences and pairs are seen in a mirror, left for right (paper: none).")
     if "residuals" in values("start_noise"):
         lines.append(
             "Noise starts from what the pre-trained dynamics leave unexplained in the training drives, and is learnt in units of that (the "
