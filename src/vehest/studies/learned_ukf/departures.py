@@ -73,12 +73,12 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
         epochs = values(phase, "max_epochs")
         if epochs != [PAPER_EPOCHS]:
             differing.append(f"{_either(sorted(epochs))} epochs (paper: {PAPER_EPOCHS}{', of one batch each' * (phase != 'one_step')})")
-        if values(phase, "learning_rate") != [PAPER_STEP_SIZE]:
-            differing.append(f"a step size of {_either(values(phase, 'learning_rate'))} (paper: {PAPER_STEP_SIZE:g})")
-        if values(phase, "schedule") != ["constant"]:
-            differing.append("which falls to zero along a cosine (paper: constant)")
+        sizes, falling = values(phase, "learning_rate"), "cosine" in values(phase, "schedule")
+        if sizes != [PAPER_STEP_SIZE] or falling:
+            size = f"a step size of {_either(sizes)}{' that falls to zero along a cosine' if falling else ''}"
+            differing.append(f"{size} (paper: {PAPER_STEP_SIZE:g}{', constant' if falling else ''})")
         if differing:
-            lines.append(f"{words}: {', '.join(differing)}.")
+            lines.append(f"{words}: {'; '.join(differing)}.")
     if values("batch_size") != [PAPER_BATCH]:
         lines.append(f"Batches of {_either(values('batch_size'))} sequences (the authors' code: {PAPER_BATCH}).")
     if "random" in values("placing"):
@@ -88,8 +88,7 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
             f"In training sequences start with the friction off by up to {_either(values('start_spread'))} (paper: at its nominal value)."
         )
     if any(values("mirrored")):
-        share = _either([100.0 * float(value) for value in values("mirrored")])
-        lines.append(f"{share} % of training sequences and pairs are seen in a mirror, left for right (paper: none).")
+        lines.append(f"A share of {_either(values('mirrored'))} of sequences and pairs is seen in a mirror, left for right (paper: none).")
     if "residuals" in values("start_noise"):
         lines.append(
             "Noise starts from what the pre-trained dynamics leave unexplained in the training drives, and is learnt in units of that (the "
