@@ -37,18 +37,18 @@ def learnt(first: Gaussian[Tensor]) -> Learnt:
 
 
 def both_ways(rule: SigmaRule, measurements: Tensor, inputs: Tensor, first: Gaussian[Tensor], lower=FREE, share=None):
-    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances."""
+    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances, those of measurements last."""
     generator = torch.Generator().manual_seed(5)
     sequences, steps = measurements.shape[:2]
     weights = [torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64) for size in ((3,), (3, 3))]
     least = torch.tensor(lower, dtype=torch.float64)
     pairs = []
     for way in (by_the_filter, by_the_scan):
-        parameters = learnt(first)
+        parameters, measurements = learnt(first), measurements.detach().requires_grad_()
         filtered = way(parameters, rule, measurements, inputs, least, share)
         state = filtered.steps.filtered
         loss = (state.mean * weights[0]).sum() + (state.covariance * weights[1]).sum()
-        pairs.append((filtered, torch.autograd.grad(loss, parameters)))
+        pairs.append((filtered, torch.autograd.grad(loss, (*parameters, measurements))))
     return pairs
 
 
@@ -87,7 +87,7 @@ def assert_equal(one: NonlinearFiltered, other: NonlinearFiltered) -> None:
 def test_scan_is_the_unscented_filter_in_values_and_gradients(name: str) -> None:
     (filtered, gradients), (scanned, own) = both_ways(RULES[name], *measured_pendulum(30, 4))
     assert_equal(filtered, scanned)
-    for field, a, b in zip(Learnt._fields, gradients, own, strict=True):
+    for field, a, b in zip((*Learnt._fields, "measurements"), gradients, own, strict=True):
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max())), field
         assert a.abs().sum() > 0, field
 

@@ -154,7 +154,7 @@ def unscented_scan(
     repair: bool = True,
     share: Share | None = None,
 ) -> NonlinearFiltered:
-    """Filter sequences; filtered means and covariances are differentiable in everything that is a tensor, the rest is not.
+    """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
 
     Args:
         model: how points move.
@@ -270,6 +270,7 @@ class _Scan(torch.autograd.Function):
         m = y.shape[2]
         dtype = y.dtype
         process, observation = np.zeros((steps, sequences, n, n), dtype), np.zeros((steps, sequences, m, m), dtype)
+        measured = np.zeros((steps, sequences, m), dtype)
         mean, covariance = np.zeros((sequences, n), dtype), np.zeros((sequences, n, n), dtype)
         mean_up, covariance_up = (np.ascontiguousarray(part.numpy()) for part in upstream)
         gradients: dict[int, list[Array]] = {}
@@ -279,18 +280,18 @@ class _Scan(torch.autograd.Function):
             part = tape if whole else tape.slice(start, end)
             own = [np.zeros(tuple(parameter.shape), dtype) for parameter in setting.model.parameters]
             gradients[start] = own
-            bars = [
-                piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (process, observation, mean_up, covariance_up)
-            ]
+            wanted = (process, observation, measured)
+            bars = [piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (*wanted, mean_up, covariance_up)]
             data = (y[:, start:end], u[:, start:end])
-            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars[0], bars[1], bars[2], bars[3], own)
+            mean[start:end], covariance[start:end] = _backward(setting, part, *data, *bars, own)
             if not whole:
-                process[:, start:end], observation[:, start:end] = bars[0], bars[1]
+                for piece, bar in zip(wanted, bars, strict=False):
+                    piece[:, start:end] = bar
 
         setting.share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
-        noise = (torch.from_numpy(process).transpose(0, 1), torch.from_numpy(observation).transpose(0, 1))
-        return (None, None, None, None, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
+        return (None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
 
 
 def _forward(setting: _Setting, tape: _Tape, y: Array, u: Array, mean: Array, covariance: Array, noises: Sequence[Any]) -> None:
@@ -343,11 +344,12 @@ def _backward(
     u: Array,
     process_bar: Array,
     observation_bar: Array,
+    y_bar: Array,
     mean_up: Array,
     covariance_up: Array,
     gradients: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Gradients of the initial mean and covariance; those of the noise are written, those of the parameters added."""
+    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added."""
     model, rule, lower = setting.model, setting.rule, setting.lower
     steps, sequences, n = tape.post_mean.shape
     m = y.shape[2]
@@ -379,6 +381,7 @@ def _backward(
             points_bar,
             expected_bar,
             observation_bar[k],
+            y_bar[k],
         )
         points_bar += model.observation_adjoint(points, now, expected_bar, gradients)
         points_adjoint(tape.prior_mean[k], factor, rule, lower, points_bar, mean_bar, covariance_bar)

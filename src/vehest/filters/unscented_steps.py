@@ -152,19 +152,10 @@ def update_of(  # type: ignore[no-untyped-def]
     cross, factor, whitened = np.empty((n, m), mean.dtype), np.empty((m, m), mean.dtype), np.empty(m, mean.dtype)
     for b in range(sequences):
         measured = 0
+        _spread(expected[b], points[b], mean[b], y[b], rule, innovation[b], spread, deviation)
         for i in range(m):
-            total = expected[b, 0, i] * 0
-            for s in range(1, count):
-                total += expected[b, s, i]
-            centre = centre_mean * expected[b, 0, i] + other * total
-            known = y[b, i] == y[b, i]
-            measured += known
-            innovation[b, i] = y[b, i] - centre if known else 0.0
-            for s in range(count):
-                spread[s, i] = expected[b, s, i] - centre if known else 0.0
+            measured += y[b, i] == y[b, i]
         for i in range(n):
-            for s in range(count):
-                deviation[s, i] = points[b, s, i] - mean[b, i]
             for j in range(m):
                 total = mean[b, 0] * 0
                 for s in range(1, count):
@@ -240,8 +231,9 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     points_bar,
     expected_bar,
     noise_bar,
+    y_bar,
 ):
-    """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar`` and ``noise_bar``."""
+    """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar``, ``noise_bar`` and ``y_bar``."""
     sequences, count, m = expected.shape
     n = mean.shape[1]
     _, centre_mean, centre_covariance, other = rule
@@ -250,23 +242,15 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     P, K = np.empty((n, n), mean.dtype), np.empty((n, m), mean.dtype)
     factor, solved, pulled = np.empty((m, m), mean.dtype), np.empty(m, mean.dtype), np.empty(m, mean.dtype)
     through, cross_bar, own_bar = np.empty(n, mean.dtype), np.empty((n, m), mean.dtype), np.empty((m, m), mean.dtype)
+    off = np.empty(m, mean.dtype)
     for b in range(sequences):
-        for i in range(m):
-            total = expected[b, 0, i] * 0
-            for s in range(1, count):
-                total += expected[b, s, i]
-            centre = centre_mean * expected[b, 0, i] + other * total
-            known = y[b, i] == y[b, i]
-            for s in range(count):
-                spread[s, i] = expected[b, s, i] - centre if known else 0.0
+        _spread(expected[b], points[b], mean[b], y[b], rule, off, spread, deviation)
         for i in range(n):
             total = mean[b, i]
             for c in range(m):
                 K[i, c] = gain[b, i, c]
                 total += K[i, c] * innovation[b, c]
             through[i] = post_mean_bar[b, i] if total >= lower[i] else total * 0
-            for s in range(count):
-                deviation[s, i] = points[b, s, i] - mean[b, i]
             for j in range(n):
                 P[i, j] = half * (post_covariance_bar[b, i, j] + post_covariance_bar[b, j, i])
                 covariance_bar[b, i, j] = P[i, j]
@@ -286,6 +270,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
             for i in range(n):
                 total += K[i, c] * through[i]
             pulled[c] = total
+            y_bar[b, c] = total if y[b, c] == y[b, c] else total * 0
         for i in range(n):
             for c in range(m):
                 total = through[i] * solved[c]
@@ -325,6 +310,25 @@ def update_adjoint(  # type: ignore[no-untyped-def]
             expected_bar[b, 0, c] += centre_mean * total
             for s in range(1, count):
                 expected_bar[b, s, c] += other * total
+
+
+@compiled
+def _spread(expected, points, mean, y, rule, innovation, spread, deviation):  # type: ignore[no-untyped-def]
+    """Of one sequence: innovation, and how far points lie from the mean and what is expected at them from its own; 0 where not measured."""
+    count, m = expected.shape
+    _, centre_mean, _, other = rule
+    for i in range(m):
+        total = expected[0, i] * 0
+        for s in range(1, count):
+            total += expected[s, i]
+        centre = centre_mean * expected[0, i] + other * total
+        known = y[i] == y[i]
+        innovation[i] = y[i] - centre if known else 0.0
+        for s in range(count):
+            spread[s, i] = expected[s, i] - centre if known else 0.0
+    for i in range(mean.shape[0]):
+        for s in range(count):
+            deviation[s, i] = points[s, i] - mean[i]
 
 
 @compiled
