@@ -37,7 +37,10 @@ def learnt(first: Gaussian[Tensor]) -> Learnt:
 
 
 def both_ways(rule: SigmaRule, measurements: Tensor, inputs: Tensor, first: Gaussian[Tensor], lower=FREE, share=None):
-    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances, those of measurements last."""
+    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances.
+
+    Those of the measurements come last.
+    """
     generator = torch.Generator().manual_seed(5)
     sequences, steps = measurements.shape[:2]
     weights = [torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64) for size in ((3,), (3, 3))]

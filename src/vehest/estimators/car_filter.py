@@ -9,15 +9,15 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
-from vehest.estimators.kernels.tyre_network import CompiledTyreNetwork
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
 from vehest.filters.nonlinear import Function, NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
-from vehest.vehicle.dynamics import MEASUREMENTS, STATES, Dynamics, TyreNetworkCar
+from vehest.vehicle.dynamics import STATES, Dynamics
 
 NoiseKind = Literal["constant", "state_dependent"]
 
@@ -82,8 +82,8 @@ class CarFilter(nn.Module):
     def point_model(self) -> PointModel:
         """The dynamics as the filter takes them: compiled where they can be."""
         dtype = next(self.parameters()).dtype
-        if isinstance(self.dynamics, TyreNetworkCar) and self.dynamics.is_compilable:
-            return CompiledTyreNetwork(self.dynamics, self.step, self.lower, dtype)
+        if is_compilable(self.dynamics):
+            return CompiledPlanarCar(self.dynamics, self.step, self.lower, dtype)
         return TorchModel(
             lambda points, inputs: self.dynamics.transition(points, inputs, self.step),
             self.dynamics.observation,
@@ -177,6 +177,3 @@ class CarFilter(nn.Module):
 
     def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
         return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
-
-
-assert len(OBSERVATION) == len(MEASUREMENTS)

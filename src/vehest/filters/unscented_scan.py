@@ -283,7 +283,7 @@ class _Scan(torch.autograd.Function):
             wanted = (process, observation, measured)
             bars = [piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (*wanted, mean_up, covariance_up)]
             data = (y[:, start:end], u[:, start:end])
-            mean[start:end], covariance[start:end] = _backward(setting, part, *data, *bars, own)
+            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars, own)
             if not whole:
                 for piece, bar in zip(wanted, bars, strict=False):
                     piece[:, start:end] = bar
@@ -342,14 +342,15 @@ def _backward(
     tape: _Tape,
     y: Array,
     u: Array,
-    process_bar: Array,
-    observation_bar: Array,
-    y_bar: Array,
-    mean_up: Array,
-    covariance_up: Array,
+    bars: Sequence[Array],
     gradients: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added."""
+    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added.
+
+    Args:
+        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
+    """
+    process_bar, observation_bar, y_bar, mean_up, covariance_up = bars
     model, rule, lower = setting.model, setting.rule, setting.lower
     steps, sequences, n = tape.post_mean.shape
     m = y.shape[2]

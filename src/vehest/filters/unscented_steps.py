@@ -145,7 +145,7 @@ def update_of(  # type: ignore[no-untyped-def]
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired."""
     sequences, count, m = expected.shape
     n = mean.shape[1]
-    _, centre_mean, centre_covariance, other = rule
+    _, _, centre_covariance, other = rule
     half = rule.dtype.type(0.5)
     log_two_pi = rule.dtype.type(np.log(2.0 * np.pi))
     spread, deviation = np.empty((count, m), mean.dtype), np.empty((count, n), mean.dtype)
