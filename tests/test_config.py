@@ -86,6 +86,19 @@ def test_shipped_pipeline_of_the_ferrari_has_31_jobs(elsewhere):
     assert [span["start"] for span in configs[0]["split"]["train"]] == [150]
 
 
+SHIPPED = {file.stem for file in (Path(__file__).parents[1] / "pipelines").glob("*.yaml")}
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED - {"ksnn", "ksnn_revs"}))  # these two: test_parts
+def test_first_and_last_job_of_every_sweep_of_shipped_pipelines_compose(elsewhere, name):
+    pipeline = read_pipeline(name)
+    if pipeline.datasets:
+        assert pipeline_configs(pipeline, [])
+    ends = {(part.split, *job) for part in pipeline.parts for sweep in part.sweeps for job in (expand(sweep)[0], expand(sweep)[-1])}
+    for split, *job in sorted(ends):
+        assert compose_config("eval", [f"split={split}", *pipeline.evaluation, *job])["split"]["name"] == split
+
+
 def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
     configs = pipeline_configs(read_pipeline("quickstart"), ["training.learning_rate=0.01"])[""]
     rates = {config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs}
