@@ -243,6 +243,13 @@ def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _loads(theta, constants):  # type: ignore[no-untyped-def]
+    """Weight over wheelbase [N/m], and static loads of front and rear axle [N]."""
+    weight = constants[0] * constants[8] / constants[1]
+    return weight, weight * theta[0], weight * (constants[1] - theta[0])
+
+
+@compiled
 def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
@@ -261,9 +268,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
             for p in range(points):
                 forces[k, p] = unscaled * o[k, p]
     else:
-        lr = theta[0]
-        weight = constants[0] * constants[8] / constants[1]
-        front_load, rear_load = weight * lr, weight * (constants[1] - lr)
+        _, front_load, rear_load = _loads(theta, constants)
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         for p in range(points):
             along = friction * Dx * _curve(slips[2, p], Bx, Cx)[0]
@@ -295,9 +300,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             for p in range(points):
                 o_bar[k, p] = unscaled * slope[k, p]
     else:
-        lr = theta[0]
-        weight = constants[0] * constants[8] / constants[1]
-        front_load, rear_load = weight * lr, weight * (constants[1] - lr)
+        weight, front_load, rear_load = _loads(theta, constants)
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         total = np.zeros_like(theta)
         for p in range(points):
