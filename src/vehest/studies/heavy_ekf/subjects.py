@@ -82,11 +82,12 @@ def validation_drives(part: StudyArtefacts) -> list[Recording]:
 
 
 def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
-    """The curves that a rational filter was fitted with, beside what the axles do in other drives."""
+    """The curves that a rational filter was fitted with and how well its fit knew them, beside what the axles do in other drives."""
     car, slowest = own.settings.car, own.settings.minimum_speed
     motion = axle_motion(drives, car, slowest)
     axles = own.curves.reshape(2, 2)
-    blocks = [own.curve_covariance[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
+    of_fit = own.curve_covariance - (own.settings.curves.deviation or 0.0) ** 2 * np.eye(4)
+    blocks = [of_fit[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
     left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
     rms = np.sqrt(np.mean(np.square(left), axis=1))
     return TyreFit("rational", axles[0], axles[1], np.stack(blocks), rms, motion.slip, motion.force)

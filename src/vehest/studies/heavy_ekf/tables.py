@@ -190,7 +190,7 @@ def _gained(errors: pd.DataFrame) -> str:
             f"{DRIVES[drive]} {fixed(same, 2)}° on nominal and {fixed(worn, 2)}° on worn tyres, beside mean errors of "
             f"{fixed(same_mean, 2)}° and {fixed(worn_mean, 2)}°"
         )
-    return f"RATT's errors have a standard deviation of, {'; '.join(words)}. Adapting can take away what differs between the former."
+    return f"Standard deviations of RATT's errors: {'; '.join(words)}. Adapting can take away by how much those grow with worn tyres."
 
 
 def _held(rmse: Rmse, errors: pd.DataFrame) -> str:
