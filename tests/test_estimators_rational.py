@@ -13,7 +13,7 @@ import torch
 from rational_drive import CURVES, NOISE, changed, rational_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
-from vehest.estimators.rational_ekf import KINDS, LEVELS, RationalFilter, RationalSettings
+from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter, RationalSettings
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import extended_filter
@@ -152,6 +152,23 @@ def test_changed_tyres_are_found_and_help():
     assert errors[0] < 0.5 * errors[1]
 
 
+def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(drive):
+    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
+    estimator = rational(adapt_above=2.0)
+    filtered = estimator.filter_samples(drive.stack(estimator.channels))
+    before, after = filtered.mean[:-1, 4:], filtered.mean[1:, 4:]
+    held = (before == after).all(axis=1)
+    bend = np.abs(drive["vx"] * filtered.mean[:, 1])[1:]
+    assert held[bend < 1.5].all()
+    assert not held[bend > 2.5].any()
+    assert 0.1 < held.mean() < 0.9
+    straight = changed(drive, {"steer": np.zeros(800), "yaw_rate": np.zeros(800), "ay": np.full(800, 0.3)})
+    kept, moved = (rational(adapt_above=limit).filter_samples(straight.stack(estimator.channels)).last.mean[4:] for limit in (2.0, 0.0))
+    assert (kept == 0.0).all()
+    assert np.abs(moved).max() > 0.1
+    assert (rational(adapt_above=2.0).variant, rational("rational", adapt_above=2.0).variant) == ("ratte_held", "ratt")
+
+
 def test_friction_is_found():
     estimate = rational("rational_friction").estimate([rational_drive(60.0, seed=3, friction=0.7)])[0]
     assert estimate["friction"][-200:].mean() == pytest.approx(0.7, abs=0.03)
@@ -235,6 +252,27 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     assert np.array_equal(other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"])
 
 
+def test_curves_come_from_the_recordings_that_are_named_and_start_as_uncertain_as_they_are_told():
+    """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
+    train, worn = rational_drive(60.0, seed=4), rational_drive(60.0, seed=7, stiffness=0.85)
+    alone, both = (estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}}) for spread in (None, 0.2))
+    alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
+    both.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
+    assert np.array_equal(alone.curves, both.curves)
+    np.testing.assert_allclose(both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12)
+    with pytest.raises(ConfigurationError, match=r"curves_from 'fit_\*' matches no training recording \(rational4\)"):
+        both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
+
+
+def test_levels_of_the_unscented_filter_are_found_through_the_extended_one():
+    train = rational_drive(30.0, seed=8)
+    fitted = [estimator_class("rational_ekf").from_config({"filter": kind}) for kind in ("extended", "unscented")]
+    for estimator in fitted:
+        estimator.fit(FitData([train], []), NoiseTuningSettings(grid=1, max_evaluations=5))
+    assert fitted[0].levels == fitted[1].levels
+    assert fitted[1].settings.filter == "unscented"
+
+
 def test_levels_of_the_data_need_no_search_and_given_ones_stay():
     train = rational_drive(30.0, seed=6)
     estimator = estimator_class("rational_ekf").from_config({"noise": {"tyres": 0.02}})
@@ -258,6 +296,17 @@ def test_optuna_is_asked_for_by_name_where_it_is_absent(monkeypatch):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
+def test_levels_that_optuna_finds_lie_in_the_box_and_get_better_with_trials():
+    train = rational_drive(30.0, seed=9)
+    few, many = (estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2))
+    records = [own.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n)) for own, n in ((few, 3), (many, 25))]
+    assert [record.metrics["evaluations"] for record in records] == [3, 25]
+    assert records[1].metrics["best_train_loss"] <= records[0].metrics["best_train_loss"]
+    low, high = BOXES["ay"]
+    assert 10.0**low <= many.levels["ay"] / many.levels["yaw_rate"] <= 10.0**high
+
+
+@pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
 def test_optuna_finds_the_minimum_and_the_same_for_the_same_seed():
     records = [optuna_search(lambda p: float((p[0] - 0.3) ** 2), [(-1.0, 1.0)], 40, 7, FitContext()) for _ in range(2)]
     assert records[0].best[0] == pytest.approx(0.3, abs=0.1)
@@ -275,6 +324,8 @@ def test_a_drive_without_a_reference_is_one_clear_error(drive):
         ({"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
         ({"filter": "particle"}, "filter 'particle' is not one of: extended, unscented"),
         ({"bound": 1.0}, "bound must be more than 1"),
+        ({"adapt_above": -1.0}, "adapt_above must not be negative"),
+        ({"adapt_above": 1.0, "filter": "unscented"}, "adapt_above needs estimator.filter=extended"),
         ({"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
         ({"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
         ({"noise": {"tyres": -1.0}}, r"estimator\.noise\.tyres must be positive"),

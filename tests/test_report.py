@@ -369,6 +369,15 @@ def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefa
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
 
 
+def test_paths_of_figures_are_given_to_a_hundredth_of_a_point(tmp_path: Path) -> None:
+    static = MatplotlibFigure()
+    static.add_subplot().plot(np.sin(np.arange(200.0)))
+    write_document(Document("One", [Figure("line", "A line.", static)]), tmp_path, page=False)
+    paths = re.findall(r'\bd="([^"]*)"', (tmp_path / "figures" / "line.svg").read_text(encoding="utf-8"))
+    assert max(len(path) for path in paths) > 1000
+    assert not any(re.search(r"\.\d{3}", path) for path in paths)
+
+
 def test_page_without_interactive_figures_leaves_the_library_out(tmp_path: Path) -> None:
     static = MatplotlibFigure()
     static.add_subplot().plot([0, 1], [1, 0])

@@ -10,7 +10,7 @@ import pytest
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.tyre_fit import axle_force, axle_motion, fit_tyres
+from vehest.estimators.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_tyres
 from vehest.vehicle.parameters import SingleTrackParameters
 
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
@@ -76,6 +76,15 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
 def test_wider_intervals_where_tyres_stay_in_their_linear_range():
     gentle, hard = fit_tyres([drive(size=0.3)], TRUCK), fit_tyres([drive()], TRUCK)
     assert (gentle.interval[:, 0] > 5.0 * hard.interval[:, 0]).all()  # c1, which bends the curve
+
+
+def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
+    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
+    fit = fit_tyres([drive(size=0.05)], TRUCK)
+    assert (np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]).all()
+    found, interval = np.array([fit.front[0], fit.rear[0]]), fit.interval[:, 0]
+    np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
+    np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
 
 
 def test_forces_that_were_measured_are_taken_as_they_are():

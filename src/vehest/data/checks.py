@@ -359,7 +359,10 @@ def _steering_offset(recording: Recording) -> list[Finding]:
 
 
 def _wheel_dropout(recording: Recording) -> list[Finding]:
-    """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard."""
+    """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard.
+
+    On slippery roads wheels lock under gentle braking too; without a channel of the brakes that cannot be told from a dropout for certain.
+    """
     names = [f"wheel_speed_{wheel}" for wheel in ("fl", "fr", "rl", "rr")]
     if not {"vx", *names} <= set(recording.channels):
         return []

@@ -13,8 +13,8 @@ import numpy as np
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
-from vehest.estimators.single_track import SingleTrackEstimator, SingleTrackSettings, checked_sample, require_positive
+from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.single_track import SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
@@ -197,26 +197,17 @@ class KalmanFilter(SingleTrackEstimator):
         self.levels = {name: float(weights[name][0]) for name in LEVELS}
 
 
-class KalmanStepper(Stepper):
+class KalmanStepper(SingleTrackStepper):
     """The filter, one sample at a time."""
 
-    def __init__(self, estimator: KalmanFilter) -> None:
-        self._estimator = estimator
-        self._last: FloatArray | None = None
-        self._state: Gaussian[FloatArray] | None = None
+    _estimator: KalmanFilter
 
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample; NaN in yaw_rate or ay is skipped."""
-        estimator = self._estimator
-        row = checked_sample(sample, estimator.channels, estimator.skippable)
-        if self._last is None or self._state is None:
-            rows, state = row[None], estimator.first_state(row[1], estimator.settings.initial_deviation, None)
-        else:  # the last sample's measurements are part of the state already
-            rows, state = np.stack([self._last, row]), self._state
-            rows[0, [0, 2]] = np.nan
-        filtered = estimator.filter_samples(rows, estimator.levels, state).filtered
-        self._last, self._state = row, Gaussian(filtered.mean[-1], filtered.covariance[-1])
-        return {"vy": float(row[1] * math.tan(self._state.mean[0])), "yaw_rate": float(self._state.mean[1])}
+    def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
+        return self._estimator.first_state(row[1], self._estimator.settings.initial_deviation, None)
+
+    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        filtered = self._estimator.filter_samples(rows, self._estimator.levels, state).filtered
+        return Gaussian(filtered.mean[-1], filtered.covariance[-1]), {}
 
 
 def _number(level: float | None) -> float:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from copy import copy
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -15,8 +17,8 @@ from numpy.typing import NDArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
-from vehest.estimators.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, checked_sample, require_positive
+from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
 from vehest.estimators.tyre_fit import fit_tyres
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
@@ -34,6 +36,7 @@ CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
 ROLLING = (0.05, 0.2, 1.0, 2.0)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
 LARGEST = (1.5, 5.0, 20.0, 100.0)  # the same units: what estimates are kept within
 FRICTION_START = 0.1  # standard deviation of its logarithm
+GIVEN_DEVIATION = 0.1  # of the logarithms of curves that nobody fitted
 BOXES = {"ay": (0.5, 3.0), "steer": (-2.0, 2.0), "tyres": (-4.0, -1.0)}  # powers of ten: ay and steer over yaw_rate, tyres as it is
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
 FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
@@ -78,14 +81,15 @@ class AxleCurves:
         c2_front: cornering stiffness of the front axle [N/rad].
         c1_rear: of the rear axle.
         c2_rear: of the rear axle.
-        deviation: standard deviation of their logarithms at the start.
+        deviation: standard deviation of their logarithms at the start, by which tyres may differ from these; with a fit, on top of what
+            that does not know. Where it is not given: 0.1 about curves that are given, and nothing on top of a fit.
     """
 
     c1_front: float | None = None
     c2_front: float | None = None
     c1_rear: float | None = None
     c2_rear: float | None = None
-    deviation: float = 0.1
+    deviation: float | None = None
 
     def __post_init__(self) -> None:
         require_positive("estimator.curves", asdict(self))
@@ -100,6 +104,8 @@ class RationalSettings(SingleTrackSettings):
             both axles are states) or ``rational_friction`` (beyond the paper: the friction is).
         filter: ``extended`` or ``unscented``.
         bound: factor by which tyre parameters may leave those that the filter started with.
+        adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²]; 0: never, as in the paper. Straight ahead
+            offsets of sensors are all that there is to adapt to. Only of the extended filter.
         noise: levels of noise.
         curves: axle curves.
     """
@@ -108,6 +114,7 @@ class RationalSettings(SingleTrackSettings):
     tyres: Tyres = "rational_adaptive"
     filter: Literal["extended", "unscented"] = "extended"
     bound: float = 3.0
+    adapt_above: float = 0.0
     noise: TrackNoise = TrackNoise()
     curves: AxleCurves = AxleCurves()
 
@@ -119,6 +126,10 @@ class RationalSettings(SingleTrackSettings):
             raise ConfigurationError(f"estimator.filter '{self.filter}' is not one of: extended, unscented")
         if not self.bound > 1.0:
             raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
+        if not self.adapt_above >= 0.0:
+            raise ConfigurationError(f"estimator.adapt_above must not be negative, not {self.adapt_above}")
+        if self.adapt_above and self.filter == "unscented":
+            raise ConfigurationError("estimator.adapt_above needs estimator.filter=extended; set one of the two back")
         for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
             given = [name for name in names if getattr(getattr(self, group), name) is not None]
             if given and len(given) < len(names):
@@ -188,19 +199,25 @@ class RationalFilter(SingleTrackEstimator):
         super().__init__(settings)
         curves = {name: getattr(settings.curves, name) for name in settings.curve_names}
         self.curves = np.array([_number(curves.get(name, math.inf)) for name in CURVES])
-        self.curve_covariance = settings.curves.deviation**2 * np.eye(len(CURVES))
+        self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
         self.levels = {name: _number(getattr(settings.noise, name) if name in settings.level_names else 0.0) for name in LEVELS}
         self._seed = 0
 
     @property
     def variant(self) -> str:
-        """The paper's name for these tyres, and whether the filter is another one."""
-        return KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")
+        """The paper's name for these tyres, and whether the filter is another one or holds them straight ahead."""
+        kind = KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")
+        return kind + ("_held" if self._holds else "")
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
-        return f"{KINDS[self.settings.tyres][1]}, {'unscented' if self.settings.filter == 'unscented' else 'extended'} Kalman filter"
+        held = ", tyres held straight ahead" if self._holds else ""
+        return f"{KINDS[self.settings.tyres][1]}, {self.settings.filter} Kalman filter{held}"
+
+    @property
+    def _holds(self) -> bool:
+        return bool(self.settings.adapted) and self.settings.adapt_above > 0.0
 
     @property
     def learns(self) -> bool:
@@ -251,16 +268,17 @@ class RationalFilter(SingleTrackEstimator):
         history: dict[str, list[float]] = {}
         interrupted = False
         if not self._curves_given:
-            metrics |= self._fit_curves(data.train)
+            metrics |= self._fit_curves(_named_like(data.train, training.curves_from))
         if training.method == "data":
             self.levels = self._levels_of(data.train)
         elif self._searched:
-            search = self._tune(data.train, training, context)
+            extended = self._extended()
+            search = extended._tune(data.train, training, context)
             n = len(self._searched)
             columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
             history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
-            self.levels = self._calibrated(search.best[:n], [_samples(r) for r in data.train])
+            self.levels = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
             interrupted = search.interrupted
         if data.validation and all(_has_reference(recording) for recording in data.validation):
             metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
@@ -278,7 +296,8 @@ class RationalFilter(SingleTrackEstimator):
         self.curve_covariance = np.zeros((len(CURVES), len(CURVES)))
         for axle, (values, covariance) in enumerate(zip((fit.front, fit.rear), fit.covariance, strict=True)):
             own = rows[axle * len(values) : (axle + 1) * len(values)]
-            self.curve_covariance[np.ix_(own, own)] = covariance / np.outer(values, values)
+            spread = (self.settings.curves.deviation or 0.0) ** 2 * np.eye(len(values))
+            self.curve_covariance[np.ix_(own, own)] = covariance / np.outer(values, values) + spread
         found = {CURVES[row]: float(self.curves[row]) for row in rows}
         intervals = dict(zip((f"{CURVES[row]}_interval" for row in rows), fit.interval.ravel().tolist(), strict=True))
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
@@ -297,6 +316,14 @@ class RationalFilter(SingleTrackEstimator):
             if not levels[name] > 0.0:
                 raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
         return levels
+
+    def _extended(self) -> RationalFilter:
+        """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
+        if self.settings.filter == "extended":
+            return self
+        twin = copy(self)
+        twin.settings = replace(self.settings, filter="extended")
+        return twin
 
     def _tune(self, recordings: Sequence[Recording], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
@@ -399,6 +426,7 @@ class RationalFilter(SingleTrackEstimator):
             np.square(ROLLING),
             1.0 / self.settings.rate_hz,
             self.settings.minimum_speed,
+            self.settings.adapt_above,
             mean,
             covariance,
             *out,
@@ -506,27 +534,27 @@ class RationalFilter(SingleTrackEstimator):
         self.levels = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
 
 
-class RationalStepper(Stepper):
-    """The filter, one sample at a time."""
+class RationalStepper(SingleTrackStepper):
+    """The filter, one sample at a time; it also tells of the tyres."""
 
-    def __init__(self, estimator: RationalFilter) -> None:
-        self._estimator = estimator
-        self._last: FloatArray | None = None
-        self._state: Gaussian[FloatArray] | None = None
+    _estimator: RationalFilter
 
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Lateral velocity [m/s], yaw rate [rad/s] and tyre parameters at the time of the sample; NaN in yaw_rate or ay is skipped."""
-        estimator = self._estimator
-        row = checked_sample(sample, estimator.channels, estimator.skippable)
-        if self._last is None or self._state is None:
-            rows, state = row[None], estimator.start(row)
-        else:  # the last sample's measurements are part of the state already
-            rows, state = np.stack([self._last, row]), self._state
-            rows[0, [0, 2]] = np.nan
-        filtered = estimator.filter_samples(rows, state)
-        self._last, self._state = row, filtered.last
-        tyres = {name: float(values[-1]) for name, values in estimator._quantities(filtered.mean[-1:]).items()}
-        return {"vy": float(row[1] * math.tan(filtered.mean[-1, 0])), "yaw_rate": float(filtered.mean[-1, 1]), **tyres}
+    def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
+        return self._estimator.start(row)
+
+    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        filtered = self._estimator.filter_samples(rows, state)
+        tyres = self._estimator._quantities(filtered.mean[-1:])
+        return filtered.last, {name: float(values[-1]) for name, values in tyres.items()}
+
+
+def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording]:
+    """Recordings whose id matches."""
+    found = [recording for recording in recordings if fnmatchcase(recording.id, pattern)]
+    if not found:
+        known = ", ".join(sorted({recording.id for recording in recordings}))
+        raise ConfigurationError(f"training.curves_from '{pattern}' matches no training recording ({known})")
+    return found
 
 
 def _samples(recording: Recording) -> FloatArray:

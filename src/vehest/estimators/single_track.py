@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -11,7 +13,7 @@ import numpy as np
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
-from vehest.estimators.base import Estimator, EstimatorSettings, required
+from vehest.estimators.base import Estimator, EstimatorSettings, Stepper, required
 from vehest.filters.gaussian import Gaussian
 from vehest.training.settings import NoTraining
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
@@ -90,6 +92,36 @@ class SingleTrackEstimator(Estimator):
         return self._wrapped(
             recording, vx * tangent, covariance, STATE if covariance is not None else (), yaw_rate=states[:, 1].copy(), **others
         )
+
+
+class SingleTrackStepper(Stepper):
+    """A filter of β, r and perhaps more, one sample at a time: each step filters the last sample and the new one."""
+
+    def __init__(self, estimator: SingleTrackEstimator) -> None:
+        self._estimator = estimator
+        self._last: FloatArray | None = None
+        self._state: Gaussian[FloatArray] | None = None
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Lateral velocity [m/s], yaw rate [rad/s] and what else the filter knows; NaN in yaw_rate or ay is skipped."""
+        channels, skippable = self._estimator.channels, self._estimator.skippable
+        row = checked_sample(sample, channels, skippable)
+        if self._last is None or self._state is None:
+            rows, state = row[None], self._first(row)
+        else:  # the last sample's measurements are part of the state already
+            rows, state = np.stack([self._last, row]), self._state
+            rows[0, [channels.index(name) for name in skippable]] = np.nan
+        self._state, others = self._filtered(rows, state)
+        self._last = row
+        return {"vy": float(row[1] * math.tan(self._state.mean[0])), "yaw_rate": float(self._state.mean[1]), **others}
+
+    @abstractmethod
+    def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
+        """State before the first sample, (4,)."""
+
+    @abstractmethod
+    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        """State after the last of the samples, (N, 4), and other quantities at its time."""
 
 
 def checked_sample(sample: Mapping[str, float], channels: Sequence[str], skippable: Sequence[str]) -> FloatArray:

@@ -30,6 +30,11 @@ PARAMETERS: dict[str, tuple[str, ...]] = {"linear": ("cornering_stiffness",), "r
 """Names of an axle's parameters, by the kind of its curve: [N/rad]; [rad²], [N/rad]."""
 
 BOUNDS = {"cornering_stiffness": (1e2, 1e8), "c1": (1e-5, 1.0), "c2": (1e2, 1e8)}
+PEAK_SLIP = math.radians(9.0)  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+PEAK_SPREAD = 0.4  # standard deviation of its logarithm
+KNOWN_C1 = (math.log(0.5 * PEAK_SLIP**2), 2.0 * PEAK_SPREAD)  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
+LEAST_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
+PASSES = 3  # of weighing what is known against what the drives leave unexplained
 SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
 SMOOTHING_ORDER = 2
 BLOCK_SECONDS = 10.0  # residuals further apart than this count as independent
@@ -175,6 +180,9 @@ def fit_tyres(
 ) -> TyreFit:
     """Least squares of both axle curves on measured drives.
 
+    Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well as `PEAK_SLIP` says of road tyres, a
+    block of 10 s counting as one sample against it.
+
     The covariance is that of least squares whose residuals hang together within blocks of 10 s and may differ in size (a sandwich of
     blocks): residuals of neighbouring samples are hardly independent, and to count them so would make intervals far too narrow.
 
@@ -223,15 +231,25 @@ def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.i
         raise DataError(
             f"tyre curves: forces run against slip angles (slope {stiffness:.3g} N/rad); check the signs of steer, ay and vy_ref"
         )
-    guess = {"cornering_stiffness": stiffness, "c1": 0.01, "c2": 1.2 * stiffness}
-    start = np.clip(np.log([guess[name] for name in names]), low, high)
-    found = optimize.least_squares(
-        lambda logarithms: (axle_force(kind, np.exp(logarithms), slip) - force) / scale, start, bounds=(low, high), xtol=1e-12, ftol=1e-12
-    )
-    parameters, residual = np.exp(found.x), scale * found.fun
-    scores = found.jac * found.fun[:, None]
+    guess = {"cornering_stiffness": stiffness, "c1": math.exp(KNOWN_C1[0]), "c2": 1.2 * stiffness}
+    logarithms = np.clip(np.log([guess[name] for name in names]), low, high)
     _, member = np.unique(block, return_inverse=True)
+    blocks = int(member.max()) + 1
+    spread = math.sqrt(float(np.mean((force - stiffness * slip) ** 2)))
+
+    def misfit(at: FloatArray, weight: float) -> FloatArray:
+        left = weight * (axle_force(kind, np.exp(at), slip) - force)
+        return np.append(left, (at[names.index("c1")] - KNOWN_C1[0]) / KNOWN_C1[1]) if "c1" in names else left
+
+    for _ in range(PASSES):
+        weight = math.sqrt(blocks / len(slip)) / max(spread, LEAST_SPREAD * scale)
+        found = optimize.least_squares(misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,))
+        logarithms, spread = found.x, math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight
+    of_data, of_knowledge = found.jac[: len(slip)], found.jac[len(slip) :]
+    scores = of_data * found.fun[: len(slip), None]
     sums = np.stack([np.bincount(member, weights=column) for column in scores.T], axis=1)
     curvature = np.linalg.pinv(found.jac.T @ found.jac)
-    covariance = curvature @ (sums.T @ sums) @ curvature * len(sums) / max(len(sums) - 1, 1)
-    return parameters, covariance * np.outer(parameters, parameters), math.sqrt(float(np.mean(residual**2)))
+    spread_of_scores = sums.T @ sums * blocks / max(blocks - 1, 1) + of_knowledge.T @ of_knowledge
+    covariance = curvature @ spread_of_scores @ curvature
+    parameters = np.exp(logarithms)
+    return parameters, covariance * np.outer(parameters, parameters), spread

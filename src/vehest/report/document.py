@@ -27,6 +27,8 @@ PATENT_NOTE = (
 
 PNG_DPI = 150
 PNG_COLOURS = 256
+_PATH = re.compile(r'\bd="[^"]*"')
+_LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
 _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
@@ -220,7 +222,12 @@ def _svg(figure: MatplotlibFigure) -> bytes:
     buffer = io.BytesIO()
     with paper_style():
         figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+    return _PATH.sub(_in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
+
+
+def _in_hundredths(path: re.Match[str]) -> str:
+    """A path whose places are given to a hundredth of a point, finer than any page: half the size."""
+    return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
 
 
 def _for_both_schemes(svg: bytes) -> bytes:

@@ -155,6 +155,7 @@ class NoiseTuningSettings:
     Args:
         method: ``data`` reads sensors' levels off measured signals and takes the rest as assumed; ``nelder_mead`` and ``optuna`` (extra
             ``tuning``) look for the levels with the smallest error of sideslip on the training recordings.
+        curves_from: training recordings, by a pattern of their ids, that axle curves are fitted to; levels of noise are found on all.
         grid: starts of Nelder-Mead along each level.
         max_evaluations: evaluations allowed from each start.
         tolerance: relative change of the levels at which a search ends.
@@ -163,6 +164,7 @@ class NoiseTuningSettings:
     """
 
     method: Literal["data", "nelder_mead", "optuna"] = "nelder_mead"
+    curves_from: str = "*"
     grid: int = 2
     max_evaluations: int = 80
     tolerance: float = 1e-3

@@ -30,6 +30,7 @@ def scan(  # type: ignore[no-untyped-def]
     rolling,
     step,
     minimum_speed,
+    adapt_above,
     mean,
     cov,
     means,
@@ -54,6 +55,7 @@ def scan(  # type: ignore[no-untyped-def]
         rolling: variances of the first four states of a car that rolls, (4,).
         step: Δt [s].
         minimum_speed: [m/s].
+        adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
         mean: at the first sample before its measurement, (n,); at the last sample after it on return.
         cov: likewise, (n, n).
         means: out, (T, n).
@@ -133,8 +135,9 @@ def scan(  # type: ignore[no-untyped-def]
             cov[2, 3] += spread * rate * acceleration
             cov[3, 2] += spread * rate * acceleration
             cov[3, 3] += spread * acceleration * acceleration
-            for i in range(4, n):
-                cov[i, i] += step * variances[i - 1]
+            if abs(vx * mean[1]) >= adapt_above:
+                for i in range(4, n):
+                    cov[i, i] += step * variances[i - 1]
             _make_symmetric(cov)
             _clip(mean, lower, upper)
             if not cov[0, 0] < LOST * LOST:  # without measurements the model may be unstable: begin anew
@@ -158,6 +161,8 @@ def scan(  # type: ignore[no-untyped-def]
         for i in range(n):
             gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
             gain[i, 1] = (cross[i, 1] * S[0, 0] - cross[i, 0] * S[0, 1]) / determinant
+        if abs(vx * mean[1]) < adapt_above:
+            gain[4:] = 0.0
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
         _clip(mean, lower, upper)

@@ -16,7 +16,7 @@ from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, 
 from vehest.studies.heavy_ekf import paper
 from vehest.studies.heavy_ekf.subjects import LINES, MEASURED, moving
 
-POINTS = 1500
+POINTS = 800  # a line across the page
 STRAIGHT_SECONDS = 25.0
 HANDLING_SECONDS = 60.0
 WHEELS = {"fl": "front left", "fr": "front right", "rl": "rear left", "rr": "rear right"}

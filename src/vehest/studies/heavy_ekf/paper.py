@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 LINT, RATT, RATTE = "LINT", "RATT", "RATTE"
+UNSCENTED = "RATTE, unscented"
+HELD = "RATTE, in bends"
+"""RATTE whose tyre parameters are held straight ahead."""
 ORDER = (RATTE, RATT, LINT)
 """From the smallest RMSE(β) to the largest."""
 
@@ -11,11 +14,10 @@ VARIANTS = {
     "ratt": RATT,
     "ratte": RATTE,
     "ratmu": "RATT with friction",
+    "ratte_ukf": UNSCENTED,
+    "ratte_held": HELD,
 }
 """Variant of the estimator -> what it is called in the report; the first three are the paper's."""
-
-QUICK = "RATTE, quick tyres"
-"""RATTE whose parameters wander as fast as they are told to, not as the training drives suggest."""
 
 LAPS = {RATTE: "below 0.5", RATT: "below 0.89", LINT: "below 1.43"}
 """RMSE(β) of three laps at 30, 40 and 45 km/h [deg]: of the first it says so, the others follow from `GAINS`."""

@@ -24,7 +24,8 @@ LINES = {
     paper.RATT: Line("#00876c", "dashdot", "o"),
     paper.RATTE: Line("#d6336c", "solid", "^"),
     "RATT with friction": Line("#a6761d", "dotted", "D"),
-    paper.QUICK: Line("#8e24aa", "dotted", "v"),
+    paper.UNSCENTED: Line("#4a4a4a", "dotted", "P"),
+    paper.HELD: Line("#8e24aa", "solid", "v"),
 }
 MEASURED = REFERENCE
 TYRES = {"nominal": "nominal tyres", "worn": "worn tyres", "wet": "wet road"}
@@ -51,7 +52,7 @@ class Filter:
 
 
 def filters_of(part: StudyArtefacts) -> dict[str, Filter]:
-    """Name -> filter, in the order of `paper.VARIANTS`; no two of one variant may have the same seed.
+    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first.
 
     Raises:
         DataError: one of the paper's three is not there.
@@ -61,14 +62,12 @@ def filters_of(part: StudyArtefacts) -> dict[str, Filter]:
         if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:
             fitted = load_model(model.model_folder)
             assert isinstance(fitted, RationalFilter)
-            quick = model.variant == "ratte" and fitted.settings.noise.tyres is not None
-            name = paper.QUICK if quick else paper.VARIANTS[model.variant]
+            name = paper.VARIANTS[model.variant]
             found.setdefault(name, Filter(name, model, fitted))
     missing = [name for name in paper.ORDER if name not in found]
     if missing:
         raise DataError(f"study '{part.study}': no {' and no '.join(missing)} among the models; the pipeline needs all three")
-    order = [*paper.VARIANTS.values(), paper.QUICK]
-    return {name: found[name] for name in sorted(found, key=order.index)}
+    return {name: found[name] for name in paper.VARIANTS.values() if name in found}
 
 
 def whole_drive(part: StudyArtefacts, test: str) -> Recording:
@@ -78,16 +77,17 @@ def whole_drive(part: StudyArtefacts, test: str) -> Recording:
 
 
 def validation_drives(part: StudyArtefacts) -> list[Recording]:
-    """Drives on the tyres that the filters were fitted on, which they were not fitted to."""
+    """Drives that the filters were neither fitted nor tuned to."""
     return recordings_of(part, part.split.validation)
 
 
 def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
-    """The curves that a rational filter was fitted with, beside what the axles do in other drives."""
+    """The curves that a rational filter was fitted with and how well its fit knew them, beside what the axles do in other drives."""
     car, slowest = own.settings.car, own.settings.minimum_speed
     motion = axle_motion(drives, car, slowest)
     axles = own.curves.reshape(2, 2)
-    blocks = [own.curve_covariance[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
+    of_fit = own.curve_covariance - (own.settings.curves.deviation or 0.0) ** 2 * np.eye(4)
+    blocks = [of_fit[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
     left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
     rms = np.sqrt(np.mean(np.square(left), axis=1))
     return TyreFit("rational", axles[0], axles[1], np.stack(blocks), rms, motion.slip, motion.force)

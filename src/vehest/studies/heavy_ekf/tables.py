@@ -123,9 +123,12 @@ def order_in_words(
     reasons = [f"- **Little to tell a linear tyre from a rational one.** {_curvature(fit)}"]
     reasons.append(f"- **What the parameters start from.** {_starts(own, fit)}")
     reasons.append(
-        "- **How fast parameters may move.** The level at which the training drives, all on nominal tyres, are estimated best lets RATTE's "
-        f"parameters wander by {100.0 * wander * math.sqrt(60.0):.2g} % in a minute (one standard deviation)." + _quick(rmse)
+        "- **How fast parameters may move.** The level at which the training drives, on nominal and on worn tyres, are estimated best lets "
+        f"RATTE's parameters wander by {100.0 * wander * math.sqrt(60.0):.2g} % in a minute (one standard deviation)."
     )
+    reasons.append(f"- **What is to be gained.** {_gained(errors)}")
+    if (errors["filter"] == paper.HELD).any():
+        reasons.append(f"- **Straight ahead there is nothing to adapt to but offsets.** {_held(rmse, errors)}")
     worst = [test for test in other if rmse[paper.RATTE, test] > rmse[paper.RATT, test]]
     if worst:
         parts = []
@@ -178,16 +181,31 @@ def _curvature(fit: TyreFit) -> str:
     return f"In the validation drives the slip angles reach (99.9 % of samples) {'; '.join(words)}."
 
 
-def _quick(rmse: Rmse) -> str:
-    """What a filter whose tyres may move faster makes of the drives."""
-    if (paper.QUICK, "nominal_laps") not in rmse:
-        return ""
-    words = [
-        f"{tyres} {drive} {fixed(rmse[paper.QUICK, f'{tyres}_{drive}'], 2)}° against {fixed(rmse[paper.RATTE, f'{tyres}_{drive}'], 2)}°"
-        for tyres in TYRES
-        for drive in DRIVES
-    ]
-    return f" With quick tyres, a level that was set and not tuned, it has {'; '.join(words)}."
+def _gained(errors: pd.DataFrame) -> str:
+    """Standard deviations of the errors, which no constant offset enters, of fixed tyres on drives with the same and with other ones."""
+    words = []
+    for drive in DRIVES:
+        (same_mean, same), (worn_mean, worn) = (_parts(errors, f"{tyres}_{drive}", paper.RATT) for tyres in ("nominal", "worn"))
+        words.append(
+            f"{DRIVES[drive]} {fixed(same, 2)}° on nominal and {fixed(worn, 2)}° on worn tyres, beside mean errors of "
+            f"{fixed(same_mean, 2)}° and {fixed(worn_mean, 2)}°"
+        )
+    return f"Standard deviations of RATT's errors: {'; '.join(words)}. Adapting can take away by how much those grow with worn tyres."
+
+
+def _held(rmse: Rmse, errors: pd.DataFrame) -> str:
+    """What a filter that holds its tyres straight ahead makes of the drives."""
+    words = []
+    for tyres in TYRES:
+        for drive in DRIVES:
+            test = f"{tyres}_{drive}"
+            spread = [fixed(_parts(errors, test, name)[1], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
+            errors_of = [fixed(rmse[name, test], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
+            words.append(f"{tyres} {drive} {', '.join(errors_of)}° (standard deviations {', '.join(spread)}°)")
+    return (
+        "There a filter lays offsets of a_y, yaw rate and steering upon its tyres, which it then brings into the next bend. RMSE(β) of "
+        f"{paper.HELD}, whose parameters are held there, of RATTE and of RATT: {'; '.join(words)}."
+    )
 
 
 def _starts(own: Mapping[str, OwnCurves], fit: TyreFit) -> str:

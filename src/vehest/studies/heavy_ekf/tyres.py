@@ -86,7 +86,8 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
             slip, force = fit.slip[row], fit.force[row]
             reach = float(np.abs(slip).max())
             grid = np.linspace(-reach, reach, 201)
-            axes.scatter(np.degrees(slip[chosen]), 1e-3 * force[chosen], s=2, color="#b5b9be", label="from accelerations", linewidths=0)
+            dots = {"s": 2, "color": "#b5b9be", "linewidths": 0, "rasterized": True}
+            axes.scatter(np.degrees(slip[chosen]), 1e-3 * force[chosen], label="from accelerations", **dots)
             low, high = _band(fit, axle, grid, row)
             axes.fill_between(np.degrees(grid), 1e-3 * low, 1e-3 * high, color="#4aa5e0", alpha=0.4, linewidth=0, label="95 %")
             axes.plot(np.degrees(grid), 1e-3 * fit.curve(axle, grid), color="#0b4f9c", label="fitted, Eq. 4")
