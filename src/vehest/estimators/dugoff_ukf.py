@@ -39,7 +39,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
 BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-QUIET_STEER, QUIET_AX, QUIET_SECONDS = 0.01, 0.3, 0.5  # rad, m/s², s: what counts as straight ahead at constant speed
+QUIET_STEER, QUIET_AX, QUIET_SECONDS = 0.003, 0.2, 0.5  # rad, m/s², s: what counts as straight ahead at constant speed
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
 BAD = 1e6  # rad², instead of a cost that is not finite
 
