@@ -39,7 +39,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
 BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-QUIET_STEER, QUIET_AX, QUIET_SECONDS = 0.003, 0.2, 0.5  # rad, m/s², s: what counts as straight ahead at constant speed
+QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle moves least
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
 BAD = 1e6  # rad², instead of a cost that is not finite
 
@@ -266,15 +266,15 @@ class DugoffUkf(Estimator):
         return {**dict(zip(TYRES, self.tyres.tolist(), strict=True)), **spread, **rms}
 
     def _sensor_levels(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Standard deviations of what is measured straight ahead at constant speed."""
+        """Standard deviations of what is measured while the steering angle hardly moves."""
+        pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
         found = {}
         for name in self._unknown(SENSORS[self.settings.inputs]):
             series = [sum(recording[wheel] for wheel in WHEELS.get(name, (name,))) for recording in recordings]
-            quiet = [(np.abs(recording["steer"]) < QUIET_STEER) & (np.abs(recording["ax"]) < QUIET_AX) for recording in recordings]
             try:
-                found[name] = quiet_level(series, quiet, round(QUIET_SECONDS * self.settings.rate_hz))
+                found[name] = quiet_level(series, [recording["steer"] for recording in recordings], pieces)
             except ValueError as error:
-                raise DataError(f"noise of '{name}' straight ahead at constant speed: {error}; give estimator.noise.{name}") from None
+                raise DataError(f"noise of '{name}' in the training recordings: {error}; give estimator.noise.{name}") from None
             if not found[name] > 0.0:
                 raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
         return found

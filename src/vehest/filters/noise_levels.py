@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.filters.gaussian import FloatArray
@@ -39,32 +38,32 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
     return float(np.std(known))
 
 
-def quiet_level(series: Sequence[FloatArray], quiet: Sequence[NDArray[np.bool_]], least: int) -> float:
-    """Standard deviation of what several recordings of one signal hold while nothing happens, taken together.
+def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], least: int, share: float = 0.1) -> float:
+    """Standard deviation of several recordings of one signal while little else happens, taken together.
 
-    Each stretch in which nothing happens is cut into pieces, and deviations are those from the piece's own mean, so that neither offsets
-    nor slow changes count.
+    Recordings are cut into pieces; those count in which another signal moves least, and in them deviations from a straight line.
 
     Args:
         series: one array a recording, (T,).
-        quiet: where nothing happens, one array a recording, (T,).
-        least: samples of a piece; what is left over is not looked at.
+        activity: the other signal, one array a recording, (T,).
+        least: samples of a piece.
+        share: of the pieces that count.
 
     Raises:
-        ValueError: there is no such piece without a gap.
+        ValueError: pieces are too short for a line, or none is without a gap.
 
-    Source: Bertipaglia et al. 2024, Section III-B, take noise levels from driving straight ahead at constant speed.
+    Source: Bertipaglia et al. 2024, Section III-B, read levels where the steering angle is zero and the speed constant.
     """
-    if least < 2:
-        raise ValueError(f"a piece must hold at least 2 samples, not {least}")
-    squares, count = 0.0, 0
-    for samples, still in zip(series, quiet, strict=True):
-        usable = still & ~np.isnan(samples)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(np.int8), [0]])))
-        for start, end in zip(edges[::2], edges[1::2], strict=True):
-            pieces = samples[start : end - (end - start) % least].reshape(-1, least)
-            squares += float(np.square(pieces - pieces.mean(1, keepdims=True)).sum())
-            count += len(pieces) * (least - 1)
-    if not count:
-        raise ValueError(f"no stretch of {least} samples without a gap in which nothing happens")
-    return float(np.sqrt(squares / count))
+    if least < 3:
+        raise ValueError(f"a piece must hold at least 3 samples, not {least}")
+
+    def pieces(samples: FloatArray) -> FloatArray:
+        return samples[: len(samples) - len(samples) % least].reshape(-1, least)
+
+    own, others = (np.concatenate([pieces(samples) for samples in signals]) for signals in (series, activity))
+    known = ~(np.isnan(own).any(1) | np.isnan(others).any(1))
+    if not known.any():
+        raise ValueError(f"no stretch of {least} samples without a gap")
+    left, moved = (np.square(signal.detrend(values[known], axis=1)).sum(1) / (least - 2) for values in (own, others))
+    quietest = np.argsort(moved, kind="stable")[: max(1, round(share * len(moved)))]
+    return float(np.sqrt(left[quietest].mean()))
