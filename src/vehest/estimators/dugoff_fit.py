@@ -16,7 +16,7 @@ from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres, dugoff_force
 DUGOFF_PARAMETERS = ("cornering_stiffness", "friction", "reduction")
 BOUNDS = ((2.0, 60.0), (0.3, 2.0), (0.0, 0.05))
 """Cornering stiffness over the axle's load at rest [1/rad], friction [1], reduction [s/m]."""
-MOST_SAMPLES = 4000  # evenly thinned to
+MOST_SAMPLES = 1500  # evenly thinned to
 POPULATION = 15  # a parameter
 
 

@@ -25,7 +25,7 @@ from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
 from vehest.training.settings import IdentificationSettings
-from vehest.vehicle.dugoff import TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
+from vehest.vehicle.dugoff import BMW_545I, TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
 Inputs = Literal["full", "imu"]
 WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
@@ -126,7 +126,7 @@ class DugoffUkfSettings(EstimatorSettings):
     linear_below: float = 3.0
     noise: TrackLevels = TrackLevels()
     tyres: AxleTyres = AxleTyres()
-    car: LoadedCar = LoadedCar()
+    car: LoadedCar = BMW_545I
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -214,7 +214,7 @@ class DugoffUkf(Estimator):
 
     @classmethod
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
-        """Identify the tyres, read sensors' levels, then find the process noise, each where it is not given; see `IdentificationSettings`."""
+        """Identify tyres, read sensors' levels, find the process noise, each where it is not given; see `IdentificationSettings`."""
         return [member._fit_one(data, training, context) for member in members if isinstance(member, DugoffUkf)]
 
     def _fit_one(self, data: FitData, training: IdentificationSettings, context: FitContext) -> FitRecord:
@@ -290,14 +290,10 @@ class DugoffUkf(Estimator):
 
         boxes = [BOXES[name] for name in searched]
         if training.method == "optuna":
-            return staged_optuna_search(
-                cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink
-            )
+            return staged_optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
 
-    def _mean_squared_error(
-        self, recordings: Sequence[Recording], skip_seconds: float, levels: Mapping[str, float] | None = None
-    ) -> float:
+    def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float, levels: Mapping[str, float] | None = None) -> float:
         """Of sideslip [rad²], over samples fast enough for the model."""
         skip = round(skip_seconds * self.settings.rate_hz)
         total, count = 0.0, 0
@@ -343,11 +339,12 @@ class DugoffUkf(Estimator):
             trusted = torch.as_tensor(np.stack([self._trusts(part) for part in measurements[..., 0].numpy()]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
-                steps = model.filtered(
-                    measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given)
-                ).steps
+                steps = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given)).steps
                 nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
-            yield rows, (steps.filtered.mean.numpy(), steps.filtered.covariance.numpy(), nis.numpy(), steps.measured.sum(-1).double().numpy())
+            yield (
+                rows,
+                (steps.filtered.mean.numpy(), steps.filtered.covariance.numpy(), nis.numpy(), steps.measured.sum(-1).double().numpy()),
+            )
 
     def _trusts(self, ay: FloatArray, before: bool = False) -> Any:
         return in_nonlinear_range(ay, self.settings.nonlinear_from, self.settings.linear_below, before)
@@ -362,9 +359,7 @@ class DugoffUkf(Estimator):
             raise ConfigurationError(f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise")
         process = torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64).square().diag()
         factor = levels.get("force_factor", 1.0)
-        rows = [
-            [levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)] for own in (factor, 1.0)
-        ]
+        rows = [[levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)] for own in (factor, 1.0)]
         return process, torch.diag_embed(torch.tensor(rows, dtype=torch.float64).square())
 
     def online(self) -> DugoffUkfStepper:

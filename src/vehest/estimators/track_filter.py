@@ -134,5 +134,8 @@ def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
     """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with their last row (none)."""
     longest = max(len(array) for array in arrays)
     return np.stack(
-        [np.concatenate([array, np.repeat(array[-1:] if fill is None else np.full_like(array[-1:], fill), longest - len(array), axis=0)]) for array in arrays]
+        [
+            np.concatenate([array, np.repeat(array[-1:] if fill is None else np.full_like(array[-1:], fill), longest - len(array), axis=0)])
+            for array in arrays
+        ]
     )

@@ -174,10 +174,10 @@ def staged_optuna_search(
         records.append(optuna_search(cost, own, share, seed + stage, context))
         if records[-1].interrupted:
             break
-    best = min(records, key=lambda record: record.cost)
+    won = min(records, key=lambda record: record.cost)
     evaluations = sum(record.evaluations for record in records)
     starts = np.concatenate([record.starts for record in records])
-    return SearchRecord(best.best, best.cost, starts, evaluations, records[-1].interrupted)
+    return SearchRecord(won.best, won.cost, starts, evaluations, records[-1].interrupted)
 
 
 def _around(value: float, low: float, high: float, width: float) -> tuple[float, float]:

@@ -37,7 +37,7 @@ Tyres = Literal["plain", "smooth"]
 
 @dataclass(frozen=True)
 class LoadedCar:
-    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; defaults: a BMW 545i.
+    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i, if not told otherwise.
 
     Args:
         mass: [kg].
@@ -70,6 +70,10 @@ class LoadedCar:
         transfer = ax * (self.cg_height / wheelbase)
         front, rear = (GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle))
         return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (rear + transfer).clamp(min=LEAST_LOAD * rear)
+
+
+BMW_545I = LoadedCar()
+"""BMW 545i of Bertipaglia et al. 2024."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +157,7 @@ class DugoffTrack:
     sees_sideslip: bool = False
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Forces of the front and the rear axle across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3); (...) [N] each."""
+        """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""
         vx, steer, ax = inputs[..., 0].clamp(min=self.minimum_speed), inputs[..., 1], inputs[..., 2]
         load_front, load_rear = self.car.loads(ax)
         course_front = (states[..., 0] + self.car.cg_to_front_axle * states[..., 1]) / vx

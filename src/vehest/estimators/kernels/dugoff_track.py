@@ -155,9 +155,7 @@ def _transition_adjoint(points, inputs, car, axles, smooth, upstream, out):  # t
                 out[b, s, 0], out[b, s, 1] = 0, 0
                 continue
             vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            _, _, by_front, by_rear = _forces(
-                vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth
-            )
+            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
             across, turning = upstream[b, s, 0], upstream[b, s, 1]
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
@@ -172,9 +170,7 @@ def _observation_adjoint(points, inputs, car, axles, smooth, upstream, out):  # 
         vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
         for s in range(points.shape[1]):
             vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            _, _, by_front, by_rear = _forces(
-                vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth
-            )
+            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
             front_bar = (upstream[b, s, 0] / mass + upstream[b, s, 2]) * by_front
             rear_bar = (upstream[b, s, 0] / mass + upstream[b, s, 3]) * by_rear
             out[b, s, 0] = front_bar + rear_bar
