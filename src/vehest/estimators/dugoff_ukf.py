@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRec
 from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.single_track import checked_sample, require_positive
 from vehest.estimators.track_filter import TrackFilter, groups_of, in_nonlinear_range, padded
-from vehest.filters.gaussian import Gaussian
+from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
@@ -37,7 +37,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
     "imu": ("process_vy", "process_yaw_rate"),
 }
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
-BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten
+BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 1.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
 QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle moves least
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
@@ -297,8 +297,8 @@ class DugoffUkf(Estimator):
         """Of sideslip [rad²], over samples fast enough for the model."""
         skip = round(skip_seconds * self.settings.rate_hz)
         total, count = 0.0, 0
-        for rows, (mean, *_) in self._filtered(recordings, levels=levels):
-            for row, states in zip(rows, mean, strict=True):
+        for rows, steps in self._filtered(recordings, levels=levels):
+            for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
                 recording = recordings[row]
                 vx, reference = recording["vx"], _reference(recording)
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
@@ -314,13 +314,15 @@ class DugoffUkf(Estimator):
     def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
         """Recordings of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
-        for rows, (mean, covariance, nis, dof) in self._filtered(recordings, states):
+        for rows, steps in self._filtered(recordings, states):
+            mean, covariance = (part.numpy() for part in steps.filtered)
+            nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1).numpy()
+            dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
             for place, row in enumerate(rows):
                 n = len(recordings[row])
                 others = {"yaw_rate": mean[place, :n, 1].copy(), "nis": nis[place, :n].copy(), "nis_dof": dof[place, :n].copy()}
-                estimates[row] = self._wrapped(
-                    recordings[row], mean[place, :n, 0].copy(), covariance[place, :n].copy(), TRACK_STATES, **others
-                )
+                vy, own = mean[place, :n, 0].copy(), covariance[place, :n].copy()
+                estimates[row] = self._wrapped(recordings[row], vy, own, TRACK_STATES, **others)
         return [estimates[row] for row in range(len(recordings))]
 
     def _filtered(
@@ -328,23 +330,19 @@ class DugoffUkf(Estimator):
         recordings: Sequence[Recording],
         states: Sequence[Mapping[str, float] | None] | None = None,
         levels: Mapping[str, float] | None = None,
-    ) -> Any:
-        """Rows of recordings, and their means (B, T, 2), covariances (B, T, 2, 2), nis (B, T) and how many numbers were measured (B, T)."""
+    ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
+        """Rows of recordings that were filtered together, padded to the longest, and what came of them."""
         model = TrackFilter(self.track())
         process, sensors = self._noise(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [samples_of(recordings[row].stack(self.channels)) for row in rows]
             measurements = torch.as_tensor(padded([part[0] for part in parts], np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            trusted = torch.as_tensor(np.stack([self._trusts(part) for part in measurements[..., 0].numpy()]))
+            trusted = torch.as_tensor(np.stack([self._trusts(ay) for ay in measurements[..., 0].numpy()]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
-                steps = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given)).steps
-                nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
-            yield (
-                rows,
-                (steps.filtered.mean.numpy(), steps.filtered.covariance.numpy(), nis.numpy(), steps.measured.sum(-1).double().numpy()),
-            )
+                outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given))
+            yield rows, outcome.steps
 
     def _trusts(self, ay: FloatArray, before: bool = False) -> Any:
         return in_nonlinear_range(ay, self.settings.nonlinear_from, self.settings.linear_below, before)

@@ -199,7 +199,7 @@ class IdentificationSettings(NoiseTuningSettings):
     """
 
     method: Literal["data", "nelder_mead", "optuna"] = "optuna"
-    trials: int = 80
+    trials: int = 60
     stages: int = 2
     shrink: float = 0.3
     tyres_from: str = "*skidpad*"
