@@ -270,7 +270,7 @@ class DugoffUkf(Estimator):
         pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
         found = {}
         for name in self._unknown(SENSORS[self.settings.inputs]):
-            series = [sum(recording[wheel] for wheel in WHEELS.get(name, (name,))) for recording in recordings]
+            series = [recording.stack(WHEELS.get(name, (name,))).sum(1) for recording in recordings]
             try:
                 found[name] = quiet_level(series, [recording["steer"] for recording in recordings], pieces)
             except ValueError as error:
