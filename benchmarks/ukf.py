@@ -3,8 +3,8 @@
 Writes results/benchmarks/ukf.json. A training step is forward and backward over sequences of 500 samples in float32 on two threads
 (BENCH_THREADS). The plain implementation stands in this file, from the equations of Węgrzynowski et al. 2024: torchdiffeq's rk4,
 torch.linalg.cholesky twice a sample, a loop over samples, autograd through it all. Both start from the same parameters (pre-trained
-for a moment), noise and sequences, and their losses and gradients are compared; for that torchdiffeq takes its classical weights, at
-the same cost: its default ones, of the 3/8 rule, make a difference of a percent where tyres are stiff.
+for a moment), noise and sequences, and their losses and gradients are compared; for that torchdiffeq takes its classical weights
+instead of its default ones, of the 3/8 rule, at the same cost.
 
 Every case runs in a process of its own; a figure is the best of its repeats, by turns. On a machine that does other things too, look at
 the processor's seconds on one thread: threads that wait for each other waste time. Memory is the peak beyond what imports, data and a

@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
+from vehest.filters.compiled_noise import compiled_noise
 from vehest.filters.noise_models import FLOOR, ConstantNoise, FixedNoise, StateDependentNoise, entropy, with_entropy
 
 STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
@@ -76,3 +77,17 @@ def test_entropy_below_the_floor_is_raised_to_it_and_above_is_left():
 def test_variances_that_make_no_sense_are_refused(variances):
     with pytest.raises(ValueError, match="positive"):
         ConstantNoise(variances)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-5)])
+def test_compiled_it_is_the_same_with_and_without_a_floor(dtype: torch.dtype, tolerance: float) -> None:
+    generator = torch.Generator().manual_seed(2)
+    noise = StateDependentNoise(START, 3, deviation=1.0, generator=generator)
+    noise.begin(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.2]).diag(), 10.0, torch.tensor([2.0, 0.5, 1.0]))
+    noise.to(dtype)
+    states = torch.randn(7, 3, generator=generator).to(dtype)
+    known = noise(states, states).detach()
+    floor = float(entropy(known).median())
+    for expected, own in ((known, compiled_noise(noise)), (with_entropy(known, floor), compiled_noise(noise, floor))):
+        assert own(states.numpy(), states.numpy()) == pytest.approx(expected.numpy(), rel=tolerance, abs=tolerance)
+    assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"

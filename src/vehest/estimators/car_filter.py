@@ -9,15 +9,16 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
-from vehest.estimators.kernels.tyre_network import CompiledTyreNetwork
+from vehest.filters.compiled_noise import compiled_noise
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
-from vehest.filters.nonlinear import Function, NonlinearFiltered
+from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, TorchModel, moved, unscented_scan
+from vehest.filters.unscented_scan import Array, NoiseAt, PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
-from vehest.vehicle.dynamics import MEASUREMENTS, STATES, Dynamics, TyreNetworkCar
+from vehest.vehicle.dynamics import STATES, Dynamics
 
 NoiseKind = Literal["constant", "state_dependent"]
 
@@ -82,8 +83,8 @@ class CarFilter(nn.Module):
     def point_model(self) -> PointModel:
         """The dynamics as the filter takes them: compiled where they can be."""
         dtype = next(self.parameters()).dtype
-        if isinstance(self.dynamics, TyreNetworkCar) and self.dynamics.is_compilable:
-            return CompiledTyreNetwork(self.dynamics, self.step, self.lower, dtype)
+        if is_compilable(self.dynamics):
+            return CompiledPlanarCar(self.dynamics, self.step, self.lower, dtype)
         return TorchModel(
             lambda points, inputs: self.dynamics.transition(points, inputs, self.step),
             self.dynamics.observation,
@@ -110,9 +111,9 @@ class CarFilter(nn.Module):
         """
         if states is not None or isinstance(self.process_noise, ConstantNoise):
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            noises: list[Tensor | Function] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
+            noises: list[Tensor | NoiseAt] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
         else:
-            noises = [self._process_noise, self.observation_noise]
+            noises = list(self.noise_at())
         return unscented_scan(
             model or self.point_model(),
             measurements,
@@ -124,6 +125,16 @@ class CarFilter(nn.Module):
             repair=self.repair,
             share=partial(over_members, pieces=1),
         )
+
+    def noise_at(self) -> tuple[NoiseAt, NoiseAt]:
+        """Process and observation noise as functions of arrays of states."""
+        process, observation = self.process_noise, self.observation_noise
+        if isinstance(process, StateDependentNoise) and isinstance(observation, StateDependentNoise):
+            return compiled_noise(process, LEAST_ENTROPY), compiled_noise(observation)
+        nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
+        with torch.no_grad():
+            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, observation)]
+        return partial(_whatever, values[0]), partial(_whatever, values[1])
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
@@ -179,4 +190,5 @@ class CarFilter(nn.Module):
         return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
 
 
-assert len(OBSERVATION) == len(MEASUREMENTS)
+def _whatever(covariance: Array, states: Array, inputs: Array) -> Array:
+    return covariance

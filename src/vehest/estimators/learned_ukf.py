@@ -17,6 +17,7 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
 from vehest.estimators.car_filter import CarFilter
 from vehest.filters.gaussian import Gaussian
+from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
@@ -379,12 +380,12 @@ class LearnedUkfStepper(Stepper):
 
     def __init__(self, estimator: LearnedUkf) -> None:
         self._estimator = estimator
-        self._dtype = next(estimator.filter.parameters()).dtype
+        own = estimator.filter
         with torch.no_grad():
-            self._model = estimator.filter.point_model()
+            self._model = own.point_model()
+        self._noises = own.noise_at()
         self._inputs = np.zeros(2)
-        self._before: Tensor | None = None
-        self._state: Gaussian[Tensor] | None = None
+        self._filter: UnscentedStepper | None = None
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """States at the time of the sample; what is NaN in it is skipped or, of inputs, held."""
@@ -393,16 +394,13 @@ class LearnedUkfStepper(Stepper):
             raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         self._inputs = np.where(np.isnan(row[4:]), self._inputs, row[4:])
         row[3] *= self._estimator.settings.car.wheel_radius
-        y, u = (torch.as_tensor(part, dtype=self._dtype).reshape(1, 1, -1) for part in (row[:4], self._inputs))
-        if self._state is None or self._before is None:
-            mean, covariance = self._estimator._start(row[:4], None)
-            state, measurements, inputs = Gaussian(mean[None], covariance[None]), y, u
-        else:  # the last sample's measurements are part of the state already
-            state, measurements, inputs = self._state, torch.cat([torch.full_like(y, torch.nan), y], 1), torch.cat([self._before, u], 1)
-        with torch.no_grad():
-            filtered = self._estimator.filter.filtered(measurements, inputs, state, model=self._model).steps.filtered
-        self._before, self._state = u, Gaussian(filtered.mean[:, -1], filtered.covariance[:, -1])
-        return dict(zip(STATES, self._state.mean[0].tolist(), strict=True))
+        if self._filter is None:
+            own = self._estimator.filter
+            mean, covariance = (part.numpy() for part in self._estimator._start(row[:4], None))
+            self._filter = UnscentedStepper(self._model, mean, covariance, len(MEASURED), own.rule, repair=own.repair)
+        dtype = self._filter.mean.dtype
+        estimated = self._filter.step(row[:4].astype(dtype), self._inputs.astype(dtype), *self._noises)
+        return dict(zip(STATES, estimated.tolist(), strict=True))
 
 
 def _held(values: FloatArray) -> FloatArray:

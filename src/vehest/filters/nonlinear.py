@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -68,6 +68,7 @@ class _Updated(NamedTuple):
     innovation_covariance: Tensor
     log_likelihood: Tensor
     repaired: Tensor
+    lost: Tensor
 
 
 def unscented_filter(
@@ -81,7 +82,8 @@ def unscented_filter(
         inputs: u, (..., T, p).
         initial: state at the first sample before its measurement, mean (..., n).
         rule: which sigma points.
-        repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
+        repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN. Where a negative
+            weight of the mean point is what takes the definiteness of an update, the update goes without it; everything else is lifted.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -106,9 +108,19 @@ def unscented_filter(
         measured = ~torch.isnan(y)
         zero = torch.zeros((), dtype=y.dtype, device=y.device)
         spread = torch.where(measured.unsqueeze(-2), expected - mean.unsqueeze(-2), zero)
-        cross = rule.covariance(points - state.mean.unsqueeze(-2), spread)
-        own = rule.covariance(spread, spread)
-        return _conditioned(model, Gaussian(state.mean, prior), mean, own, cross, y, u, repaired, repair)
+        deviations, known = points - state.mean.unsqueeze(-2), Gaussian(state.mean, prior)
+
+        def conditioned(rule: SigmaRule) -> _Updated:
+            own, cross = rule.covariance(spread, spread), rule.covariance(deviations, spread)
+            return _conditioned(model, known, mean, own, cross, y, u, repaired, repair)
+
+        updated = conditioned(rule)
+        if not repair or rule.centre_covariance >= 0.0:
+            return updated
+        lost = updated.lost | factorised(updated.state.covariance).repaired
+        if not bool(lost.any()):
+            return updated
+        return _either(lost, conditioned(replace(rule, centre_covariance=0.0)), updated)
 
     return _filtered(model, measurements, inputs, initial, predict, update)
 
@@ -174,7 +186,18 @@ def _conditioned(
     determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     count = measured.sum(-1, dtype=y.dtype)
     likelihood = -0.5 * (whitened.square().sum(-1) + determinant + count * math.log(2.0 * math.pi))
-    return _Updated(posterior, innovation, covariance, likelihood, repaired | lost)
+    return _Updated(posterior, innovation, covariance, likelihood, repaired | lost, lost)
+
+
+def _either(lost: Tensor, one: _Updated, other: _Updated) -> _Updated:
+    """One update where something was lost, which counts as repaired, and the other elsewhere."""
+
+    def chosen(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(lost.reshape(*lost.shape, *[1] * (a.dim() - lost.dim())), a, b)
+
+    state = Gaussian(*(chosen(a, b) for a, b in zip(one.state, other.state, strict=True)))
+    rest = [chosen(a, b) for a, b in zip(one[1:4], other[1:4], strict=True)]
+    return _Updated(state, rest[0], rest[1], rest[2], other.repaired | lost, lost)
 
 
 def _filtered(

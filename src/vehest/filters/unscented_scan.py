@@ -23,6 +23,8 @@ from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_steps import moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
 
 Array = NDArray[Any]
+NoiseAt = Callable[[Array, Array], Array]
+"""Covariances of noise at estimated states, (B, n) under inputs (B, p) -> (B, k, k)."""
 Share = Callable[[Callable[[int, int], None], int], None]
 """Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
 
@@ -112,7 +114,39 @@ class _Setting:
     lower: Array
     margin: Any
     repair: bool
-    share: Share
+
+    @classmethod
+    def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool) -> _Setting:
+        row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], dtype)
+        lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
+        return cls(model, row, lower, dtype(MARGIN), repair)
+
+
+class _Points:
+    """Sigma points of sequences, and room for them.
+
+    Attributes:
+        values: (B, 2n + 1, n).
+        factor: that they are drawn with, (B, n, n).
+        lost: whether a covariance was not positive definite, (B,).
+        covariance: that they are drawn from, repaired where it had to be, (B, n, n).
+    """
+
+    def __init__(self, setting: _Setting, sequences: int, n: int, dtype: Any) -> None:
+        self._setting = setting
+        self.values, self.factor = np.empty((sequences, 2 * n + 1, n), dtype), np.empty((sequences, n, n), dtype)
+        self.lost, self.covariance = np.zeros(sequences, np.bool_), np.empty((sequences, n, n), dtype)
+
+    def draw(self, mean: Array, covariance: Array) -> Array:
+        """Points of states."""
+        own = self._setting
+        self.covariance[:] = covariance
+        points_of(mean, self.covariance, own.rule, own.lower, own.margin, own.repair, self.factor, self.values, self.lost)
+        return self.values
+
+    def adjoint(self, mean: Array, points_bar: Array, mean_bar: Array, covariance_bar: Array) -> None:
+        """Add to the gradients of the states that points were last drawn of."""
+        points_adjoint(mean, self.factor, self._setting.rule, self._setting.lower, points_bar, mean_bar, covariance_bar)
 
 
 class _Tape:
@@ -126,7 +160,7 @@ class _Tape:
         self.prior_mean, self.prior_covariance = empty(n), empty(n, n)
         self.post_mean, self.post_covariance = empty(n), empty(n, n)
         self.moved, self.expected = empty(points, n), empty(points, m)
-        self.innovation, self.own, self.gain, self.likelihood = empty(m), empty(m, m), empty(n, m), empty()
+        self.innovation, self.own, self.gain, self.likelihood, self.centre = empty(m), empty(m, m), empty(n, m), empty(), empty()
         self.repaired = np.zeros((steps, sequences), np.bool_)
 
     def slice(self, first: int, end: int) -> _Tape:
@@ -147,8 +181,8 @@ def unscented_scan(
     measurements: Tensor,
     inputs: Tensor,
     initial: Gaussian[Tensor],
-    process_noise: Tensor | Function,
-    observation_noise: Tensor | Function,
+    process_noise: Tensor | NoiseAt,
+    observation_noise: Tensor | NoiseAt,
     rule: SigmaRule,
     *,
     repair: bool = True,
@@ -161,8 +195,8 @@ def unscented_scan(
         measurements: y, (B, T, m); what is NaN was not measured.
         inputs: u, (B, T, p).
         initial: state at the first sample before its measurement, mean (n,) or (B, n).
-        process_noise: Q of each step, (B, T, n, n) or what broadcasts to it; or a function of the estimated state, without gradients.
-        observation_noise: R of each sample, (B, T, m, m) or what broadcasts to it; or a function of the predicted state, without gradients.
+        process_noise: Q of each step, (B, T, n, n) or what broadcasts to it; or at the estimated state, without gradients.
+        observation_noise: R of each sample, (B, T, m, m) or what broadcasts to it; or at the predicted state, without gradients.
         rule: which sigma points.
         repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
         share: how sequences are shared out over threads; none: one thread.
@@ -184,9 +218,7 @@ def unscented_scan(
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], numpy_dtype)
-    lower = np.full(n, -np.inf, numpy_dtype) if model.lower is None else np.asarray(model.lower, numpy_dtype)
-    setting = _Setting(model, row, lower, numpy_dtype(MARGIN), repair, share or _alone)
+    setting = _Setting.of(model, rule, n, numpy_dtype, repair)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
@@ -195,7 +227,7 @@ def unscented_scan(
     ]
     tape = _Tape(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
     outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
@@ -207,6 +239,48 @@ def unscented_scan(
         torch.from_numpy(tape.likelihood.swapaxes(0, 1)),
     )
     return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
+
+
+class UnscentedStepper:
+    """The same filter of one sequence, one sample at a time.
+
+    Args:
+        model: how points move.
+        mean, covariance: of the state at the first sample before its measurement, (n,) and (n, n), of the model's precision.
+        measurements: how many there are, m.
+        rule: which sigma points.
+        repair: see `unscented_scan`.
+
+    Attributes:
+        mean, covariance: of the state, filtered, (n,) and (n, n).
+    """
+
+    def __init__(
+        self, model: PointModel, mean: Array, covariance: Array, measurements: int, rule: SigmaRule, *, repair: bool = True
+    ) -> None:
+        n, dtype = len(mean), mean.dtype.type
+        self._setting = _Setting.of(model, rule, n, dtype, repair)
+        self._tape, self._points = _Tape(1, 1, n, measurements, dtype), _Points(self._setting, 1, n, dtype)
+        self._tape.prior_mean[0], self._tape.prior_covariance[0] = mean, covariance
+        self._inputs: Array | None = None
+        self.mean, self.covariance = self._tape.post_mean[0, 0], self._tape.post_covariance[0, 0]
+
+    def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
+        """The filtered mean, (n,), valid until the next step.
+
+        Args:
+            measurement: (m,); what is NaN was not measured.
+            inputs: (p,); they act from this sample to the next.
+            process_noise: Q of the step that led here, (1, n, n), or as a function of the state before.
+            observation_noise: R, (1, m, m), or as a function of the predicted state.
+        """
+        tape, now = self._tape, inputs[None]
+        if self._inputs is not None:
+            before = tape.post_mean[0].copy(), tape.post_covariance[0].copy()
+            _predict(self._setting, tape, 0, self._points, *before, self._inputs, process_noise)
+        _update(self._setting, tape, 0, self._points, measurement[None], now, observation_noise)
+        self._inputs = now
+        return self.mean
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -234,8 +308,9 @@ class _Scan(torch.autograd.Function):
     def forward(
         ctx: Any,
         setting: _Setting,
+        share: Share,
         tape: _Tape,
-        functions: Sequence[Function | None],
+        functions: Sequence[NoiseAt | None],
         measurements: Tensor,
         inputs: Tensor,
         mean: Tensor,
@@ -257,13 +332,13 @@ class _Scan(torch.autograd.Function):
             if part is not tape:
                 tape.put(start, end, part)
 
-        setting.share(work, y.shape[1])
-        ctx.kept = (setting, tape, functions, y, u)
+        share(work, y.shape[1])
+        ctx.kept = (setting, share, tape, functions, y, u)
         return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        setting, tape, functions, y, u = ctx.kept
+        setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
         steps, sequences, n = tape.post_mean.shape
@@ -283,58 +358,64 @@ class _Scan(torch.autograd.Function):
             wanted = (process, observation, measured)
             bars = [piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (*wanted, mean_up, covariance_up)]
             data = (y[:, start:end], u[:, start:end])
-            mean[start:end], covariance[start:end] = _backward(setting, part, *data, *bars, own)
+            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars, own)
             if not whole:
                 for piece, bar in zip(wanted, bars, strict=False):
                     piece[:, start:end] = bar
 
-        setting.share(work, sequences)
+        share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
         y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
 
 
 def _forward(setting: _Setting, tape: _Tape, y: Array, u: Array, mean: Array, covariance: Array, noises: Sequence[Any]) -> None:
-    model, rule, lower = setting.model, setting.rule, setting.lower
-    steps, sequences = y.shape[:2]
-    n = mean.shape[1]
-    factor, points = np.empty((sequences, n, n), y.dtype), np.empty((sequences, 2 * n + 1, n), y.dtype)
-    lost = np.zeros(sequences, np.bool_)
-    for k in range(steps):
+    points = _Points(setting, len(mean), mean.shape[1], y.dtype)
+    for k in range(len(y)):
         now = np.ascontiguousarray(u[k])
         if k == 0:
             tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
         else:
             before = np.ascontiguousarray(u[k - 1])
-            draw = tape.post_covariance[k - 1].copy()
-            points_of(tape.post_mean[k - 1], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
-            tape.repaired[k] = lost
-            tape.moved[k] = model.transition(points, before)
-            noise = _noise(noises[0], k - 1, tape.post_mean[k - 1], before)
-            moments_of(tape.moved[k], noise, rule, lower, tape.prior_mean[k], tape.prior_covariance[k])
-        draw = tape.prior_covariance[k].copy()
-        points_of(tape.prior_mean[k], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
-        tape.repaired[k] |= lost
-        tape.expected[k] = model.observation(points, now)
-        update_of(
-            tape.prior_mean[k],
-            draw,
-            points,
-            tape.expected[k],
-            np.ascontiguousarray(y[k]),
-            _noise(noises[1], k, tape.prior_mean[k], now),
-            rule,
-            lower,
-            setting.margin,
-            setting.repair,
-            tape.post_mean[k],
-            tape.post_covariance[k],
-            tape.innovation[k],
-            tape.own[k],
-            tape.gain[k],
-            tape.likelihood[k],
-            tape.repaired[k],
-        )
+            _predict(setting, tape, k, points, tape.post_mean[k - 1], tape.post_covariance[k - 1], before, _noise(noises[0], k - 1))
+        _update(setting, tape, k, points, np.ascontiguousarray(y[k]), now, _noise(noises[1], k))
+
+
+def _predict(
+    setting: _Setting, tape: _Tape, k: int, points: _Points, mean: Array, covariance: Array, inputs: Array, noise: Array | NoiseAt
+) -> None:
+    """Move states to sample ``k`` of the tape."""
+    tape.moved[k] = setting.model.transition(points.draw(mean, covariance), inputs)
+    tape.repaired[k] = points.lost
+    added = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
+    moments_of(tape.moved[k], added, setting.rule, setting.lower, tape.prior_mean[k], tape.prior_covariance[k])
+
+
+def _update(setting: _Setting, tape: _Tape, k: int, points: _Points, y: Array, inputs: Array, noise: Array | NoiseAt) -> None:
+    """Take in the measurement at sample ``k`` of the tape."""
+    mean = tape.prior_mean[k]
+    tape.expected[k] = setting.model.observation(points.draw(mean, tape.prior_covariance[k]), inputs)
+    tape.repaired[k] |= points.lost
+    update_of(
+        mean,
+        points.covariance,
+        points.values,
+        tape.expected[k],
+        y,
+        noise if isinstance(noise, np.ndarray) else noise(mean, inputs),
+        setting.rule,
+        setting.lower,
+        setting.margin,
+        setting.repair,
+        tape.post_mean[k],
+        tape.post_covariance[k],
+        tape.innovation[k],
+        tape.own[k],
+        tape.gain[k],
+        tape.likelihood[k],
+        tape.repaired[k],
+        tape.centre[k],
+    )
 
 
 def _backward(
@@ -342,31 +423,30 @@ def _backward(
     tape: _Tape,
     y: Array,
     u: Array,
-    process_bar: Array,
-    observation_bar: Array,
-    y_bar: Array,
-    mean_up: Array,
-    covariance_up: Array,
+    bars: Sequence[Array],
     gradients: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added."""
+    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added.
+
+    Args:
+        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
+    """
+    process_bar, observation_bar, y_bar, mean_up, covariance_up = bars
     model, rule, lower = setting.model, setting.rule, setting.lower
     steps, sequences, n = tape.post_mean.shape
     m = y.shape[2]
-    factor, points = np.empty((sequences, n, n), y.dtype), np.empty((sequences, 2 * n + 1, n), y.dtype)
-    points_bar, expected_bar = np.empty_like(points), np.empty((sequences, 2 * n + 1, m), y.dtype)
-    moved_bar, lost = np.empty_like(points), np.zeros(sequences, np.bool_)
+    points = _Points(setting, sequences, n, y.dtype)
+    points_bar, expected_bar = np.empty_like(points.values), np.empty((sequences, 2 * n + 1, m), y.dtype)
+    moved_bar = np.empty_like(points.values)
     post_mean_bar, post_covariance_bar = np.zeros((sequences, n), y.dtype), np.zeros((sequences, n, n), y.dtype)
     mean_bar, covariance_bar = np.empty_like(post_mean_bar), np.empty_like(post_covariance_bar)
     for k in range(steps - 1, -1, -1):
         now = np.ascontiguousarray(u[k])
         post_mean_bar += mean_up[k]
         post_covariance_bar += covariance_up[k]
-        draw = tape.prior_covariance[k].copy()
-        points_of(tape.prior_mean[k], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
         update_adjoint(
             tape.prior_mean[k],
-            points,
+            points.draw(tape.prior_mean[k], tape.prior_covariance[k]),
             tape.expected[k],
             np.ascontiguousarray(y[k]),
             rule,
@@ -374,6 +454,7 @@ def _backward(
             tape.innovation[k],
             tape.own[k],
             tape.gain[k],
+            tape.centre[k],
             post_mean_bar,
             post_covariance_bar,
             mean_bar,
@@ -383,27 +464,24 @@ def _backward(
             observation_bar[k],
             y_bar[k],
         )
-        points_bar += model.observation_adjoint(points, now, expected_bar, gradients)
-        points_adjoint(tape.prior_mean[k], factor, rule, lower, points_bar, mean_bar, covariance_bar)
+        points_bar += model.observation_adjoint(points.values, now, expected_bar, gradients)
+        points.adjoint(tape.prior_mean[k], points_bar, mean_bar, covariance_bar)
         if k == 0:
             break
         moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1])
         before = np.ascontiguousarray(u[k - 1])
-        draw = tape.post_covariance[k - 1].copy()
-        points_of(tape.post_mean[k - 1], draw, rule, lower, setting.margin, setting.repair, factor, points, lost)
-        points_bar[:] = model.transition_adjoint(points, before, moved_bar, gradients)
+        points.draw(tape.post_mean[k - 1], tape.post_covariance[k - 1])
+        points_bar[:] = model.transition_adjoint(points.values, before, moved_bar, gradients)
         post_mean_bar[:] = 0
         post_covariance_bar[:] = 0
-        points_adjoint(tape.post_mean[k - 1], factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar)
+        points.adjoint(tape.post_mean[k - 1], points_bar, post_mean_bar, post_covariance_bar)
     return mean_bar, covariance_bar
 
 
-def _noise(noise: Any, k: int, mean: Array, inputs: Array) -> Array:
-    if isinstance(noise, np.ndarray):
-        return np.ascontiguousarray(noise[k])
-    with torch.no_grad():
-        values: Array = noise(torch.from_numpy(mean), torch.from_numpy(inputs)).contiguous().numpy()
-    return values
+def _noise(noise: Any, k: int) -> Array | NoiseAt:
+    """That of sample k, or the function that it is."""
+    own: Array | NoiseAt = np.ascontiguousarray(noise[k]) if isinstance(noise, np.ndarray) else noise
+    return own
 
 
 def _by_time(tensor: Tensor) -> Array:

@@ -141,47 +141,45 @@ def update_of(  # type: ignore[no-untyped-def]
     gain,
     likelihood,
     repaired,
+    centre,
 ):
-    """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired."""
+    """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
+
+    ``centre`` becomes the weight that the mean point had in covariances, (B,): 0 where a negative one took their definiteness.
+    """
     sequences, count, m = expected.shape
     n = mean.shape[1]
-    _, centre_mean, centre_covariance, other = rule
+    _, _, centre_covariance, other = rule
     half = rule.dtype.type(0.5)
     log_two_pi = rule.dtype.type(np.log(2.0 * np.pi))
     spread, deviation = np.empty((count, m), mean.dtype), np.empty((count, n), mean.dtype)
     cross, factor, whitened = np.empty((n, m), mean.dtype), np.empty((m, m), mean.dtype), np.empty(m, mean.dtype)
+    tried = np.empty((n, n), mean.dtype)
     for b in range(sequences):
-        measured = 0
         _spread(expected[b], points[b], mean[b], y[b], rule, innovation[b], spread, deviation)
-        for i in range(m):
-            measured += y[b, i] == y[b, i]
-        for i in range(n):
-            for j in range(m):
-                total = mean[b, 0] * 0
-                for s in range(1, count):
-                    total += deviation[s, i] * spread[s, j]
-                cross[i, j] = other * total + centre_covariance * deviation[0, i] * spread[0, j]
-        for i in range(m):
-            for j in range(i + 1):
-                total = mean[b, 0] * 0
-                for s in range(1, count):
-                    total += spread[s, i] * spread[s, j]
-                total = other * total + centre_covariance * spread[0, i] * spread[0, j]
-                if y[b, i] == y[b, i] and y[b, j] == y[b, j]:
-                    total += half * (noise[b, i, j] + noise[b, j, i])
-                elif i == j:
-                    total += 1.0
-                own[b, i, j] = total
-                own[b, j, i] = total
-        if not _cholesky(own[b], factor):
+        centre[b] = centre_covariance
+        definite = _joint(spread, deviation, centre_covariance, other, y[b], noise[b], cross, own[b], factor)
+        if definite:
+            _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
+        lost = repair and centre_covariance < 0 and not (definite and _cholesky(post_covariance[b], tried))
+        if lost and _all_finite(own[b]) and _all_finite(covariance[b]):
+            repaired[b] = True
+            centre[b] = 0
+            definite = _joint(spread, deviation, centre[b], other, y[b], noise[b], cross, own[b], factor)
+            if definite:
+                _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
+        if not definite:
             lost = _all_finite(own[b])
             repaired[b] = repaired[b] or lost
             if not (repair and lost and _lifted(own[b], factor, margin)):
                 factor[:] = np.nan
                 own[b] = np.nan
+            _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
         log_determinant = mean[b, 0] * 0
         squared = mean[b, 0] * 0
+        measured = 0
         for i in range(m):
+            measured += y[b, i] == y[b, i]
             total = innovation[b, i]
             for c in range(i):
                 total -= factor[i, c] * whitened[c]
@@ -189,28 +187,63 @@ def update_of(  # type: ignore[no-untyped-def]
             squared += whitened[i] * whitened[i]
             log_determinant += np.log(factor[i, i])
         likelihood[b] = -half * (squared + 2 * log_determinant + measured * log_two_pi)
-        for i in range(n):  # gain = cross S⁻¹
-            for j in range(m):
-                total = cross[i, j]
-                for c in range(j):
-                    total -= factor[j, c] * whitened[c]
-                whitened[j] = total / factor[j, j]
-            for j in range(m - 1, -1, -1):
-                total = whitened[j]
-                for c in range(j + 1, m):
-                    total -= factor[c, j] * gain[b, i, c]
-                gain[b, i, j] = total / factor[j, j]
         for i in range(n):
             total = mean[b, i]
             for c in range(m):
                 total += gain[b, i, c] * innovation[b, c]
             post_mean[b, i] = max(total, lower[i]) if total == total else total
-            for j in range(i + 1):
-                total = half * (covariance[b, i, j] + covariance[b, j, i])
-                for c in range(m):
-                    total -= half * (gain[b, i, c] * cross[j, c] + gain[b, j, c] * cross[i, c])
-                post_covariance[b, i, j] = total
-                post_covariance[b, j, i] = total
+
+
+@compiled
+def _joint(spread, deviation, centre, other, y, noise, cross, own, factor):  # type: ignore[no-untyped-def]
+    """Covariance of states with what is expected, and of that with noise, with its factor; whether it is positive definite."""
+    count, m = spread.shape
+    half = own.dtype.type(0.5)
+    for i in range(deviation.shape[1]):
+        for j in range(m):
+            total = spread[0, 0] * 0
+            for s in range(1, count):
+                total += deviation[s, i] * spread[s, j]
+            cross[i, j] = other * total + centre * deviation[0, i] * spread[0, j]
+    for i in range(m):
+        for j in range(i + 1):
+            total = spread[0, 0] * 0
+            for s in range(1, count):
+                total += spread[s, i] * spread[s, j]
+            total = other * total + centre * spread[0, i] * spread[0, j]
+            if y[i] == y[i] and y[j] == y[j]:
+                total += half * (noise[i, j] + noise[j, i])
+            elif i == j:
+                total += 1.0
+            own[i, j] = total
+            own[j, i] = total
+    return _cholesky(own, factor)
+
+
+@compiled
+def _posterior(covariance, cross, factor, gain, post_covariance):  # type: ignore[no-untyped-def]
+    """Gain cross S⁻¹, by the factor of S, and the covariance that is left."""
+    n, m = cross.shape
+    half = cross.dtype.type(0.5)
+    whitened = np.empty(m, cross.dtype)
+    for i in range(n):
+        for j in range(m):
+            total = cross[i, j]
+            for c in range(j):
+                total -= factor[j, c] * whitened[c]
+            whitened[j] = total / factor[j, j]
+        for j in range(m - 1, -1, -1):
+            total = whitened[j]
+            for c in range(j + 1, m):
+                total -= factor[c, j] * gain[i, c]
+            gain[i, j] = total / factor[j, j]
+    for i in range(n):
+        for j in range(i + 1):
+            total = half * (covariance[i, j] + covariance[j, i])
+            for c in range(m):
+                total -= half * (gain[i, c] * cross[j, c] + gain[j, c] * cross[i, c])
+            post_covariance[i, j] = total
+            post_covariance[j, i] = total
 
 
 @compiled
@@ -224,6 +257,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     innovation,
     own,
     gain,
+    centre,
     post_mean_bar,
     post_covariance_bar,
     mean_bar,
@@ -236,7 +270,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar``, ``noise_bar`` and ``y_bar``."""
     sequences, count, m = expected.shape
     n = mean.shape[1]
-    _, centre_mean, centre_covariance, other = rule
+    _, centre_mean, _, other = rule
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
     spread, deviation = np.empty((count, m), mean.dtype), np.empty((count, n), mean.dtype)
     P, K = np.empty((n, n), mean.dtype), np.empty((n, m), mean.dtype)
@@ -288,7 +322,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
         for i in range(n):
             total = through[i]
             for s in range(count):
-                weight = centre_covariance if s == 0 else other
+                weight = centre[b] if s == 0 else other
                 part = total * 0
                 for c in range(m):
                     part += cross_bar[i, c] * spread[s, c]
@@ -299,7 +333,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
             known = y[b, c] == y[b, c]
             total = -pulled[c] if known else pulled[c] * 0
             for s in range(count):
-                weight = centre_covariance if s == 0 else other
+                weight = centre[b] if s == 0 else other
                 part = total * 0
                 for i in range(n):
                     part += cross_bar[i, c] * deviation[s, i]

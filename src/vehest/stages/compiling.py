@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-SLOW = {"learned_ukf": "vehest.estimators.kernels.tyre_network"}
+SLOW = {"learned_ukf": "vehest.estimators.kernels.planar_car"}
 """Estimators that compile for tens of seconds, and what of them takes longest."""
 
 

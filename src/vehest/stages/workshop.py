@@ -162,7 +162,7 @@ class Workshop:
             raise NotThereYet
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(name):
-                self.messages.line("once", "compile", name, "about a minute before its first training; later ones load it")
+                self.messages.line("once", "compile", name, "tens of seconds before its first training; later ones load it")
         failures: list[tuple[str, Failure]] = []
         tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
         with self.messages.bars() as bars:

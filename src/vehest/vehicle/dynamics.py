@@ -190,11 +190,6 @@ class TyreNetworkCar(Dynamics):
         count = 9 if friction_scaled else 10
         self.network = Perceptron([1.0] * count if input_scale is None else input_scale, hidden, [force_scale] * 4)
 
-    @property
-    def is_compilable(self) -> bool:
-        """Whether the network has the two hidden layers that compiled code is written for."""
-        return len(self.network) == 5
-
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
         """Forces of both axles [N]."""
         steer, current = inputs.unbind(-1)
@@ -238,9 +233,19 @@ PHYSICAL = (
 )
 
 
-def physical_of(car: PlanarCar) -> Physical:
-    """Learnt values in the order of `PHYSICAL`, differentiable, and known ones."""
-    return Physical(torch.stack([car.learnt[name] for name in PHYSICAL]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius)
+PACEJKA = ("friction", *(f"{letter}_{where}" for where in ("x", "front", "rear") for letter in "BCD"))
+
+
+def physical_of(dynamics: Dynamics) -> Physical:
+    """Learnt values in the order of `PHYSICAL` and `PACEJKA`, differentiable, and known ones; 0 and 1 where a car has none."""
+    car, tyres = getattr(dynamics, "car", None), getattr(dynamics, "tyres", None)
+    if not isinstance(car, PlanarCar):
+        return Physical(torch.zeros(len(PHYSICAL) + len(PACEJKA)), 1.0, 1.0, 1.0)
+    learnt = torch.stack([car.learnt[name] for name in PHYSICAL])
+    curves = (
+        torch.stack([tyres.parameters_of[name] for name in PACEJKA]) if isinstance(tyres, PacejkaTyres) else learnt.new_zeros(len(PACEJKA))
+    )
+    return Physical(torch.cat([learnt, curves]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius)
 
 
 def _kinematic(state: Tensor, rates: Tensor) -> Motion:

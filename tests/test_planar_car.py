@@ -1,4 +1,4 @@
-"""The compiled car whose tyres are a network is the readable one, in values and in the gradients of everything that is learnt."""
+"""Compiled planar cars are the readable ones, in values and in the gradients of everything that is learnt."""
 
 from __future__ import annotations
 
@@ -7,28 +7,33 @@ import pytest
 import torch
 from torch import Tensor
 
-from vehest.estimators.kernels.tyre_network import CompiledTyreNetwork
+from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, moved, unscented_scan
-from vehest.vehicle.dynamics import TyreNetworkCar
+from vehest.vehicle.dynamics import Dynamics, NeuralCar, PacejkaCar, ResidualCar, TyreNetworkCar
 
 STEP = 0.01
 LOWER = [-1e9, -1e9, -1e9, -1e9, 0.05]
 SIZES = [3.0, 0.3, 1.0, 3.0, 0.6, 0.2, 0.3, 0.3, 0.3, 2.0]
-KINDS = pytest.mark.parametrize(
-    ("friction_scaled", "scaled"), [(True, True), (True, False), (False, True)], ids=["NNTF", "NNTF in SI units", "NNT"]
-)
+CARS = {
+    "NNTF": lambda: TyreNetworkCar(hidden=(12, 7), input_scale=SIZES[:9], force_scale=25.0),
+    "NNTF in SI units": lambda: TyreNetworkCar(hidden=(12, 7)),
+    "NNT": lambda: TyreNetworkCar(friction_scaled=False, hidden=(12, 7), input_scale=SIZES, force_scale=25.0),
+    "PC": PacejkaCar,
+    "PCR": lambda: ResidualCar(hidden=(12, 7)),
+    "NN": lambda: NeuralCar(hidden=(12, 7)),
+}
+KINDS = pytest.mark.parametrize("kind", CARS)
 
 
-def network_car(friction_scaled: bool, scaled: bool, dtype: torch.dtype) -> TyreNetworkCar:
-    sizes = SIZES[: 9 if friction_scaled else 10] if scaled else None
-    car = TyreNetworkCar(friction_scaled=friction_scaled, hidden=(12, 7), input_scale=sizes, force_scale=25.0 if scaled else 1.0)
+def a_car(kind: str = "NNTF", dtype: torch.dtype = torch.float64) -> Dynamics:
+    car = CARS[kind]()
     car.reset(torch.Generator().manual_seed(0))
     return car.to(dtype)
 
 
-def readable(car: TyreNetworkCar) -> TorchModel:
+def readable(car: Dynamics) -> TorchModel:
     return TorchModel(lambda x, u: car.transition(x, u, STEP), car.observation, list(car.parameters()), LOWER)
 
 
@@ -42,7 +47,7 @@ def driven(count: int) -> tuple[Tensor, Tensor]:
     return states, drawn(count, 2, seed=2) * torch.tensor([0.25, 6.0])
 
 
-def through_the_filter(car: TyreNetworkCar, compiled: bool, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor]]:
+def through_the_filter(car: Dynamics, compiled: bool, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor]]:
     """Means of 25 sequences, more than a block of points holds, and the gradients of a random sum of them."""
     sequences, steps = 25, 12
     _, inputs = driven(sequences * steps)
@@ -50,7 +55,7 @@ def through_the_filter(car: TyreNetworkCar, compiled: bool, dtype: torch.dtype) 
     measurements[1, 4, 0] = torch.nan
     initial = Gaussian(torch.tensor([3.0, 0.2, 1.0, 3.0, 0.6]), torch.tensor([1e-3, 1e-3, 1e-3, 1e-3, 1e-4]).diag())
     noises = [torch.tensor(noise).to(dtype).diag() for noise in ([1e-3, 1e-3, 1e-2, 1e-2, 1e-4], [50.0, 50.0, 0.1, 0.1])]
-    model = CompiledTyreNetwork(car, STEP, LOWER, dtype) if compiled else readable(car)
+    model = CompiledPlanarCar(car, STEP, LOWER, dtype) if compiled else readable(car)
     y, u = measurements.to(dtype), inputs.reshape(sequences, steps, 2).to(dtype)
     outcome = unscented_scan(model, y, u, Gaussian(*(part.to(dtype) for part in initial)), *noises, symmetric_rule(5, -2.0))
     car.zero_grad()
@@ -60,18 +65,18 @@ def through_the_filter(car: TyreNetworkCar, compiled: bool, dtype: torch.dtype) 
 
 
 @KINDS
-def test_compiled_points_move_and_are_observed_as_the_readable_ones(friction_scaled: bool, scaled: bool) -> None:
-    car = network_car(friction_scaled, scaled, torch.float64)
+def test_compiled_points_move_and_are_observed_as_the_readable_ones(kind: str) -> None:
+    car = a_car(kind)
     points, inputs = driven(7 * 11)
     points, inputs = points.reshape(7, 11, 5).numpy(), inputs[:7].contiguous().numpy()
-    compiled, known = CompiledTyreNetwork(car, STEP, LOWER, torch.float64), readable(car)
+    compiled, known = CompiledPlanarCar(car, STEP, LOWER, torch.float64), readable(car)
     assert compiled.transition(points, inputs) == pytest.approx(known.transition(points, inputs), rel=1e-11, abs=1e-12)
     assert compiled.observation(points, inputs) == pytest.approx(known.observation(points, inputs), rel=1e-11, abs=1e-12)
 
 
 @KINDS
-def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(friction_scaled: bool, scaled: bool) -> None:
-    car = network_car(friction_scaled, scaled, torch.float64)
+def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind: str) -> None:
+    car = a_car(kind)
     (known, gradients), (mean, own) = (through_the_filter(car, compiled, torch.float64) for compiled in (False, True))
     assert torch.allclose(mean, known, rtol=0, atol=1e-10)
     assert gradients.keys() == own.keys()
@@ -81,7 +86,7 @@ def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(fr
 
 
 def test_in_single_precision_it_agrees_to_a_ten_thousandth() -> None:
-    car = network_car(True, True, torch.float32)
+    car = a_car(dtype=torch.float32)
     mean, own = through_the_filter(car, True, torch.float32)
     known, gradients = through_the_filter(car.double(), False, torch.float64)
     assert mean.double() == pytest.approx(known, abs=1e-4)
@@ -91,12 +96,12 @@ def test_in_single_precision_it_agrees_to_a_ten_thousandth() -> None:
 
 def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense() -> None:
     """At 5 cm/s and sliding: squashed values have reached their ends, and what rounding leaves of their slopes must not count."""
-    car = network_car(True, False, torch.float64)
+    car = a_car("NNTF in SI units")
     states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(200, 5) * torch.tensor([0.004, 1.0, 0.5, 0.3, 0.05])
     inputs = drawn(200, 2, seed=2) * torch.tensor([0.25, 6.0])
     slopes = []
     for dtype in (torch.float64, torch.float32):
-        model = CompiledTyreNetwork(car.to(dtype), STEP, LOWER, dtype)
+        model = CompiledPlanarCar(car.to(dtype), STEP, LOWER, dtype)
         points, own = (part.to(dtype).reshape(20, 10, -1).contiguous().numpy() for part in (states, inputs))
         gradients = [np.zeros(parameter.shape, points.dtype) for parameter in model.parameters]
         slopes.append(model.observation_adjoint(points, np.ascontiguousarray(own[:, 0]), np.ones((20, 10, 4), points.dtype), gradients))
@@ -105,7 +110,7 @@ def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense()
 
 def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:
     """Of a step of the car alone, in all parameters at once."""
-    car = network_car(True, True, torch.float64)
+    car = a_car()
     states, inputs = driven(30)
     ways = [0.1 * drawn(*p.shape, seed=k) for k, p in enumerate(car.parameters())]
 
@@ -113,7 +118,7 @@ def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:
         with torch.no_grad():
             for parameter, way in zip(car.parameters(), ways, strict=True):
                 parameter += shift * way
-        total = moved(CompiledTyreNetwork(car, STEP, LOWER, torch.float64), states, inputs).square().sum()
+        total = moved(CompiledPlanarCar(car, STEP, LOWER, torch.float64), states, inputs).square().sum()
         with torch.no_grad():
             for parameter, way in zip(car.parameters(), ways, strict=True):
                 parameter -= shift * way
@@ -125,17 +130,17 @@ def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:
 
 
 def test_a_car_with_nothing_to_learn_has_no_gradients_and_the_same_values() -> None:
-    car = network_car(True, True, torch.float64)
+    car = a_car()
     states, inputs = driven(5)
-    learning = moved(CompiledTyreNetwork(car, STEP, LOWER, torch.float64), states, inputs)
-    frozen = CompiledTyreNetwork(car.requires_grad_(False), STEP, LOWER, torch.float64)
+    learning = moved(CompiledPlanarCar(car, STEP, LOWER, torch.float64), states, inputs)
+    frozen = CompiledPlanarCar(car.requires_grad_(False), STEP, LOWER, torch.float64)
     assert learning.requires_grad
     assert not list(frozen.parameters)
     assert torch.equal(moved(frozen, states, inputs), learning.detach())
 
 
-def test_other_depths_are_refused() -> None:
-    car = TyreNetworkCar(hidden=(4, 4, 4))
-    assert not car.is_compilable
-    with pytest.raises(ValueError, match="two hidden layers, not 3"):
-        CompiledTyreNetwork(car, STEP, None, torch.float32)
+def test_other_cars_are_refused() -> None:
+    for car in (TyreNetworkCar(hidden=(4, 4, 4)), NeuralCar(hidden=(4,)), PacejkaCar(with_curvature=True)):
+        assert not is_compilable(car)
+        with pytest.raises(ValueError, match=f"no compiled code for this {type(car).__name__}"):
+            CompiledPlanarCar(car, STEP, None, torch.float32)

@@ -1,0 +1,616 @@
+"""Sigma points through the planar cars of `vehicle.dynamics`, compiled, with the adjoint.
+
+Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes
+stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache; matrix products stay on their thread.
+
+In the compiled code ``car`` is (layers, theta, constants, kind): weight and offset of the three layers, learnt numbers in the order of
+`PHYSICAL` and `PACEJKA`, known ones, and which car. ``room`` is what a motion leaves for its adjoint (`_room`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+
+from vehest.estimators.kernels.activation import sigmoid, tanh
+from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.filters.unscented_scan import Array, PointModel
+from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
+from vehest.vehicle.planar import GRAVITY
+from vehest.vehicle.tyres import STILL
+
+BLOCK = 110  # points at a time
+FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
+
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz", "afn"})
+
+
+class CompiledPlanarCar(PointModel):
+    """A planar car for the unscented filter.
+
+    Args:
+        dynamics: the car, one that `is_compilable`; gradients go to its parameters where they are wanted.
+        step: [s].
+        lower: smallest possible value of each state.
+        dtype: precision of the arrays.
+
+    Raises:
+        ValueError: the car is of another kind, its network has not two hidden layers, or its tyres have a curvature.
+    """
+
+    def __init__(self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype) -> None:
+        kind = _kind_of(dynamics)
+        if kind is None:
+            known = "networks have two hidden layers, tyres no curvature"
+            raise ValueError(f"there is no compiled code for this {type(dynamics).__name__}: {known}")
+        network = getattr(dynamics, "network", None)
+        if isinstance(network, Perceptron):
+            layers = [tensor for pair in network.layers() for tensor in pair]
+        else:
+            layers = [torch.zeros(0, 0), torch.zeros(0)] * 3
+        physical = physical_of(dynamics)
+        tensors = [tensor.to(dtype) for tensor in (*layers, physical.values)]
+        arrays = [tensor.detach().contiguous().numpy() for tensor in tensors]
+        learning = any(tensor.requires_grad for tensor in tensors)
+        self.parameters = tensors if learning else ()
+        self.lower = lower
+        scalar = arrays[0].dtype.type
+        flat = 4.0 * np.finfo(scalar).eps
+        numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
+        self._car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
+
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        out = np.empty_like(points)
+        with one_blas_thread():
+            _transition(points, inputs, self._car, BLOCK, out)
+        return out
+
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        out = np.empty((*points.shape[:2], 4), points.dtype)
+        with one_blas_thread():
+            _observation(points, inputs, self._car, BLOCK, out)
+        return out
+
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        return self._adjoint(_transition_adjoint, points, inputs, upstream, gradients)
+
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        return self._adjoint(_observation_adjoint, points, inputs, upstream, gradients)
+
+    def _adjoint(self, adjoint: Any, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        out = np.empty_like(points)
+        learning = bool(self.parameters)
+        own = tuple(gradients) if learning else (*self._car[0], self._car[1])  # never written to without learning
+        with one_blas_thread():
+            adjoint(points, inputs, self._car, BLOCK, upstream, out, learning, own)
+        return out
+
+
+def is_compilable(dynamics: Dynamics) -> bool:
+    """Whether there is compiled code for a car."""
+    return _kind_of(dynamics) is not None
+
+
+def _kind_of(dynamics: Dynamics) -> int | None:
+    network = getattr(dynamics, "network", None)
+    if isinstance(network, Perceptron) and len(network) != 5:
+        return None
+    if isinstance(dynamics, TyreNetworkCar):
+        return FRICTION_SCALED if dynamics.friction_scaled else UNSCALED_FORCES
+    if isinstance(dynamics, PacejkaCar):
+        if dynamics.tyres.curvature is not None:
+            return None
+        return PACEJKA_AND_RATES if isinstance(dynamics, ResidualCar) else PACEJKA_FORCES
+    return RATES if isinstance(dynamics, NeuralCar) else None
+
+
+@compiled
+def _columns(points, inputs, first, end, x, u):  # type: ignore[no-untyped-def]
+    """Points of some sequences side by side; rows of u are steering angle, its sine and cosine, and current."""
+    count, n = points.shape[1:]
+    for b in range(first, end):
+        sine, cosine = math.sin(inputs[b, 0]), math.cos(inputs[b, 0])
+        for s in range(count):
+            p = (b - first) * count + s
+            for i in range(n):
+                x[i, p] = points[b, s, i]
+            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[b, 0], sine, cosine, inputs[b, 1]
+
+
+@compiled
+def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
+    """Rows back into points of some sequences."""
+    count = points.shape[1]
+    for b in range(first, end):
+        for s in range(count):
+            for i in range(points.shape[2]):
+                points[b, s, i] = rows[i, (b - first) * count + s]
+
+
+@compiled
+def _layer(weight, offset, below, above):  # type: ignore[no-untyped-def]
+    np.dot(weight, below, above)
+    for i in range(above.shape[0]):
+        row = above[i]
+        value = offset[i]
+        for p in range(row.shape[0]):
+            row[p] += value
+
+
+@compiled
+def _squash(rows):  # type: ignore[no-untyped-def]
+    for i in range(rows.shape[0]):
+        row = rows[i]
+        for p in range(row.shape[0]):
+            row[p] = sigmoid(row[p])
+
+
+@compiled
+def _rise(above, below, flat):  # type: ignore[no-untyped-def]
+    """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
+
+    At a crawl slips change by a million per m/s, and rounding would count.
+    """
+    return above * below if min(above, below) > flat else above * 0
+
+
+@compiled
+def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
+    W1, b1, W2, b2, W3, b3 = layers
+    _layer(W1, b1, f, h1)
+    _squash(h1)
+    _layer(W2, b2, h1, h2)
+    _squash(h2)
+    _layer(W3, b3, h2, o)
+
+
+@compiled
+def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
+    """Writes ``f_bar``, and adds to the gradients when learning."""
+    W1, _, W2, _, W3, _ = layers
+    h2_bar, h1_bar = np.empty_like(h2), np.empty_like(h1)
+    np.dot(W3.T, o_bar, h2_bar)
+    for i in range(h2.shape[0]):
+        for p in range(h2.shape[1]):
+            h2_bar[i, p] *= _rise(h2[i, p], 1 - h2[i, p], flat)
+    np.dot(W2.T, h2_bar, h1_bar)
+    for i in range(h1.shape[0]):
+        for p in range(h1.shape[1]):
+            h1_bar[i, p] *= _rise(h1[i, p], 1 - h1[i, p], flat)
+    np.dot(W1.T, h1_bar, f_bar)
+    if learning:
+        dW1, db1, dW2, db2, dW3, db3 = gradients[:6]
+        _add_layer(o_bar, h2, dW3, db3)
+        _add_layer(h2_bar, h1, dW2, db2)
+        _add_layer(h1_bar, f, dW1, db1)
+
+
+@compiled
+def _add_layer(above_bar, below, dW, db):  # type: ignore[no-untyped-def]
+    product = np.empty_like(dW)
+    np.dot(above_bar, below.T, product)
+    for i in range(dW.shape[0]):
+        for j in range(dW.shape[1]):
+            dW[i, j] += product[i, j]
+        total = db[i] * 0
+        for p in range(above_bar.shape[1]):
+            total += above_bar[i, p]
+        db[i] += total
+
+
+@compiled
+def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
+    """Slips (front, rear, ratio), and what the network sees."""
+    _, theta, constants, kind = car
+    lr, still = theta[0], constants[6]
+    lf = constants[1] - lr
+    for p in range(x.shape[1]):
+        along = x[0, p] + still
+        slips[0, p] = math.atan((x[1, p] + lf * x[2, p]) / along) - u[0, p]
+        slips[1, p] = math.atan((x[1, p] - lr * x[2, p]) / along)
+        slips[2, p] = (x[3, p] - x[0, p]) / along
+    if kind in (FRICTION_SCALED, UNSCALED_FORCES):
+        for i in range(5):
+            f[i] = x[i]
+        f[5] = u[0]
+        for i in range(3):
+            f[6 + i] = slips[i]
+        if kind == UNSCALED_FORCES:
+            f[9] = u[3]
+    elif kind in (PACEJKA_AND_RATES, RATES):
+        for i in range(4):
+            f[i] = x[i]
+        f[4] = u[0]
+        f[5] = u[3]
+
+
+@compiled
+def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+    """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
+    angle = math.atan(stiffness * slip)
+    slope = math.cos(shape * angle)
+    steep = slope * shape / (1 + stiffness * slip * stiffness * slip)
+    return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
+
+
+@compiled
+def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
+    """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
+    _, theta, constants, kind = car
+    points = x.shape[1]
+    turn, unscaled = constants[4], constants[5]
+    if kind == FRICTION_SCALED:
+        for k in range(2):
+            for p in range(points):
+                forces[k, p] = x[4, p] * o[k, p]
+                value = o[2 + k, p]
+                forces[4 + k, p] = tanh(turn * slips[1 - k, p])
+                forces[2 + k, p] = -x[4, p] * (max(value, value * 0) + math.log1p(math.exp(-abs(value))))
+                forces[2 + k, p] *= forces[4 + k, p]
+    elif kind == UNSCALED_FORCES:
+        for k in range(4):
+            for p in range(points):
+                forces[k, p] = unscaled * o[k, p]
+    else:
+        lr = theta[0]
+        weight = constants[0] * constants[8] / constants[1]
+        front_load, rear_load = weight * lr, weight * (constants[1] - lr)
+        friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
+        for p in range(points):
+            along = friction * Dx * _curve(slips[2, p], Bx, Cx)[0]
+            forces[0, p], forces[1, p] = rear_load * along, front_load * along
+            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr)[0]
+            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf)[0]
+
+
+@compiled
+def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+    """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and adds to the others."""
+    _, theta, constants, kind = car
+    points = x.shape[1]
+    turn, unscaled, flat = constants[4], constants[5], constants[7]
+    slips_bar[:] = 0
+    if kind == FRICTION_SCALED:
+        for k in range(2):
+            for p in range(points):
+                o_bar[k, p] = slope[k, p] * x[4, p]
+                direction = forces[4 + k, p]
+                value = o[2 + k, p]
+                size = max(value, value * 0) + math.log1p(math.exp(-abs(value)))
+                through = -slope[2 + k, p] * x[4, p]
+                o_bar[2 + k, p] = through * direction * sigmoid(value)
+                slips_bar[1 - k, p] = through * size * turn * _rise(1 - direction, 1 + direction, flat)
+                x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
+    elif kind == UNSCALED_FORCES:
+        for k in range(4):
+            for p in range(points):
+                o_bar[k, p] = unscaled * slope[k, p]
+    else:
+        lr = theta[0]
+        weight = constants[0] * constants[8] / constants[1]
+        front_load, rear_load = weight * lr, weight * (constants[1] - lr)
+        friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
+        total = np.zeros_like(theta)
+        for p in range(points):
+            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx)
+            up = slope[0, p] * rear_load + slope[1, p] * front_load
+            slips_bar[2, p] = up * friction * Dx * rise
+            total[0] += (slope[1, p] - slope[0, p]) * weight * friction * Dx * peak
+            total[9] += up * Dx * peak
+            total[10] += up * friction * Dx * stiffer
+            total[11] += up * friction * Dx * rounder
+            total[12] += up * friction * peak
+            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf)
+            up = -slope[3, p] * front_load
+            slips_bar[0, p] = up * friction * Df * rise
+            total[0] -= slope[3, p] * weight * friction * Df * peak
+            total[9] += up * Df * peak
+            total[13] += up * friction * Df * stiffer
+            total[14] += up * friction * Df * rounder
+            total[15] += up * friction * peak
+            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr)
+            up = -slope[2, p] * rear_load
+            slips_bar[1, p] = up * friction * Dr * rise
+            total[0] += slope[2, p] * weight * friction * Dr * peak
+            total[9] += up * Dr * peak
+            total[16] += up * friction * Dr * stiffer
+            total[17] += up * friction * Dr * rounder
+            total[18] += up * friction * peak
+        if learning:
+            for i in range(theta.shape[0]):
+                dtheta[i] += total[i]
+
+
+@compiled
+def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
+    """Rows of ``out`` are ax, ay, dr/dt, dω/dt."""
+    _, theta, constants, _ = car
+    mass, wheelbase, radius = constants[:3]
+    lr, inertia, drag0, drag1, drag2, powertrain, torque, viscous, coulomb = theta[:9]
+    lf = wheelbase - lr
+    for p in range(x.shape[1]):
+        vx, rim = x[0, p], x[3, p]
+        sine, cosine, current = u[1, p], u[2, p], u[3, p]
+        rear_x, front_x, rear_y, front_y = forces[0, p], forces[1, p], forces[2, p], forces[3, p]
+        sideways = front_x * sine + front_y * cosine
+        drag = drag0 * np.sign(vx) + drag1 * vx + drag2 * vx * vx
+        out[0, p] = (rear_x + front_x * cosine - front_y * sine - drag) / mass
+        out[1, p] = (sideways + rear_y) / mass
+        out[2, p] = (sideways * lf - rear_y * lr) / inertia
+        out[3, p] = radius / powertrain * (torque * current - radius * (front_x + rear_x) - viscous * rim - coulomb * np.sign(rim))
+
+
+@compiled
+def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+    """Writes the gradients of the forces, rows of ``slope``, and adds to the others; ``out`` is what `_chassis` wrote."""
+    _, theta, constants, _ = car
+    mass, wheelbase, radius = constants[:3]
+    lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta[:9]
+    lf = wheelbase - lr
+    zero = x[0, 0] * 0
+    d_lf, d_lr, d_inertia, d_drag0, d_drag1, d_drag2 = zero, zero, zero, zero, zero, zero
+    d_powertrain, d_torque, d_viscous, d_coulomb = zero, zero, zero, zero
+    for p in range(x.shape[1]):
+        vx, rim = x[0, p], x[3, p]
+        sine, cosine, current = u[1, p], u[2, p], u[3, p]
+        front_x, rear_y, front_y = forces[1, p], forces[2, p], forces[3, p]
+        ax, ay, turning, spinning = out_bar[0, p] / mass, out_bar[1, p] / mass, out_bar[2, p] / inertia, out_bar[3, p]
+        twisting = spinning * radius / powertrain
+        along, across = ax * cosine + ay * sine + turning * sine * lf, ay * cosine - ax * sine + turning * cosine * lf
+        slope[0, p] = ax - radius * twisting
+        slope[1, p] = along - radius * twisting
+        slope[2, p] = ay - turning * lr
+        slope[3, p] = across
+        x_bar[0, p] -= ax * (drag1 + 2 * drag2 * vx)
+        x_bar[3, p] -= viscous * twisting
+        d_lf += turning * (front_x * sine + front_y * cosine)
+        d_lr -= turning * rear_y
+        d_inertia -= turning * out[2, p]
+        d_drag0 -= ax * np.sign(vx)
+        d_drag1 -= ax * vx
+        d_drag2 -= ax * vx * vx
+        d_powertrain -= spinning * out[3, p]
+        d_torque += twisting * current
+        d_viscous -= twisting * rim
+        d_coulomb -= twisting * np.sign(rim)
+    if learning:
+        dtheta[0] += d_lr - d_lf
+        dtheta[1] += d_inertia
+        dtheta[2] += d_drag0
+        dtheta[3] += d_drag1
+        dtheta[4] += d_drag2
+        dtheta[5] += d_powertrain / powertrain
+        dtheta[6] += d_torque
+        dtheta[7] += d_viscous
+        dtheta[8] += d_coulomb
+
+
+@compiled
+def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
+    """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is kept for the adjoint."""
+    layers, _, _, kind = car
+    f, slips, h1, h2, o, forces, plain = room
+    _seen(x, u, car, f, slips)
+    if kind != PACEJKA_FORCES:
+        _network(layers, f, h1, h2, o)
+    if kind == RATES:
+        for p in range(x.shape[1]):
+            out[0, p] = o[0, p] - x[1, p] * x[2, p]
+            out[1, p] = o[1, p] + x[0, p] * x[2, p]
+            out[2, p], out[3, p] = o[2, p], o[3, p]
+        return
+    _forces(x, car, slips, o, forces)
+    _chassis(x, u, car, forces, plain)
+    for i in range(4):
+        for p in range(x.shape[1]):
+            out[i, p] = plain[i, p] + (o[i, p] if kind == PACEJKA_AND_RATES else 0)
+
+
+@compiled
+def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # type: ignore[no-untyped-def]
+    """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
+    layers, theta, constants, kind = car
+    f, slips, h1, h2, o, forces, plain = room
+    points = x.shape[1]
+    o_bar, f_bar, slips_bar = np.empty_like(o), np.zeros_like(f), np.zeros_like(slips)
+    dtheta = gradients[6]
+    if kind != RATES:
+        slope = np.empty_like(o)
+        _chassis_adjoint(x, u, car, forces, plain, out_bar, slope, x_bar, learning, dtheta)
+        _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta)
+    if kind in (PACEJKA_AND_RATES, RATES):
+        for i in range(4):
+            for p in range(points):
+                o_bar[i, p] = out_bar[i, p]
+    if kind != PACEJKA_FORCES:
+        _network_adjoint(layers, constants[7], f, h1, h2, o_bar, f_bar, learning, gradients)
+    if kind in (FRICTION_SCALED, UNSCALED_FORCES):
+        for i in range(5):
+            for p in range(points):
+                x_bar[i, p] += f_bar[i, p]
+        for i in range(3):
+            for p in range(points):
+                slips_bar[i, p] += f_bar[6 + i, p]
+    elif kind in (PACEJKA_AND_RATES, RATES):
+        for i in range(4):
+            for p in range(points):
+                x_bar[i, p] += f_bar[i, p]
+    if kind == RATES:
+        for p in range(points):
+            x_bar[0, p] += out_bar[1, p] * x[2, p]
+            x_bar[1, p] -= out_bar[0, p] * x[2, p]
+            x_bar[2, p] += out_bar[1, p] * x[0, p] - out_bar[0, p] * x[1, p]
+        return
+    _slips_adjoint(x, theta[0], constants, slips_bar, x_bar, learning, dtheta)
+
+
+@compiled
+def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
+    lf, still = constants[1] - lr, constants[6]
+    d_lf, d_lr = lr * 0, lr * 0
+    for p in range(x.shape[1]):
+        vx, vy, yaw_rate, rim = x[0, p], x[1, p], x[2, p], x[3, p]
+        along = vx + still
+        front, rear = (vy + lf * yaw_rate) / along, (vy - lr * yaw_rate) / along
+        front_bar = slips_bar[0, p] / (1 + front * front) / along
+        rear_bar = slips_bar[1, p] / (1 + rear * rear) / along
+        ratio_bar = slips_bar[2, p] / along
+        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + 1)
+        x_bar[1, p] += front_bar + rear_bar
+        x_bar[2, p] += front_bar * lf - rear_bar * lr
+        x_bar[3, p] += ratio_bar
+        d_lf += front_bar * yaw_rate
+        d_lr -= rear_bar * yaw_rate
+    if learning:
+        dtheta[0] += d_lr - d_lf
+
+
+@compiled
+def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
+    for p in range(x.shape[1]):
+        rates[0, p] = motion[0, p] + x[1, p] * x[2, p]
+        rates[1, p] = motion[1, p] - x[0, p] * x[2, p]
+        rates[2, p] = motion[2, p]
+        rates[3, p] = motion[3, p]
+        rates[4, p] = 0
+
+
+@compiled
+def _block_of(sequences, count, block):  # type: ignore[no-untyped-def]
+    """Sequences in a block, so that blocks are about equal."""
+    most = max(block // count, 1)
+    pieces = (sequences + most - 1) // most
+    return (sequences + pieces - 1) // pieces
+
+
+@compiled
+def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
+    """For what the network sees, slips, both hidden layers, the network's outputs, forces, and rates without what a network adds."""
+    W1, _, W2, _, _, _ = car[0]
+    return (
+        np.empty((W1.shape[1], columns), dtype),
+        np.empty((3, columns), dtype),
+        np.empty((W1.shape[0], columns), dtype),
+        np.empty((W2.shape[0], columns), dtype),
+        np.empty((4, columns), dtype),
+        np.empty((6, columns), dtype),
+        np.empty((4, columns), dtype),
+    )
+
+
+@compiled
+def _four_rooms(columns, car, dtype):  # type: ignore[no-untyped-def]
+    return _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype)
+
+
+@compiled
+def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
+    """The four stages of the Runge-Kutta method."""
+    step = car[2][3]
+    motion = np.empty((4, x0.shape[1]), x0.dtype)
+    for stage in range(4):
+        if stage == 0:
+            x[0] = x0
+        else:
+            share = step if stage == 3 else step / 2
+            for i in range(5):
+                for p in range(x0.shape[1]):
+                    x[stage, i, p] = x0[i, p] + share * rates[stage - 1, i, p]
+        _motion(x[stage], u, car, rooms[stage], motion)
+        _rates(x[stage], motion, rates[stage])
+
+
+@compiled
+def _transition(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
+    sequences, count, n = points.shape
+    step = car[2][3]
+    size = _block_of(sequences, count, block)
+    for first in range(0, sequences, size):
+        end = min(first + size, sequences)
+        columns = (end - first) * count
+        x0, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
+        x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
+        room = _room(columns, car, points.dtype)
+        _columns(points, inputs, first, end, x0, u)
+        _stages(x0, u, car, x, (room, room, room, room), rates)
+        for i in range(n):
+            for p in range(columns):
+                x0[i, p] += step / 6 * (rates[0, i, p] + 2 * rates[1, i, p] + 2 * rates[2, i, p] + rates[3, i, p])
+        _put(x0, out, first, end)
+
+
+@compiled
+def _observation(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
+    sequences, count, n = points.shape
+    size = _block_of(sequences, count, block)
+    for first in range(0, sequences, size):
+        end = min(first + size, sequences)
+        columns = (end - first) * count
+        x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
+        _columns(points, inputs, first, end, x, u)
+        _motion(x, u, car, _room(columns, car, points.dtype), expected)
+        expected[2], expected[3] = x[2], x[3]
+        _put(expected, out, first, end)
+
+
+@compiled
+def _transition_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
+    sequences, count, n = points.shape
+    step = car[2][3]
+    size = _block_of(sequences, count, block)
+    for first in range(0, sequences, size):
+        end = min(first + size, sequences)
+        columns = (end - first) * count
+        x0, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((n, columns), points.dtype)
+        x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
+        rooms = _four_rooms(columns, car, points.dtype)
+        _columns(points, inputs, first, end, x0, u)
+        _stages(x0, u, car, x, rooms, rates)
+        _columns(upstream, inputs, first, end, up, u)
+        total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
+        for k in range(4):
+            at = 3 - k
+            own = step / 3 if at in (1, 2) else step / 6
+            later = step if at == 2 else step / 2
+            for i in range(4):
+                for p in range(columns):
+                    rates_bar[i, p] = own * up[i, p] + (later * stage_bar[i, p] if at < 3 else 0)
+            for p in range(columns):
+                stage_bar[0, p] = -rates_bar[1, p] * x[at, 2, p]
+                stage_bar[1, p] = rates_bar[0, p] * x[at, 2, p]
+                stage_bar[2, p] = rates_bar[0, p] * x[at, 1, p] - rates_bar[1, p] * x[at, 0, p]
+                stage_bar[3, p] = 0
+                stage_bar[4, p] = 0
+            _motion_adjoint(x[at], u, car, rooms[at], rates_bar, stage_bar, learning, gradients)
+            for i in range(n):
+                for p in range(columns):
+                    total[i, p] += stage_bar[i, p]
+        _put(total, out, first, end)
+
+
+@compiled
+def _observation_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
+    sequences, count, n = points.shape
+    size = _block_of(sequences, count, block)
+    for first in range(0, sequences, size):
+        end = min(first + size, sequences)
+        columns = (end - first) * count
+        x, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
+        room = _room(columns, car, points.dtype)
+        _columns(points, inputs, first, end, x, u)
+        _motion(x, u, car, room, np.empty((4, columns), points.dtype))
+        _columns(upstream, inputs, first, end, up, u)
+        x_bar = np.zeros_like(x)
+        x_bar[2], x_bar[3] = up[2], up[3]
+        up[2], up[3] = 0, 0
+        _motion_adjoint(x, u, car, room, up, x_bar, learning, gradients)
+        _put(x_bar, out, first, end)
