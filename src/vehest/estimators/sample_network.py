@@ -48,17 +48,26 @@ class SampleNetworkSettings(EstimatorSettings):
         super().__post_init__()
         if self.inputs not in INPUTS:
             raise ConfigurationError(f"estimator.inputs '{self.inputs}' is not one of: {', '.join(INPUTS)}")
-        widths = tuple(self.hidden) if isinstance(self.hidden, Sequence) and not isinstance(self.hidden, str) else ()
-        if len(widths) != 2 or not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in widths):
-            raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {self.hidden!r}")
-        object.__setattr__(self, "hidden", widths)
-        if not 0 <= self.dropout < 1:
-            raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {self.dropout}")
+        object.__setattr__(self, "hidden", checked_layers(self.hidden, self.dropout))
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Measured channels that the network sees."""
         return INPUTS[self.inputs]
+
+
+def checked_layers(hidden: Sequence[int], dropout: float) -> tuple[int, int]:
+    """Widths of two hidden layers as a tuple.
+
+    Raises:
+        ConfigurationError: they are no such widths, or the dropout is no share.
+    """
+    widths = tuple(hidden) if isinstance(hidden, Sequence) and not isinstance(hidden, str) else ()
+    if len(widths) != 2 or not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in widths):
+        raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {hidden!r}")
+    if not 0 <= dropout < 1:
+        raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {dropout}")
+    return widths[0], widths[1]
 
 
 class SampleNetwork(nn.Module):
