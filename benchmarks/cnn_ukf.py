@@ -30,7 +30,7 @@ HOURS, RATE, STEPS, BATCH = 2.0, 100, 256, 32
 MEMBERS, EPOCHS, SAMPLES_A_STEP, COUNTED = 20, 30, 1024, 6
 DRIVES = ("train_slalom_18_on_001", "train_j_turn_off_001", "train_lane_change_1_on_001", "train_random_steer_on_001")
 LEAST_RATIO, MOST_EPOCH, MOST_ENSEMBLE = 6.0, 240.0, 2400.0  # 1, s, s
-MOST_DIFFERENCE = 1e-6  # relative, of losses and gradients
+MOST_DIFFERENCE = 1e-4  # relative, of losses and gradients, of a network in single precision
 TYRES = {"cornering_stiffness": 1.2e5, "friction": 1.1, "reduction": 1e-3}
 LEVELS = {
     "process_vy": 1e-3,

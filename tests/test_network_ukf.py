@@ -132,7 +132,7 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
         torch.testing.assert_close(own, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))
     training.filter = ours
     said = estimator.said(estimator.network(batch.inputs.reshape(1, -1, 17)).reshape(4, 30, 4))
-    assert found.item() > float((batch.sideslip - said.sideslip).square().mean())  # the filter's error comes on top of the network's
+    assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
 
 
 def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on() -> None:

@@ -59,7 +59,7 @@ class EndToEndSettings:
 
     pre_training: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10)  # noqa: RUF009
     pre_training_batch: int = 256
-    end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=60, patience=15)  # noqa: RUF009
+    end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30)  # noqa: RUF009
     steps: int = 256
     batch_size: int = 32
     identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
