@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -100,6 +100,9 @@ bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data 
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
+
+bench-cnn: $(INSTALLED) ## training through the filter and twenty networks together, against plain PyTorch (minutes)
+	$(BIN)/python benchmarks/cnn_ukf.py
 
 clean: ## remove what can be made again (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

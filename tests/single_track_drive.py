@@ -34,6 +34,7 @@ def linear_drive(
         "yaw_rate": states[:, 1] + noise["yaw_rate"] * generator.standard_normal(len(time)),
         "ay": np.einsum("ti,ti->t", model.C, states) + model.D * steer + noise["ay"] * generator.standard_normal(len(time)),
         "steer": steer,
+        "ax": np.gradient(vx, 1.0 / rate_hz),
         "vx_ref": vx,
         "vy_ref": vx * np.tan(states[:, 0]),
         "yaw_rate_ref": states[:, 1],

@@ -17,6 +17,7 @@ from vehest.data.transforms import (
     TRANSFORMS,
     LowPass,
     MountingCorrection,
+    ReferenceLever,
     RemoveOutliers,
     Resample,
     SpeedFromWheels,
@@ -98,6 +99,54 @@ def test_low_pass_beyond_nyquist_is_refused(cutoff_hz: float) -> None:
         LowPass(cutoff_hz)(recorded(ay=np.zeros(10)))
 
 
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
+def test_a_symmetric_low_pass_has_the_gain_of_its_taps_and_no_phase(frequency: float) -> None:
+    time = np.arange(1000) / RATE
+    samples = LowPass(5.0, design="fir")(recorded(ay=np.sin(2 * np.pi * frequency * time)))["ay"]
+    lag = np.arange(-30, 31) / RATE
+    taps = np.sinc(10.0 * lag) * (0.54 + 0.46 * np.cos(np.pi * lag / 0.3))
+    response = float(np.sum(taps * np.cos(2 * np.pi * frequency * lag)) / taps.sum())
+    inside = slice(200, 800)
+    gain, phase = fitted_sine(samples[inside], time[inside], frequency)
+    assert gain * np.cos(phase) == pytest.approx(response, abs=1e-6)
+    assert gain * np.sin(phase) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 300])
+def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length: int) -> None:
+    line = 3.0 - 0.2 * np.arange(length)
+    np.testing.assert_allclose(LowPass(5.0, design="fir")(recorded(ay=line))["ay"], line, atol=1e-9)
+
+
+def test_a_causal_low_pass_runs_along_with_the_drive_as_over_the_recording() -> None:
+    generator = np.random.default_rng(0)
+    drive = recorded(ay=generator.standard_normal(80).cumsum() + 5.0, vx=generator.standard_normal(80))
+    low_pass = LowPass(5.0, ("ay",), "causal")
+    stepper, whole = low_pass.online(RATE), low_pass(drive)
+    steps = [stepper.step({name: float(drive[name][k]) for name in ("ay", "vx")}) for k in range(80)]
+    for name in ("ay", "vx"):
+        np.testing.assert_allclose([step[name] for step in steps], whole[name], rtol=0, atol=1e-12)
+    with pytest.raises(DataError, match="'ay' is missing"):
+        stepper.step({"vx": 1.0})
+
+
+def test_what_cannot_be_causal_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="use design=butterworth for a causal one"):
+        LowPass(5.0, direction="causal", design="fir")
+    with pytest.raises(ConfigurationError, match="use direction=causal"):
+        LowPass(5.0, design="fir").online(RATE)
+
+
+def test_reference_lever_brings_velocities_to_the_centre_of_gravity() -> None:
+    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
+    yaw_rate, vx, vy = np.array([0.0, 0.4, -0.3]), np.full(3, 15.0), np.array([0.0, -0.2, 0.4])
+    at_sensor = {"vx_ref": vx - yaw_rate * 0.5, "vy_ref": vy + yaw_rate * 2.0, "yaw_rate": yaw_rate}
+    moved = ReferenceLever(2.0, 0.5)(recorded(**at_sensor, sideslip_ref=np.zeros(3)))
+    np.testing.assert_allclose(moved["vx_ref"], vx)
+    np.testing.assert_allclose(moved["vy_ref"], vy)
+    np.testing.assert_allclose(moved["sideslip_ref"], np.arctan2(vy, vx))
+
+
 def test_only_the_named_channels_are_filtered() -> None:
     noise = np.random.default_rng(0).standard_normal(100)
     out = LowPass(5.0, channels=("ay",))(recorded(ay=noise, ax=noise))
@@ -133,6 +182,18 @@ def test_outlier_removal_leaves_a_clean_signal_alone(noise: float) -> None:
 def test_outlier_removal_keeps_steps_ramps_and_quantised_ramps() -> None:
     for samples in (np.repeat([0.0, 5.0], 50), np.arange(100.0), np.round(np.arange(100.0) / 7.0), np.full(100, 2.0)):
         np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], samples)
+
+
+def test_outlier_removal_keeps_the_peak_of_a_slide_and_removes_a_glitch_on_it() -> None:
+    """A slide of 10 degrees within half a second, noise of an optical sensor."""
+    time = np.arange(300) / RATE
+    slide = np.radians(10.0) * np.exp(-np.square((time - 1.5) / 0.25)) + 1e-3 * np.random.default_rng(1).standard_normal(300)
+    spoilt = slide.copy()
+    spoilt[150] += 0.2
+    cleaned = RemoveOutliers()(recorded(ay=spoilt))["ay"]
+    assert abs(cleaned[150] - slide[150]) < 0.005
+    assert np.delete(cleaned, 150).max() == np.delete(slide, 150).max()
+    assert (np.delete(cleaned == slide, 150)).mean() > 0.98
 
 
 def test_outlier_removal_removes_a_spike_from_a_channel_at_rest() -> None:
@@ -232,7 +293,9 @@ def test_transforms_are_built_from_plain_values() -> None:
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
-    assert set(TRANSFORMS) == {"resample", "low_pass", "remove_outliers", "mounting_correction", "speed_from_wheels"} | of_an_alignment
+    assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
+    others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
+    assert set(TRANSFORMS) == others | of_an_alignment
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from conftest import planar_drive
+from dugoff_drive import TYRES
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -16,6 +17,7 @@ from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
 from vehest.training.settings import (
     DirectSearchSettings,
+    IdentificationSettings,
     NoiseTuningSettings,
     NoTraining,
     PhaseSettings,
@@ -30,6 +32,7 @@ CONFIGS = {  # those that are offline by default run online with these; recurren
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
     "learned_ukf": {"width": 8},
+    "dugoff_ukf": {"inputs": "imu", "tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}},
     "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
 }
 
@@ -50,6 +53,8 @@ def _fitted(name, dtype="float64", **config):
         estimator.fit(FitData([small_car_drive(2.0)], [small_car_drive(1.5, 1)]), training)
     elif estimator.training_type is NoiseTuningSettings:
         estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
+    elif estimator.training_type is IdentificationSettings:
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), IdentificationSettings(method="data"))
     elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))

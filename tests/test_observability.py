@@ -35,6 +35,7 @@ def test_smallest_singular_value_of_a_linear_model_in_closed_form():
 def test_position_cannot_be_seen_from_speed():
     blind = along(lambda x, u: x[1:])
     assert (blind.smallest == 0.0).all()
+    assert (blind.rank == 1).all()
     assert np.isinf(blind.deviation[:, 0]).all()
     np.testing.assert_allclose(blind.deviation[:, 1], np.sqrt(0.5))
 

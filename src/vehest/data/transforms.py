@@ -127,21 +127,34 @@ class Resample:
 class LowPass:
     """Remove what lies above a cut-off frequency.
 
-    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways.
+    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways. A ``fir`` is symmetric
+    (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
 
     Args:
-        cutoff_hz: -3 dB frequency of one pass [Hz].
+        cutoff_hz: -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz].
         channels: which channels; all measured ones if empty, never references.
         direction: ``causal`` or ``zero_phase``.
+        design: ``butterworth`` or ``fir``.
+        reach: of a ``fir`` into past and future; the longer, the sharper its cut-off [s].
+
+    Source: of the ``fir``, Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.5.
     """
 
     cutoff_hz: float
     channels: tuple[str, ...] = ()
     direction: Literal["causal", "zero_phase"] = "zero_phase"
+    design: Literal["butterworth", "fir"] = "butterworth"
+    reach: float = 0.3
 
     def __post_init__(self) -> None:
         if self.direction not in ("causal", "zero_phase"):
             raise ConfigurationError(f"low-pass direction '{self.direction}' is not one of: causal, zero_phase")
+        if self.design not in ("butterworth", "fir"):
+            raise ConfigurationError(f"low-pass design '{self.design}' is not one of: butterworth, fir")
+        if self.design == "fir" and self.direction == "causal":
+            raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
+        if not (math.isfinite(self.reach) and self.reach > 0):
+            raise ConfigurationError(f"the reach of a low-pass must be positive, not {self.reach}")
 
     @property
     def mode(self) -> Mode:
@@ -155,19 +168,68 @@ class LowPass:
             ConfigurationError: the cut-off is not below the Nyquist frequency.
             DataError: a channel is missing or has gaps.
         """
-        if not 0 < self.cutoff_hz < recording.rate_hz / 2:
-            raise ConfigurationError(
-                f"recording '{recording.id}': low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {recording.rate_hz / 2:g} Hz"
-            )
-        sections = signal.butter(2, self.cutoff_hz, fs=recording.rate_hz, output="sos")
+        sections = self._sections(recording.rate_hz, f"recording '{recording.id}': ")
         settled = signal.sosfilt_zi(sections)
 
         def apply(samples: FloatArray) -> FloatArray:
+            if self.design == "fir":
+                return self._symmetric(samples, recording.rate_hz)
             if self.direction == "causal":
                 return signal.sosfilt(sections, samples, zi=settled * samples[0])[0]
             return signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
 
         return _with_changed(recording, self.channels, apply)
+
+    def online(self, rate_hz: float) -> LowPassStepper:
+        """The same for one sample at a time, as a car has them.
+
+        Raises:
+            ConfigurationError: it is not causal, or the cut-off is not below the Nyquist frequency.
+        """
+        if self.mode != "causal":
+            raise ConfigurationError("a low-pass that sees later samples cannot run along with a drive; use direction=causal")
+        return LowPassStepper(self._sections(rate_hz, ""), self.channels)
+
+    def _sections(self, rate_hz: float, where: str) -> FloatArray:
+        if not 0 < self.cutoff_hz < rate_hz / 2:
+            raise ConfigurationError(f"{where}low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
+        return np.asarray(signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
+
+    def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
+        """By the ``fir``, on samples extended at both ends by odd reflection; a constant stays that constant, a line that line."""
+        half = max(1, round(self.reach * rate_hz))
+        taps = signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
+        kind: dict[str, Any] = {"mode": "reflect", "reflect_type": "odd"} if len(samples) > 1 else {"mode": "edge"}
+        return np.convolve(np.pad(samples, half, **kind), taps, mode="valid")
+
+
+class LowPassStepper:
+    """A causal low-pass, one sample at a time; settled at the first.
+
+    Args:
+        sections: second-order ones, (n, 6).
+        channels: which channels; all that the first sample has if empty.
+    """
+
+    def __init__(self, sections: FloatArray, channels: tuple[str, ...] = ()) -> None:
+        self._sections, self._channels = sections, channels
+        self._states: dict[str, FloatArray] = {}
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """The sample with its channels filtered.
+
+        Raises:
+            DataError: a channel is missing, or its value is not finite.
+        """
+        filtered = dict(sample)
+        for name in self._channels or tuple(sample):
+            value = sample.get(name, math.nan)
+            if not math.isfinite(value):
+                raise DataError(f"the sample's '{name}' is {'missing' if name not in sample else value}, and cannot be filtered")
+            if name not in self._states:
+                self._states[name] = signal.sosfilt_zi(self._sections) * value
+            (filtered[name],), self._states[name] = signal.sosfilt(self._sections, [value], zi=self._states[name])
+        return {name: float(value) for name, value in filtered.items()}
 
 
 @dataclass(frozen=True)
@@ -252,6 +314,40 @@ class MountingCorrection:
             rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
             rotated_y = rotated_y - yaw_acceleration * self.lever_x + yaw_rate**2 * self.lever_y
         return replace(recording, channels={**recording.channels, "ax": rotated_x, "ay": rotated_y})
+
+
+@dataclass(frozen=True)
+class ReferenceLever:
+    """Move reference velocities from where their sensor sits to the centre of gravity: v_cg = v_sensor - ω × l.
+
+    Args:
+        lever_x: forward offset of the sensor from the centre of gravity [m].
+        lever_y: leftward offset [m].
+
+    Source:
+        Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C moves an optical sensor on the bumper so.
+    """
+
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.lever_x) and math.isfinite(self.lever_y)):
+            raise ConfigurationError(f"the lever of a reference must be numbers [m], not {self.lever_x} and {self.lever_y}")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Correct vx_ref and vy_ref, and sideslip_ref where there is one, by yaw_rate_ref or, without one, yaw_rate.
+
+        Raises:
+            DataError: vx_ref, vy_ref or the yaw rate is missing or has gaps.
+        """
+        turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
+        _require_no_gaps(recording, ("vx_ref", "vy_ref", turning))
+        vx = recording["vx_ref"] + recording[turning] * self.lever_y
+        vy = recording["vy_ref"] - recording[turning] * self.lever_x
+        sideslip = {"sideslip_ref": np.arctan2(vy, vx)} if "sideslip_ref" in recording else {}
+        return replace(recording, channels={**recording.channels, "vx_ref": vx, "vy_ref": vy, **sideslip})
 
 
 @dataclass(frozen=True)
@@ -484,6 +580,7 @@ TRANSFORMS: dict[str, type] = {
     "low_pass": LowPass,
     "remove_outliers": RemoveOutliers,
     "mounting_correction": MountingCorrection,
+    "reference_lever": ReferenceLever,
     "delay_correction": DelayCorrection,
     "offset_correction": OffsetCorrection,
     "steering_ratio": SteeringRatio,

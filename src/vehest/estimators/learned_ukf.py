@@ -16,6 +16,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
 from vehest.estimators.car_filter import CarFilter
+from vehest.estimators.phase_records import record_of_phases
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
@@ -213,7 +214,7 @@ class LearnedUkf(Estimator):
                 twins = [other for other, seed in enumerate(seeds) if other > index and seed == member._seed]
                 phases = member._train(data, training, context, index, twins)
                 trained[member._seed] = (member, phases)
-            records.append(_record_of(phases, len(members)))
+            records.append(record_of_phases(phases))
         return records
 
     def _train(
@@ -411,29 +412,6 @@ def _held(values: FloatArray) -> FloatArray:
         if missing.any():
             held[k, missing] = held[k - 1, missing] if k else 0.0
     return held
-
-
-def _record_of(phases: Sequence[PhaseRecord], members: int) -> FitRecord:
-    history: dict[str, list[float]] = {"phase": [], "epoch": [], "train_loss": [], "validation_loss": []}
-    for number, phase in enumerate(phases):
-        history["phase"] += [number] * phase.epochs
-        history["epoch"] += range(len(history["epoch"]) + 1, len(history["epoch"]) + phase.epochs + 1)
-        history["train_loss"] += phase.train_loss
-        history["validation_loss"] += phase.validation_loss
-    last = phases[-1]
-    return FitRecord(
-        history=history,
-        metrics={
-            "epochs": sum(phase.epochs for phase in phases),
-            "best_epoch": last.best_epoch,
-            "best_validation_loss": last.best_loss,
-            "start_validation_loss": last.start_loss,
-            "skipped_steps": sum(phase.skipped_steps for phase in phases),
-            "train_seconds": sum(phase.seconds for phase in phases),
-            **{f"{phase.name}_seconds": phase.seconds for phase in phases},
-        },
-        interrupted=last.interrupted,
-    )
 
 
 ESTIMATOR = LearnedUkf

@@ -21,6 +21,7 @@ from scipy import optimize, signal
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import FloatArray, Recording
+from vehest.vehicle.dugoff import LoadedCar
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.rational_tyres import rational_axle
 
@@ -43,17 +44,19 @@ NORMAL_95 = 1.959964
 
 
 class AxleMotion(NamedTuple):
-    """What the axles do along drives; both arrays have a row an axle, front and rear.
+    """What the axles do along drives; slips and forces have a row an axle, front and rear.
 
     Attributes:
         slip: slip angles, positive where they make a force to the left, (2, N) [rad].
         force: lateral forces, (2, N) [N].
         block: number of the stretch of time a sample belongs to, (N,).
+        driven: forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN where none was measured.
     """
 
     slip: FloatArray
     force: FloatArray
     block: NDArray[np.int64]
+    driven: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,11 @@ def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArr
 
 
 def axle_motion(
-    recordings: Sequence[Recording], parameters: SingleTrackParameters, minimum_speed: float = 3.0, *, measured_forces: bool = False
+    recordings: Sequence[Recording],
+    parameters: SingleTrackParameters | LoadedCar,
+    minimum_speed: float = 3.0,
+    *,
+    measured_forces: bool = False,
 ) -> AxleMotion:
     """Slip angles and forces of the axles along drives.
 
@@ -121,7 +128,7 @@ def axle_motion(
     Raises:
         DataError: a channel is missing, or hardly any samples are left.
     """
-    slips, forces, blocks = [], [], []
+    slips, forces, blocks, driven = [], [], [], []
     first_block = 0
     for recording in recordings:
         length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
@@ -129,13 +136,14 @@ def axle_motion(
             raise DataError(f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more")
         if len(recording) < length:
             continue
-        slip, force = _motion_of(recording, parameters, minimum_speed, length, measured_forces=measured_forces)
+        slip, force, inputs = _motion_of(recording, parameters, minimum_speed, length, measured_forces=measured_forces)
         block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
         first_block = int(block[-1]) + 1
         usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
         slips.append(slip[:, usable])
         forces.append(force[:, usable])
         blocks.append(block[usable])
+        driven.append(inputs[:, usable])
     count = sum(slip.shape[1] for slip in slips)
     if count < FEWEST_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
@@ -143,13 +151,13 @@ def axle_motion(
             f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {FEWEST_SAMPLES} are needed "
             f"(recordings: {named})"
         )
-    return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks))
+    return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks), np.concatenate(driven, axis=1))
 
 
 def _motion_of(
-    recording: Recording, parameters: SingleTrackParameters, minimum_speed: float, length: int, *, measured_forces: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Slips and forces of one drive, (2, T) each."""
+    recording: Recording, parameters: SingleTrackParameters | LoadedCar, minimum_speed: float, length: int, *, measured_forces: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slips and forces of one drive, (2, T) each, and what it was driven with, (3, T)."""
     front, rear, mass, inertia = (
         float(value) for value in (parameters.cg_to_front_axle, parameters.cg_to_rear_axle, parameters.mass, parameters.yaw_inertia)
     )
@@ -163,11 +171,13 @@ def _motion_of(
     sideslip = recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], u)
     turn = recording["yaw_rate"] / u
     slip = np.stack([smoothed(recording["steer"] - sideslip - front * turn), smoothed(rear * turn - sideslip)])
+    ax = smoothed(recording["ax"]) if "ax" in recording else np.full(len(u), np.nan)
+    driven = np.stack([smoothed(u), smoothed(recording["steer"]), ax])
     if measured_forces:
         wheels = [recording[f"fy_{wheel}"] for wheel in ("fl", "fr", "rl", "rr")]
-        return slip, np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])])
+        return slip, np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])]), driven
     total, moment = mass * smoothed(recording["ay"]), inertia * smoothed(recording["yaw_rate"], derivative=1)
-    return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear)
+    return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear), driven
 
 
 def fit_tyres(

@@ -32,10 +32,12 @@ class Observability(NamedTuple):
         smallest: smallest singular value of the local observability matrix, (T - N + 1,).
         deviation: standard deviation of each state from these measurements alone, in units of its size; infinite where they do not
             determine it, (T - N + 1, n).
+        rank: of the local observability matrix, (T - N + 1,).
     """
 
     smallest: FloatArray
     deviation: FloatArray
+    rank: NDArray[np.int64]
 
 
 def jacobians_along(
@@ -88,7 +90,7 @@ def observability_along(
     noise: FloatArray,
     steps: int,
 ) -> Observability:
-    """Smallest singular value and standard deviations of every window along a drive.
+    """Smallest singular value, standard deviations and rank of every window along a drive.
 
     Args:
         transition: f of states (n,) and inputs (p,), to (n,); smooth.
@@ -113,4 +115,4 @@ def observability_along(
     full[full <= 1e-13 * full[:, :1]] = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         spread = np.where(np.abs(directions) > 1e-7, directions / full[:, :, None], 0.0)
-    return Observability(full[:, -1], np.sqrt(np.square(spread).sum(1)))
+    return Observability(full[:, -1], np.sqrt(np.square(spread).sum(1)), np.count_nonzero(full, axis=1))

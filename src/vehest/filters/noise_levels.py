@@ -36,3 +36,34 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
     if not len(known):
         raise ValueError(f"{len(taps)} samples without a gap are needed to read a noise level")
     return float(np.std(known))
+
+
+def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], least: int, share: float = 0.1) -> float:
+    """Standard deviation of several recordings of one signal while little else happens, taken together.
+
+    Recordings are cut into pieces; those count in which another signal moves least, and in them deviations from a straight line.
+
+    Args:
+        series: one array a recording, (T,).
+        activity: the other signal, one array a recording, (T,).
+        least: samples of a piece.
+        share: of the pieces that count.
+
+    Raises:
+        ValueError: pieces are too short for a line, or none is without a gap.
+
+    Source: Bertipaglia et al. 2024, Section III-B, read levels where the steering angle is zero and the speed constant.
+    """
+    if least < 3:
+        raise ValueError(f"a piece must hold at least 3 samples, not {least}")
+
+    def pieces(samples: FloatArray) -> FloatArray:
+        return samples[: len(samples) - len(samples) % least].reshape(-1, least)
+
+    own, others = (np.concatenate([pieces(samples) for samples in signals]) for signals in (series, activity))
+    known = ~(np.isnan(own).any(1) | np.isnan(others).any(1))
+    if not known.any():
+        raise ValueError(f"no stretch of {least} samples without a gap")
+    left, moved = (np.square(signal.detrend(values[known], axis=1)).sum(1) / (least - 2) for values in (own, others))
+    quietest = np.argsort(moved, kind="stable")[: max(1, round(share * len(moved)))]
+    return float(np.sqrt(left[quietest].mean()))

@@ -1,4 +1,4 @@
-"""Direct search: Nelder-Mead from a grid of starts inside a box."""
+"""Search inside a box for the parameters with the smallest cost: Nelder-Mead from a grid of starts, Optuna at once or in stages."""
 
 from __future__ import annotations
 
@@ -134,3 +134,53 @@ def optuna_search(
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
     return SearchRecord(best[: len(box)], float(best[-1]), table, len(rows), len(rows) < trials)
+
+
+def staged_optuna_search(
+    cost: Callable[[FloatArray], float],
+    box: Sequence[tuple[float, float]],
+    trials: int,
+    seed: int,
+    context: FitContext,
+    *,
+    stages: int = 2,
+    shrink: float = 0.3,
+) -> SearchRecord:
+    """Minimise a cost by Optuna in stages: first in the whole box, then in smaller ones around the best so far.
+
+    Args:
+        cost: function of the parameters, shape (K,).
+        box: admissible range of each parameter, which no stage leaves.
+        trials: evaluations of all stages together, shared out evenly.
+        seed: of the first stage; the others follow it.
+        context: progress and the wish to stop.
+        stages: how many there are.
+        shrink: width of the box of a stage, relative to that of the stage before.
+
+    Raises:
+        MissingError: Optuna is not installed.
+
+    Source: Bertipaglia et al., IEEE Intelligent Vehicles Symposium 2022 (two-stage Bayesian optimisation).
+    """
+    records: list[SearchRecord] = []
+    width = 1.0
+    for stage in range(stages):
+        own = list(box)
+        if records:
+            best = min(records, key=lambda record: record.cost).best
+            width *= shrink
+            own = [_around(value, low, high, width * (high - low)) for value, (low, high) in zip(best, box, strict=True)]
+        share = trials * (stage + 1) // stages - trials * stage // stages
+        records.append(optuna_search(cost, own, share, seed + stage, context))
+        if records[-1].interrupted:
+            break
+    won = min(records, key=lambda record: record.cost)
+    evaluations = sum(record.evaluations for record in records)
+    starts = np.concatenate([record.starts for record in records])
+    return SearchRecord(won.best, won.cost, starts, evaluations, records[-1].interrupted)
+
+
+def _around(value: float, low: float, high: float, width: float) -> tuple[float, float]:
+    """A range of this width about a value, moved inside the bounds."""
+    start = min(max(value - 0.5 * width, low), high - width)
+    return start, start + width

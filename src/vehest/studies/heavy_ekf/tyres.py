@@ -55,9 +55,8 @@ class OwnCurves:
         for number, drive in enumerate(drives):
             motion = axle_motion([drive], car, minimum_speed, measured_forces=True)
             offsets[drive.id] = np.array([_no_force(slip, force) for slip, force in zip(motion.slip, motion.force, strict=True)])
-            motions.append(AxleMotion(motion.slip - offsets[drive.id][:, None], motion.force, motion.block + 10_000 * number))
-        slips, forces, blocks = (np.concatenate(parts, axis=-1) for parts in zip(*motions, strict=True))
-        together = AxleMotion(slips, forces, blocks)
+            motions.append(motion._replace(slip=motion.slip - offsets[drive.id][:, None], block=motion.block + 10_000 * number))
+        together = AxleMotion(*(np.concatenate(parts, axis=-1) for parts in zip(*motions, strict=True)))
         return cls(fit_motion(together, "rational"), fit_motion(together, "linear"), offsets)
 
     def value(self, quantity: str, name: str) -> float:

@@ -1,0 +1,297 @@
+"""UKF-informed neural network: a network and the unscented filter behind it, trained end to end (CNN-UKF)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import FloatArray, Recording
+from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
+from vehest.estimators.phase_records import record_of_phases
+from vehest.estimators.sample_network import SampleNetwork, believed, learnt_samples, reference_sideslip
+from vehest.filters.gaussian import Gaussian
+from vehest.training.context import FitContext
+from vehest.training.samples import Draw, Samples, sample_phase
+from vehest.training.sequences import Phase, train_phases
+from vehest.training.settings import IdentificationSettings, PhaseSettings
+
+START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
+MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
+
+
+@dataclass(frozen=True)
+class CnnUkfSettings(NetworkUkfSettings):
+    """Settings of the filter and of its network; the tyres are the smooth ones that gradients pass (Eq. 10).
+
+    Args:
+        curve: see `DugoffUkfSettings`.
+        hidden: see `NetworkUkfSettings`.
+    """
+
+    curve: Literal["plain", "smooth"] = "smooth"
+    hidden: tuple[int, int] = (200, 100)
+
+
+@dataclass(frozen=True)
+class EndToEndSettings:
+    """Training of filter and network (Bertipaglia et al. 2024, Section III-C).
+
+    Args:
+        pre_training: the network alone, on samples in random order.
+        pre_training_batch: samples in a batch.
+        end_to_end: network and filter, on sequences.
+        steps: samples of a training sequence.
+        batch_size: sequences in a batch.
+        identification: of the filter.
+        dtype: of the network, ``float32`` or ``float64``; the filter computes in double precision.
+        checkpoint_seconds: time between two checkpoints [s].
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+
+    pre_training: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10)  # noqa: RUF009
+    pre_training_batch: int = 256
+    end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30)  # noqa: RUF009
+    steps: int = 256
+    batch_size: int = 32
+    identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
+    dtype: Literal["float32", "float64"] = "float32"
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        for name in ("pre_training_batch", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+        if self.steps < 2:
+            raise ConfigurationError(f"training.steps must be at least 2, not {self.steps}")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+
+
+class Said(NamedTuple):
+    """What the network says of samples, differentiable, in double precision.
+
+    Attributes:
+        sideslip: β_DD (...) [rad].
+        distrust: σ_DD (...) [rad].
+        process: σ_Vy and σ_ψ̇ (..., 2) [m/s, rad/s], of one sample's step.
+    """
+
+    sideslip: Tensor
+    distrust: Tensor
+    process: Tensor
+
+    @property
+    def variance(self) -> Tensor:
+        """Of the sideslip angle as a measurement [rad²]."""
+        return self.distrust.square() + LEAST_VARIANCE
+
+
+class Cuts(NamedTuple):
+    """Training sequences of one length, cut from recordings.
+
+    Attributes:
+        inputs: scaled, (B, T, C).
+        sideslip: reference, (B, T) [rad].
+        measured: of the four sensors, (B, T, 4).
+        driven: inputs of the filter, (B, T, 3).
+        trusted: whether forces are trusted, bool (B, T).
+        start: true state at the first sample, (B, 2).
+        seeds: of dropout, int64 (1,).
+        firsts: where they begin in all training samples, int64 (B,).
+    """
+
+    inputs: Tensor
+    sideslip: Tensor
+    measured: Tensor
+    driven: Tensor
+    trusted: Tensor
+    start: Tensor
+    seeds: Tensor
+    firsts: Tensor
+
+
+class CnnUkf(NetworkUkf):
+    """A network gives the filter a sideslip angle, how little to trust it, and the process noise, sample by sample.
+
+    Its 1x1 convolutions over time see one sample each, so it is a network of samples. σ_DD, σ_Vy and σ_ψ̇ come out of logistic functions;
+    all three are standard deviations here, in pre-training too, where Eq. 6 has σ_DD as a variance: R = σ_DD² + ε, and ε is added rather
+    than a bound, so that it has a gradient everywhere.
+
+    Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural network for vehicle sideslip angle
+    estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
+    """
+
+    name = "cnn_ukf"
+    title = "UKF-informed network"
+    settings_type = CnnUkfSettings
+    training_type = EndToEndSettings
+    settings: CnnUkfSettings
+
+    def _new_network(self) -> SampleNetwork:
+        return SampleNetwork(len(self.inputs), self.settings.hidden, 4)
+
+    def said(self, outputs: Tensor) -> Said:
+        """What outputs of the network, (..., 4), say."""
+        shares = torch.sigmoid(outputs[..., 1:].double())
+        return Said(outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:])
+
+    def word(self, inputs: FloatArray) -> Word:
+        """Angle, its variance and the process noise."""
+        said = self.said(torch.as_tensor(self.network.said(inputs)[0]))
+        return Word(believed(said.sideslip.numpy()), said.variance.numpy(), said.process.square().numpy())
+
+    def _fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
+        raw, judged = (learnt_samples(part, self.inputs, self.name) for part in (data.train, data.validation))
+        network = self.network = self._new_network().to(getattr(torch, training.dtype))
+        network.scale(*raw)
+        network.reset([torch.Generator().manual_seed(self._seed)])
+        levels = torch.tensor([self.model.levels["process_vy"], self.model.levels["process_yaw_rate"]], dtype=torch.float64)
+        with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
+            start = torch.cat([network.unit.double().reshape(1), levels])
+            network.get_parameter("bias_3")[0, 1:] = torch.logit(start.clamp(max=0.5)).to(network.unit.dtype)
+        train = network.samples(*raw)
+        end_to_end = _EndToEnd(self, train, data.train, training)
+        phases = [
+            self._pre_training(train, network.samples(*judged), levels, training),
+            Phase(
+                "end_to_end",
+                training.end_to_end,
+                network,
+                end_to_end.batches,
+                end_to_end.loss,
+                lambda: self.mean_squared_error(
+                    data.validation, [self.word(recording.stack(self.inputs)) for recording in data.validation]
+                ),
+            ),
+        ]
+        record = record_of_phases(train_phases(phases, self._seed, context, index, training.checkpoint_seconds))
+        return FitRecord(record.history, {**record.metrics, "lost_sequences": end_to_end.lost}, record.interrupted)
+
+    def _pre_training(self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings) -> Phase:
+        """The network alone: a likelihood of its angle and distrust, and process noise at the filter's own levels (Eqs. 5 and 6)."""
+        network, dropout = self.network, self.settings.dropout
+
+        def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
+            said = self.said(outputs)
+            error = said.sideslip - targets.double() * network.unit.double()
+            likelihood = 0.5 * (said.variance.log() + error.square() / said.variance).mean(-1)
+            return likelihood + (said.process - levels).square().sum(-1).mean(-1)
+
+        def losses(draw: Draw) -> Tensor:
+            return loss_of(network(train.inputs[draw.rows], draw.seeds, dropout), train.targets[draw.rows])
+
+        def judge() -> Tensor:
+            return loss_of(network(judged.inputs.unsqueeze(0)), judged.targets)
+
+        return sample_phase(
+            "pre_training", network, training.pre_training, training.pre_training_batch, len(train.targets), 1, losses, judge
+        )
+
+
+class _EndToEnd:
+    """Backpropagation through network and filter over sequences (Eqs. 7 and 8)."""
+
+    def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:
+        self.estimator, self.samples, self.recordings, self.training = estimator, samples, recordings, training
+        self.filter = estimator.track_filter()
+        self.sensors = estimator.sensor_noise()[1]
+        self.lengths = [len(recording) for recording in recordings]
+        self.offsets = np.concatenate([[0], np.cumsum(self.lengths)])
+        if max(self.lengths) < training.steps:
+            raise DataError(
+                f"no training recording is {training.steps} samples long, as a sequence for training through the filter is "
+                f"(the longest has {max(self.lengths)}); lower training.steps"
+            )
+        taken = [estimator.taken(recording.stack(estimator.channels)) for recording in recordings]
+        self.measured, self.driven = (torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True))
+        self.trusted = torch.as_tensor(np.concatenate([estimator.trusts(part[0][:, 0]) for part in taken]))
+        self.sideslip = torch.as_tensor(np.concatenate([reference_sideslip(recording) for recording in recordings]))
+        motion = [np.stack([recording["vy_ref"], recording["yaw_rate"]], 1) for recording in recordings]
+        self.states = torch.as_tensor(np.concatenate(motion))
+        self.lost = 0
+
+    def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
+        """As many sequences of each recording as fit into it, from an offset that is drawn, in random order."""
+        steps, firsts = self.training.steps, []
+        for length, offset in zip(self.lengths, self.offsets.tolist(), strict=False):
+            count = length // steps
+            if count:
+                shift = int(torch.randint(length - count * steps + 1, (), generator=generator))
+                firsts += [offset + shift + number * steps for number in range(count)]
+        order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
+        for chosen in order.split(self.training.batch_size):
+            seeds = torch.randint(2**62, (1,), generator=generator)
+            yield self.cut(chosen, seeds)
+
+    def cut(self, firsts: Tensor, seeds: Tensor) -> Cuts:
+        """Cuts that begin at these samples, (B,)."""
+        rows = firsts.unsqueeze(1) + torch.arange(self.training.steps)
+        of_sensors = (self.measured[rows], self.driven[rows], self.trusted[rows])
+        return Cuts(self.samples.inputs[rows], self.sideslip[rows], *of_sensors, self.states[firsts], seeds, firsts)
+
+    def loss(self, batch: Cuts) -> Tensor:
+        """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad²].
+
+        Cuts whose covariance or gradient is not finite are left out and counted.
+
+        Raises:
+            DataError: that is more than half of the batch.
+        """
+        estimator = self.estimator
+        count, steps = batch.sideslip.shape
+        outputs = estimator.network(batch.inputs.reshape(1, count * steps, -1), batch.seeds, estimator.settings.dropout)
+        outputs = outputs.reshape(count, steps, -1).double()
+        lost = torch.zeros(count, dtype=torch.bool)
+        if outputs.requires_grad:
+            outputs.register_hook(lambda gradient: self._cleaned(gradient, batch, lost))
+        said = estimator.said(outputs)
+        initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
+        measurements = torch.cat([batch.measured, said.sideslip.unsqueeze(-1)], -1)
+        process, noise = torch.diag_embed(said.process.square()), observation_noise(self.sensors, batch.trusted, said.variance)
+        filtered = self.filter.filtered(measurements, batch.driven, process, noise, initial).steps.filtered
+        sideslip = torch.atan2(filtered.mean[..., 0], batch.driven[..., 0])
+        finite = torch.isfinite(filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1))
+        lost |= self._account(~finite, batch, "covariance")
+        errors = [(batch.sideslip - angle)[~lost].square().mean() for angle in (said.sideslip, sideslip)]
+        return errors[0] + errors[1]
+
+    def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
+        """A gradient, (B, T, 4), that is zero for sequences that are lost, or for which it is not finite."""
+        bad = ~torch.isfinite(gradient).all(-1)
+        bad[lost] = False
+        lost = lost | self._account(bad, batch, "gradient")
+        return torch.where(lost[:, None, None], 0.0, gradient)
+
+    def _account(self, bad: Tensor, batch: Cuts, what: str) -> Tensor:
+        """Which sequences are lost, (B,), of where something is not finite, (B, T); counts them, and stops if they are too many."""
+        lost = bad.any(1)
+        number = int(lost.sum())
+        self.lost += number
+        if number > MOST_LOST * len(lost):
+            row = int(lost.int().argmax())
+            step = int(bad[row].int().argmax())
+            raise DataError(
+                f"training: phase 'end_to_end': the filter's {what} is not finite at {self.place(int(batch.firsts[row]) + step)} "
+                f"(step {step + 1} of a sequence), nor in {number} of the batch's {len(lost)} sequences; "
+                f"lower training.end_to_end.learning_rate or check the data with 'vehest data check'"
+            )
+        return lost
+
+    def place(self, sample: int) -> str:
+        """Which sample of which recording one of all training samples is."""
+        number = int(np.searchsorted(self.offsets, sample, side="right")) - 1
+        recording = self.recordings[number]
+        time = recording.start_time + (sample - int(self.offsets[number])) / recording.rate_hz
+        return f"{time:.2f} s of recording '{recording.id}'"
+
+
+ESTIMATOR = CnnUkf

@@ -1,0 +1,176 @@
+"""Unscented filter with a deep ensemble's mean and variance as a measurement of the sideslip angle (DE-UKF)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import FloatArray, Recording
+from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.kernels.sample_network import gaussian_likelihood
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word
+from vehest.estimators.phase_records import record_of_phases
+from vehest.estimators.sample_network import SampleNetwork, believed, learnt_samples
+from vehest.training.context import FitContext
+from vehest.training.samples import SampleSettings, sample_phase
+from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
+from vehest.training.sequences import train_phases
+from vehest.training.settings import IdentificationSettings, PhaseSettings
+
+BOX = ((-6.0, 4.0), (0.2, 2.0))
+"""Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
+STARTS = ((-2.0, 2.0), (0.5, 1.5))
+LEAST_SPREAD = 1e-12  # rad², of models that agree to the last digit
+MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
+
+
+@dataclass(frozen=True)
+class EnsembleUkfSettings(NetworkUkfSettings):
+    """Settings of the filter, of its networks, and of how they are put together.
+
+    Args:
+        members: networks M of the ensemble.
+        variance: ``models``, that of the networks' angles, as in the paper; or ``mixture``, with the mean of their own variances on top.
+    """
+
+    members: int = 20
+    variance: Literal["models", "mixture"] = "models"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.members < 2:
+            raise ConfigurationError(f"estimator.members must be at least 2, since one network alone has no spread, not {self.members}")
+        if self.variance not in ("models", "mixture"):
+            raise ConfigurationError(f"estimator.variance '{self.variance}' is not one of: models, mixture")
+
+
+@dataclass(frozen=True)
+class EnsembleSettings(SampleSettings):
+    """Training of filter, networks and scaling (Bertipaglia et al. 2024, Section IV-C).
+
+    Args:
+        phase: step size and epochs of the networks.
+        scaling_trials: evaluations of the search for p₁ and p₂ of Eq. 11 by Optuna; Nelder-Mead has its own limits in ``identification``.
+        identification: of the filter; its method is also that of the search for p₁ and p₂ (``data``: 0 and 1).
+    """
+
+    phase: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30)  # noqa: RUF009
+    scaling_trials: int = 60
+    identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scaling_trials < self.identification.stages:
+            raise ConfigurationError(f"training.scaling_trials must be at least training.identification.stages, not {self.scaling_trials}")
+
+
+class EnsembleUkf(NetworkUkf):
+    """Networks that differ in initial weights, order of samples and dropout; the filter takes their mean for measured.
+
+    Its variance is scaled, σ² → 10^p₁ (σ²)^p₂ [rad²] (Eq. 11), with p₁ and p₂ of the smallest error of the filter on the validation
+    recordings, since on those of the training the networks err less than elsewhere.
+
+    Source: Bertipaglia et al. 2024, Section IV-C, after its reference 11; Lakshminarayanan, Pritzel & Blundell, Simple and scalable
+    predictive uncertainty estimation using deep ensembles, 2017.
+    """
+
+    name = "ensemble_ukf"
+    title = "UKF with a deep ensemble"
+    settings_type = EnsembleUkfSettings
+    training_type = EnsembleSettings
+    settings: EnsembleUkfSettings
+
+    def __init__(self, settings: EnsembleUkfSettings) -> None:
+        super().__init__(settings)
+        self.scaling = np.array([0.0, 1.0])
+
+    @property
+    def n_parameters(self) -> int:
+        """With p₁ and p₂."""
+        return super().n_parameters + len(self.scaling)
+
+    def _new_network(self) -> SampleNetwork:
+        return SampleNetwork(len(self.inputs), self.settings.hidden, 2, self.settings.members)
+
+    def _fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
+        raw, judged = (learnt_samples(part, self.inputs, self.name) for part in (data.train, data.validation))
+        network = self.network = self._new_network().to(getattr(torch, training.dtype))
+        network.scale(*raw)
+        streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.settings.members, np.uint64) >> np.uint64(1)
+        network.reset([torch.Generator().manual_seed(int(stream)) for stream in streams])
+        train, validation = network.samples(*raw), network.samples(*judged)
+        phase = sample_phase(
+            "samples",
+            network,
+            training.phase,
+            training.batch_size,
+            len(train.targets),
+            self.settings.members,
+            lambda draw: network.losses(train, draw, self.settings.dropout, gaussian_likelihood),
+            lambda: network.judged(validation, gaussian_likelihood),
+        )
+        record = record_of_phases(train_phases([phase], self._seed, context, index, training.checkpoint_seconds))
+        if record.interrupted or training.identification.method == "data":
+            return record
+        search = self._search(data.validation, training, context)
+        self.scaling = search.best
+        found = {
+            "scaling_p1": float(search.best[0]),
+            "scaling_p2": float(search.best[1]),
+            "best_validation_likelihood": record.metrics["best_validation_loss"],
+            "best_validation_loss": search.cost,
+        }
+        return FitRecord(record.history, {**record.metrics, **found}, search.interrupted)
+
+    def _search(self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext) -> SearchRecord:
+        told = [self._told(recording.stack(self.inputs)) for recording in recordings]
+        how = training.identification
+        quiet = FitContext(should_stop=context.should_stop)
+
+        def cost(scaling: FloatArray) -> float:
+            words = [Word(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in told]
+            error = self.mean_squared_error(recordings, words, how.skip_seconds)
+            return error if np.isfinite(error) else 1e6
+
+        if how.method == "optuna":
+            return staged_optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
+        return nelder_mead_over_grid(cost, BOX, STARTS, how.search, quiet)
+
+    def _told(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""
+        said, unit = self.network.said(inputs), float(self.network.unit)
+        variance = said[..., 0].var(axis=0)
+        if self.settings.variance == "mixture":
+            variance = variance + np.logaddexp(said[..., 1], 0.0).mean(axis=0)
+        return believed(unit * said[..., 0].mean(axis=0)), unit**2 * variance
+
+    def word(self, inputs: FloatArray) -> Word:
+        """Mean of the networks, and its scaled variance."""
+        sideslip, variance = self._told(inputs)
+        return Word(sideslip, scaled_variance(variance, self.scaling))
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Those of filter and networks, and p₁ and p₂."""
+        return {**super().weights(), "scaling": self.scaling.copy()}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take them back."""
+        scaling = np.array(weights.get("scaling", ()), dtype=np.float64)
+        if scaling.shape != (2,):
+            raise DataError(f"weights of '{self.name}' do not fit its settings: 'scaling' is missing or of another shape")
+        super().load_weights({name: values for name, values in weights.items() if name != "scaling"})
+        self.scaling = scaling
+
+
+def scaled_variance(variance: FloatArray, scaling: FloatArray) -> FloatArray:
+    """10^p₁ (σ²)^p₂, and ε on top so that no filter takes a network's word for the truth; (T,) [rad²] (Eq. 11)."""
+    size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, LEAST_SPREAD))
+    return LEAST_VARIANCE + 10.0 ** np.clip(size, *MOST_SIZE)
+
+
+ESTIMATOR = EnsembleUkf

@@ -1,0 +1,241 @@
+"""Networks of two hidden layers over single samples, compiled, member by member, with masks of dropout that follow from seeds.
+
+A member's layers fit the processor's cache where those of all members together do not. A mask is not kept: what it hides is zero in the
+hidden layer, which is all that the adjoint asks for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vehest.estimators.kernels.threads import over_members
+
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+
+LEVELS = 256  # the share that dropout hides is a whole number of so many parts
+LAYERS = 3  # two hidden ones and the output
+
+Criterion = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], float]
+"""Of outputs (B, O) and targets (B,): the mean loss; its gradient by the outputs, (B, O), is written into the last argument."""
+
+
+def outputs_of(inputs: Tensor, parameters: Sequence[Tensor], seeds: Tensor | None = None, dropout: float = 0.0) -> Tensor:
+    """Outputs of M members, (M, B, O), differentiable in the parameters; h = d(relu(W x + b)) twice, then W h + b.
+
+    Args:
+        inputs: (M, B, C), or (1, B, C) for all members.
+        parameters: weights and biases by turns from the inputs on, (M, C, H), (M, H), and so on.
+        seeds: one a member, int64 (M,), from which its mask follows; none: no dropout.
+        dropout: share of hidden values that are hidden, rounded to a 256th; the others are scaled so that their mean stays.
+
+    Source: Srivastava et al., Dropout, Journal of Machine Learning Research 15, 2014.
+    """
+    hidden = round(LEVELS * dropout) if seeds is not None else 0
+    drawn = np.zeros(len(parameters[0]), np.int64) if seeds is None else seeds.numpy()
+    outputs: Tensor = _Outputs.apply(inputs, drawn, hidden, *parameters)  # type: ignore[no-untyped-call]
+    return outputs
+
+
+def losses_of(
+    table: Tensor, targets: Tensor, rows: Tensor, parameters: Sequence[Tensor], seeds: Tensor, dropout: float, criterion: Criterion
+) -> Tensor:
+    """Losses of M members, each on rows of its own, (M,), differentiable in the parameters.
+
+    A member's outputs, loss and gradient are computed in one go, so that nothing of one member is in the next one's way.
+
+    Args:
+        table: inputs, (N, C).
+        targets: (N,).
+        rows: which of them each member sees, int64 (M, B).
+        parameters: see `outputs_of`; likewise ``seeds`` and ``dropout``.
+        criterion: see `Criterion`; compiled, or it keeps members from running side by side.
+    """
+    losses: Tensor = _Losses.apply(table, targets, rows, seeds, round(LEVELS * dropout), criterion, *parameters)  # type: ignore[no-untyped-call]
+    return losses
+
+
+def squared_error(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
+    """Mean of (o - t)²; a `Criterion` of one output."""
+    return float(_squared_error(outputs, targets, gradient))
+
+
+def gaussian_likelihood(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
+    """Mean of (log v + (o - t)²/v)/2 with v = softplus(o₂) + 1e-6; a `Criterion` of two outputs.
+
+    Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017, Eq. 1.
+    """
+    return float(_gaussian_likelihood(outputs, targets, gradient))
+
+
+def kept(seed: int, layer: int, shape: tuple[int, int], dropout: float) -> NDArray[np.bool_]:
+    """Which values of a hidden layer (0 or 1) a member's mask leaves, (B, H)."""
+    ones = np.ones(shape, np.float32)
+    _activate(ones, np.zeros(shape[1], np.float32), seed, layer, round(LEVELS * dropout))
+    return ones > 0
+
+
+class _Outputs(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor) -> Tensor:
+        x, weights = inputs.contiguous().numpy(), [parameter.detach().contiguous().numpy() for parameter in parameters]
+        members, samples = len(weights[0]), x.shape[1]
+        layers = [np.empty((members, samples, weights[2 * layer].shape[2]), x.dtype) for layer in range(LAYERS)]
+
+        def work(first: int, end: int) -> None:
+            for m in range(first, end):
+                own = [weight[m] for weight in weights]
+                _forward(x[m if len(x) > 1 else 0], *own, seeds[m], hidden, *[layer[m] for layer in layers])
+
+        over_members(work, members)
+        ctx.kept = (x, weights, layers[:-1], hidden)
+        return torch.from_numpy(layers[-1])
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        x, weights, layers, hidden = ctx.kept
+        up = upstream[0].contiguous().numpy()
+        gradients = [np.empty_like(weight) for weight in weights]
+
+        def work(first: int, end: int) -> None:
+            for m in range(first, end):
+                own = [gradient[m] for gradient in gradients]
+                _backward(x[m if len(x) > 1 else 0], weights[2][m], weights[4][m], hidden, layers[0][m], layers[1][m], up[m], *own)
+
+        over_members(work, len(gradients[0]))
+        return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
+
+
+class _Losses(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, table: Tensor, targets: Tensor, rows: Tensor, seeds: Tensor, hidden: int, criterion: Criterion, *parameters: Tensor
+    ) -> Tensor:
+        x, y, chosen, drawn = (tensor.numpy() for tensor in (table, targets, rows, seeds))
+        weights = [parameter.detach().contiguous().numpy() for parameter in parameters]
+        gradients = [np.empty_like(weight) for weight in weights]
+        losses = np.empty(len(chosen), x.dtype)
+
+        def work(first: int, end: int) -> None:
+            layers = [np.empty((chosen.shape[1], weights[2 * layer].shape[2]), x.dtype) for layer in range(LAYERS)]
+            up = np.empty_like(layers[-1])
+            for m in range(first, end):
+                seen, own, bars = x[chosen[m]], [weight[m] for weight in weights], [gradient[m] for gradient in gradients]
+                _forward(seen, *own, drawn[m], hidden, *layers)
+                losses[m] = criterion(layers[-1], y[chosen[m]], up)
+                _backward(seen, own[2], own[4], hidden, layers[0], layers[1], up, *bars)
+
+        over_members(work, len(chosen))
+        ctx.kept = gradients
+        return torch.from_numpy(losses)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        scaled = (torch.from_numpy(gradient).mul_(_row(upstream[0], gradient.ndim)) for gradient in ctx.kept)
+        return (None, None, None, None, None, None, *scaled)
+
+
+def _row(values: Tensor, dimensions: int) -> Tensor:
+    return values.reshape(-1, *[1] * (dimensions - 1))
+
+
+@compiled
+def _squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+    total, count = 0.0, len(targets)
+    for row in range(count):
+        error = outputs[row, 0] - targets[row]
+        total += error * error
+        gradient[row, 0] = outputs.dtype.type(2.0 / count) * error
+    return total / count
+
+
+@compiled
+def _gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+    total, count = 0.0, len(targets)
+    for row in range(count):
+        raw, error = outputs[row, 1], outputs[row, 0] - targets[row]
+        variance = max(raw, 0.0) + np.log1p(np.exp(-abs(raw))) + 1e-6
+        total += 0.5 * (np.log(variance) + error * error / variance)
+        by_variance = 0.5 * (1.0 - error * error / variance) / variance
+        gradient[row, 0] = error / variance / count
+        gradient[row, 1] = by_variance / (1.0 + np.exp(-raw)) / count
+    return total / count
+
+
+@compiled
+def _forward(x, w1, b1, w2, b2, w3, b3, seed, hidden, first, second, out):  # type: ignore[no-untyped-def]
+    np.dot(x, w1, first)
+    _activate(first, b1, seed, 0, hidden)
+    np.dot(first, w2, second)
+    _activate(second, b2, seed, 1, hidden)
+    np.dot(second, w3, out)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            out[row, column] += b3[column]
+
+
+@compiled
+def _backward(x, w2, w3, hidden, first, second, up, w1_bar, b1_bar, w2_bar, b2_bar, w3_bar, b3_bar):  # type: ignore[no-untyped-def]
+    np.dot(second.T, up, w3_bar)
+    _summed(up, b3_bar)
+    second_bar, first_bar = np.empty_like(second), np.empty_like(first)
+    np.dot(up, w3.T, second_bar)
+    _gate(second, second_bar, hidden, b2_bar)
+    np.dot(first.T, second_bar, w2_bar)
+    np.dot(second_bar, w2.T, first_bar)
+    _gate(first, first_bar, hidden, b1_bar)
+    np.dot(x.T, first_bar, w1_bar)
+
+
+@compiled
+def _activate(values, bias, seed, layer, hidden):  # type: ignore[no-untyped-def]
+    """relu(values + bias), masked and scaled, in place; eight bytes of every random word decide of eight values (SplitMix64)."""
+    rows, columns = values.shape
+    scale = values.dtype.type(256.0 / (256 - hidden))
+    zero = values.dtype.type(0.0)
+    if hidden == 0:
+        for row in range(rows):
+            for column in range(columns):
+                values[row, column] = max(values[row, column] + bias[column], zero)
+        return
+    words = (columns + 7) // 8
+    mask = np.empty(8 * words, np.uint8)
+    start = np.uint64(seed) * np.uint64(0xD1342543DE82EF95) + np.uint64(layer + 1) * np.uint64(0xA0761D6478BD642F)
+    for row in range(rows):
+        for word in range(words):
+            z = start + np.uint64(row * words + word + 1) * np.uint64(0x9E3779B97F4A7C15)
+            z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+            z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+            z = z ^ (z >> np.uint64(31))
+            for byte in range(8):
+                mask[8 * word + byte] = np.uint8(z >> np.uint64(8 * byte))
+        for column in range(columns):
+            value = max(values[row, column] + bias[column], zero) * scale
+            values[row, column] = value if mask[column] >= hidden else zero
+
+
+@compiled
+def _gate(values, bars, hidden, bias_bar):  # type: ignore[no-untyped-def]
+    """Adjoint of `_activate`, in place; that of the bias is written."""
+    scale = values.dtype.type(256.0 / (256 - hidden))
+    zero = values.dtype.type(0.0)
+    bias_bar[:] = zero
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            bar = bars[row, column] * scale if values[row, column] > zero else zero
+            bars[row, column] = bar
+            bias_bar[column] += bar
+
+
+@compiled
+def _summed(bars, total):  # type: ignore[no-untyped-def]
+    total[:] = total.dtype.type(0.0)
+    for row in range(bars.shape[0]):
+        for column in range(bars.shape[1]):
+            total[column] += bars[row, column]

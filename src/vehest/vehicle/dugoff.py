@@ -1,0 +1,197 @@
+"""Dugoff's tyres under pure lateral slip, plain and smooth, and the single track on them, in torch.
+
+State (v, r): lateral velocity [m/s] and yaw rate [rad/s]. Inputs (u, δ, a_x): forward speed, road-wheel angle, longitudinal acceleration.
+
+    v' = (F_F cos δ + F_R)/m - u r,   r' = (l_F F_F cos δ - l_R F_R)/I_zz                             (Eq. 2)
+    α_F = δ - atan((v + l_F r)/u),   α_R = -atan((v - l_R r)/u)
+    F = C tan α f(λ),   λ = μ F_z / (2 C |tan α|),   μ = μ₀ (1 - e_r u |tan α|)                      (Eq. 9 at κ = 0)
+    f = λ (2 - λ) where λ ≤ 1, else 1 (Eq. 9);   f = 2/(exp(-4λ) + 1) - 1 = tanh 2λ (Eq. 10)
+    F_zF = m (g l_R - a_x h)/L,   F_zR = m (g l_F + a_x h)/L
+
+Inputs and rates are held over a sample of Δt: x⁺ = x + Δt f(x, u). In Eq. 10 as in Eq. 9, λ is infinite at α = 0 and its gradient is not a
+number, though F is as smooth as C tan α there; λ is kept below a largest value at which f is 1 to the last digit, and its gradient none.
+
+Source: Bertipaglia, Alirezaei, Happee & Shyrokau, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+TRACK_STATES = ("vy", "yaw_rate")
+TRACK_INPUTS = ("vx", "steer", "ax")
+TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
+GRAVITY = 9.81
+LARGEST_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
+LEAST_SHARE = 0.2  # of the friction that sliding leaves
+LEAST_LOAD = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves
+LEAST_COSINE = 0.05  # of the front slip angle: a tyre that slides across has a finite tangent
+
+Tyres = Literal["plain", "smooth"]
+
+
+@dataclass(frozen=True)
+class LoadedCar:
+    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i, if not told otherwise.
+
+    Args:
+        mass: [kg].
+        yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
+        cg_to_front_axle: distance from the centre of gravity [m].
+        cg_to_rear_axle: the same [m].
+        cg_height: of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed.
+
+    Raises:
+        ValueError: a number that is not positive.
+
+    Source: Bertipaglia et al. 2024, Eq. 2.
+    """
+
+    mass: float = 1970.0
+    yaw_inertia: float = 3498.0
+    cg_to_front_axle: float = 1.47
+    cg_to_rear_axle: float = 1.41
+    cg_height: float = 0.52
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            value = getattr(self, entry.name)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{entry.name} must be positive, not {value}")
+
+    def loads(self, ax: Tensor) -> tuple[Tensor, Tensor]:
+        """Vertical force on the front and on the rear axle under longitudinal accelerations (...) [m/s²], (...) [N] each."""
+        wheelbase = self.cg_to_front_axle + self.cg_to_rear_axle
+        transfer = ax * (self.cg_height / wheelbase)
+        front, rear = (GRAVITY * arm / wheelbase for arm in (self.cg_to_rear_axle, self.cg_to_front_axle))
+        return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (rear + transfer).clamp(min=LEAST_LOAD * rear)
+
+
+BMW_545I = LoadedCar()
+"""BMW 545i of Bertipaglia et al. 2024."""
+
+
+@dataclass(frozen=True)
+class DugoffAxle:
+    """Parameters of an axle's tyres.
+
+    Args:
+        cornering_stiffness: C [N/rad].
+        friction: μ₀ of a tyre that hardly slides [1].
+        reduction: e_r, share of the friction that is lost per m/s of sliding [s/m].
+
+    Raises:
+        ValueError: stiffness or friction is not positive, or the reduction is negative.
+    """
+
+    cornering_stiffness: float
+    friction: float
+    reduction: float
+
+    def __post_init__(self) -> None:
+        for name in ("cornering_stiffness", "friction"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
+        if not self.reduction >= 0:
+            raise ValueError(f"reduction must not be negative, not {self.reduction}")
+
+    def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
+        """Lateral force of the axle in the wheels' axes, positive to the left.
+
+        Args:
+            tangent: of the slip angle, positive where it makes a force to the left (...).
+            load: vertical force (...) [N].
+            vx: forward speed (...) [m/s].
+            tyres: ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+
+        Returns:
+            (...) [N], differentiable everywhere, at a slip of zero too.
+        """
+        return dugoff_force(tangent, load, vx, self.cornering_stiffness, self.friction, self.reduction, tyres)
+
+
+def dugoff_force(
+    tangent: Tensor,
+    load: Tensor,
+    vx: Tensor,
+    cornering_stiffness: float | Tensor,
+    friction: float | Tensor,
+    reduction: float | Tensor,
+    tyres: Tyres,
+) -> Tensor:
+    """The same of parameters that may be tensors, where many are tried at once; everything broadcasts."""
+    slide = tangent.abs()
+    half = friction * (1.0 - reduction * vx * slide).clamp(min=LEAST_SHARE) * load / (2.0 * cornering_stiffness)
+    ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
+    used = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
+    return cornering_stiffness * tangent * used
+
+
+@dataclass(frozen=True)
+class DugoffTrack:
+    """The single track on Dugoff's tyres, as a filter takes it.
+
+    Below the minimum speed wheels roll without slip, v = l_R u δ/L and r = u δ/L, whatever the state was.
+
+    Args:
+        car: the car.
+        front: the front axle's tyres.
+        rear: the rear axle's tyres.
+        step: Δt [s].
+        tyres: ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+        minimum_speed: see above [m/s].
+        sees_sideslip: whether the sideslip angle is among the measurements (β_DD of Eq. 4).
+    """
+
+    car: LoadedCar
+    front: DugoffAxle
+    rear: DugoffAxle
+    step: float
+    tyres: Tyres = "plain"
+    minimum_speed: float = 3.0
+    sees_sideslip: bool = False
+
+    def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""
+        vx, steer, ax = inputs[..., 0].clamp(min=self.minimum_speed), inputs[..., 1], inputs[..., 2]
+        load_front, load_rear = self.car.loads(ax)
+        course_front = (states[..., 0] + self.car.cg_to_front_axle * states[..., 1]) / vx
+        course_rear = (states[..., 0] - self.car.cg_to_rear_axle * states[..., 1]) / vx
+        turned = torch.tan(steer)
+        front = (turned - course_front) / (1.0 + turned * course_front).clamp(min=LEAST_COSINE)
+        of_front = self.front.force(front, load_front, vx, self.tyres) * torch.cos(steer)
+        return of_front, self.rear.force(-course_rear, load_rear, vx, self.tyres)
+
+    def transition(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """States one step later, (..., 2) under inputs (..., 3)."""
+        front, rear = self.forces(states, inputs)
+        car, vx = self.car, inputs[..., 0]
+        rates = torch.stack(
+            [
+                (front + rear) / car.mass - vx * states[..., 1],
+                (car.cg_to_front_axle * front - car.cg_to_rear_axle * rear) / car.yaw_inertia,
+            ],
+            -1,
+        )
+        return torch.where((vx < self.minimum_speed).unsqueeze(-1), self.rolling(inputs), states + self.step * rates)
+
+    def rolling(self, inputs: Tensor) -> Tensor:
+        """The state of a car whose wheels do not slip, (..., 2) under inputs (..., 3)."""
+        turn = inputs[..., 0] * inputs[..., 1] / (self.car.cg_to_front_axle + self.car.cg_to_rear_axle)
+        return torch.stack([self.car.cg_to_rear_axle * turn, turn], -1)
+
+    def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
+        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 4), or (..., 5) with the sideslip; Eq. 4.
+
+        Axle forces are those across the body, as the channels hold them; the paper's transducers turn with the wheels.
+        """
+        front, rear = self.forces(states, inputs)
+        seen = [(front + rear) / self.car.mass, states[..., 1] + torch.zeros_like(front), front, rear]
+        if self.sees_sideslip:
+            seen.append(torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed)))
+        return torch.stack(seen, -1)

@@ -1,0 +1,53 @@
+"""Drives of the single track on Dugoff's tyres itself, with known tyres and sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from vehest.data.recording import Recording
+from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
+
+FRONT, REAR = DugoffAxle(1.2e5, 1.0, 0.005), DugoffAxle(1.7e5, 1.05, 0.004)
+TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", REAR)) for name, value in vars(own).items()}
+NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
+
+
+def dugoff_track(tyres: str = "plain", *, sees_sideslip: bool = False) -> DugoffTrack:
+    return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)  # type: ignore[arg-type]
+
+
+def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name: str = "drive") -> Recording:
+    """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces."""
+    generator = np.random.default_rng(seed)
+    time = np.arange(round(seconds * 100)) / 100
+    phases = generator.uniform(0, 6, 3)
+    vx = 24.0 + 6.0 * np.sin(0.4 * time + phases[0])
+    ax = 2.4 * np.cos(0.4 * time + phases[0])
+    steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.09 * time) + 0.01 * np.sin(2.9 * time + phases[2])
+    track = dugoff_track()
+    inputs = torch.as_tensor(np.stack([vx, steer, ax], 1))
+    states = torch.zeros(len(time), 2, dtype=torch.float64)
+    for k in range(len(time) - 1):
+        states[k + 1] = track.transition(states[k], inputs[k])
+    ay, yaw_rate, front, rear = track.observation(states, inputs).T.numpy()
+
+    def shown(values: np.ndarray, level: float) -> np.ndarray:
+        return values + noise * level * generator.standard_normal(len(time))
+
+    channels = {
+        "vx": vx,
+        "ax": ax,
+        "steer": steer,
+        "ay": shown(ay, NOISE["ay"]),
+        "yaw_rate": shown(yaw_rate, NOISE["yaw_rate"]),
+        "fy_fl": shown(0.4 * front, NOISE["fy"]),
+        "fy_fr": shown(0.6 * front, NOISE["fy"]),
+        "fy_rl": shown(0.4 * rear, NOISE["fy"]),
+        "fy_rr": shown(0.6 * rear, NOISE["fy"]),
+        "vx_ref": vx,
+        "vy_ref": states[:, 0].numpy(),
+        "yaw_rate_ref": states[:, 1].numpy(),
+        "sideslip_ref": np.arctan2(states[:, 0].numpy(), vx),
+    }
+    return Recording(name, "Dugoff's single track", 100.0, 0.0, channels, "simulated")
