@@ -24,7 +24,7 @@ def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name:
     phases = generator.uniform(0, 6, 3)
     vx = 24.0 + 6.0 * np.sin(0.4 * time + phases[0])
     ax = 2.4 * np.cos(0.4 * time + phases[0])
-    steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.09 * time) + 0.01 * np.sin(2.9 * time + phases[2])
+    steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.2 * time) + 0.01 * np.sin(2.9 * time + phases[2])
     track = dugoff_track()
     inputs = torch.as_tensor(np.stack([vx, steer, ax], 1))
     states = torch.zeros(len(time), 2, dtype=torch.float64)

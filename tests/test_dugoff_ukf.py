@@ -47,7 +47,7 @@ def test_the_fit_finds_tyres_and_sensors_noise():
     for name in ("cornering_stiffness_front", "friction_front", "cornering_stiffness_rear", "friction_rear"):
         assert record.metrics[name] == pytest.approx(TYRES[name], rel=0.05), name
         assert record.metrics[f"{name}_spread"] < 0.02 * TYRES[name]
-    assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.2)
+    assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.35)
     assert record.metrics["noise_fy_front"] == pytest.approx(NOISE["fy"] * np.sqrt(2.0), rel=0.2)
     assert record.metrics["best_validation_loss"] < np.radians(0.3) ** 2
     assert estimator.n_parameters == 6 + 7

@@ -19,8 +19,8 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
 from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.single_track import checked_sample, require_positive
-from vehest.estimators.track_filter import TrackFilter, groups_of, in_nonlinear_range, padded
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.estimators.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
+from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
@@ -382,11 +382,9 @@ class DugoffUkfStepper(Stepper):
 
     def __init__(self, estimator: DugoffUkf) -> None:
         self._estimator = estimator
-        self._filter = TrackFilter(estimator.track())
-        self._process, self._sensors = estimator._noise(estimator.levels)
+        self._filter = TrackStepper(TrackFilter(estimator.track()))
+        self._process, self._sensors = (noise.numpy() for noise in estimator._noise(estimator.levels))
         self._trusts = False
-        self._before: Tensor | None = None
-        self._state: Gaussian[Tensor] | None = None
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample; measurements that are NaN are skipped."""
@@ -396,15 +394,8 @@ class DugoffUkfStepper(Stepper):
             raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         measurements, inputs = samples_of(row[None])
         self._trusts = bool(estimator._trusts(measurements[:, 0], self._trusts)[0])
-        y, u = (torch.as_tensor(part)[None] for part in (measurements, inputs))
-        if self._state is None or self._before is None:
-            state = self._filter.start(u[:, 0])
-        else:  # the last sample's measurements are part of the state already
-            state, y, u = self._state, torch.cat([torch.full_like(y, torch.nan), y], 1), torch.cat([self._before, u], 1)
-        with torch.no_grad():
-            filtered = self._filter.filtered(y, u, self._process, self._sensors[int(self._trusts)], state).steps.filtered
-        self._before, self._state = u[:, -1:], Gaussian(filtered.mean[:, -1], filtered.covariance[:, -1])
-        return dict(zip(TRACK_STATES, self._state.mean[0].tolist(), strict=True))
+        state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])
+        return dict(zip(TRACK_STATES, state.tolist(), strict=True))
 
 
 def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:

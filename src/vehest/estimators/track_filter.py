@@ -15,12 +15,13 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, TorchModel, unscented_scan
+from vehest.filters.unscented_scan import PointModel, TorchModel, UnscentedStepper, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 FloatArray = NDArray[np.float64]
 
 UNKNOWN = (0.5, 0.2)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+ROLLING = np.diag(np.square(UNKNOWN))
 KNOWN = 1e-6  # the same of a state that is handed over
 KAPPA = 1.0  # n + κ = 3
 
@@ -63,7 +64,7 @@ class TrackFilter:
         """
         slow = (inputs[..., 0] < self.track.minimum_speed)[..., None]
         if bool(slow.any()):
-            rolling = torch.tensor(UNKNOWN, dtype=inputs.dtype).square().diag()
+            rolling = torch.as_tensor(ROLLING, dtype=inputs.dtype)
             measurements = torch.where(slow, torch.nan, measurements)
             process_noise = torch.where(slow[..., None], rolling, process_noise)
         return unscented_scan(
@@ -99,6 +100,36 @@ class TrackFilter:
             track = self.track
             self._models[dtype] = CompiledDugoffTrack(track, dtype) if self.compiled else TorchModel(track.transition, track.observation)
         return self._models[dtype]
+
+
+class TrackStepper:
+    """The same filter of one sequence, one sample at a time, in float64.
+
+    Args:
+        own: the filter.
+    """
+
+    def __init__(self, own: TrackFilter) -> None:
+        self._own, self._model = own, own.model(torch.float64)
+        self._filter: UnscentedStepper | None = None
+        self._rolled = False
+
+    def step(self, measurement: FloatArray, inputs: FloatArray, process_noise: FloatArray, observation_noise: FloatArray) -> FloatArray:
+        """The state at a sample, (2,), valid until the next one.
+
+        Args:
+            measurement: (m,); what is NaN was not measured.
+            inputs: (3,), finite.
+            process_noise: covariance of the step that led here, (2, 2).
+            observation_noise: (m, m).
+        """
+        slow = bool(inputs[0] < self._own.track.minimum_speed)
+        if self._filter is None:
+            mean, covariance = (part[0].numpy() for part in self._own.start(torch.as_tensor(inputs)[None]))
+            self._filter = UnscentedStepper(self._model, mean, covariance, len(measurement), self._own.rule)
+        seen = np.full_like(measurement, np.nan) if slow else measurement
+        noise, self._rolled = ROLLING if self._rolled else process_noise, slow
+        return self._filter.step(seen, inputs, noise[None], observation_noise[None])
 
 
 def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:

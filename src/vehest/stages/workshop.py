@@ -215,7 +215,7 @@ class Workshop:
             else:
                 epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
                 loss = fit.get("best_validation_loss")
-                outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation MSE {loss:.4g} m²/s²"
+                outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}"
                 self.messages.line("done", "train", member.model.label, f"{epochs}{outcome}")
             self.log_fit(member.model, fit)
         if member.evaluation is not None and not member.evaluation.skipped:
