@@ -61,10 +61,10 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: an hour or more
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
-learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and about an hour
+learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and an hour or two
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
-learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets
+learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with smaller budgets
 	$(BIN)/vehest run pipelines/learned_ukf_sim.yaml
 
 heavy_ekf: $(INSTALLED) ## a heavy vehicle's laps by Kalman filters whose tyres adapt, simulated, and the real Ferrari with VEHEST_DATA: minutes
