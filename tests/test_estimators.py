@@ -13,8 +13,11 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import EndToEndSettings
+from vehest.estimators.ensemble_ukf import EnsembleSettings
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
+from vehest.training.samples import SampleSettings
 from vehest.training.settings import (
     DirectSearchSettings,
     IdentificationSettings,
@@ -27,13 +30,24 @@ from vehest.training.settings import (
 from vehest.training.through_filter import ThroughFilterSettings
 
 VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
+SMALL = {"inputs": "imu", "hidden": [8, 4]}
+DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
 CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
     "factor_graph": {"window": 0.05},
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
     "learned_ukf": {"width": 8},
-    "dugoff_ukf": {"inputs": "imu", "tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}},
+    "dugoff_ukf": {"inputs": "imu", **DUGOFF},
+    "sideslip_ffnn": SMALL,
+    "ensemble_ukf": {"members": 2, **SMALL, **DUGOFF},
+    "cnn_ukf": {**SMALL, **DUGOFF},
     "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
+}
+ONCE, GIVEN = PhaseSettings(max_epochs=1), IdentificationSettings(method="data")
+SAMPLED = {
+    SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
+    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
+    EndToEndSettings: lambda dtype: EndToEndSettings(ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype),
 }
 
 
@@ -55,6 +69,9 @@ def _fitted(name, dtype="float64", **config):
         estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
     elif estimator.training_type is IdentificationSettings:
         estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), IdentificationSettings(method="data"))
+    elif estimator.training_type in SAMPLED:
+        training = SAMPLED[estimator.training_type](dtype)
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0, seed=1)[0]]), training)
     elif name == "luenberger":
         data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
         estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
@@ -214,9 +231,10 @@ def test_window_network_has_no_state_to_start_from(drive):
 
 
 def test_registry_knows_names_and_modules():
-    assert set(estimator_names()) >= {"luenberger", "ksnn", "gru", "lstm", "kalman", "factor_graph", "learned_ukf", "rational_ekf"}
+    first = "cnn_ukf, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, ksnn, learned_ukf, lstm, luenberger, rational_ekf"
+    names = f"{first}, sideslip_ffnn, velocity_gru, velocity_lstm"
+    assert ", ".join(sorted(estimator_names())) == names
     assert estimator_module("ksnn") == "vehest.estimators.ksnn"
-    names = "factor_graph, gru, kalman, ksnn, learned_ukf, lstm, luenberger, rational_ekf, velocity_gru, velocity_lstm"
     with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):
         estimator_class("kalman_filter_from_the_future")
     with pytest.raises(ConfigurationError, match="'windowed' is not one of"):

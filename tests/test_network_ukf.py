@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from dugoff_drive import TYRES
 from test_sample_network import loaded_drive
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings, _EndToEnd
 from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
@@ -18,8 +20,9 @@ from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
 from vehest.estimators.registry import estimator_class
 from vehest.estimators.sample_network import learnt_samples
-from vehest.estimators.track_filter import TrackFilter
+from vehest.estimators.track_filter import KNOWN, TrackFilter
 from vehest.training.context import FitContext
+from vehest.training.samples import Draw
 from vehest.training.settings import IdentificationSettings, PhaseSettings
 
 LEVELS = {
@@ -121,6 +124,54 @@ def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks() -> None:
     assert (told["mixture"].variance > told["models"].variance).all()
 
 
+def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is() -> None:
+    """Eq. 11, on the validation recordings."""
+    estimator = estimator_of("ensemble_ukf")
+    search = IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=10)
+    training = replace(TRAININGS["ensemble_ukf"], identification=search)
+    assert isinstance(estimator, EnsembleUkf)
+    found = estimator.fit(DATA, training).metrics
+    assert [found["scaling_p1"], found["scaling_p2"]] == estimator.scaling.tolist() != [0.0, 1.0]
+
+    def loss() -> float:
+        words = [estimator.word(recording.stack(estimator.inputs)) for recording in DATA.validation]
+        return estimator.mean_squared_error(DATA.validation, words, search.skip_seconds)
+
+    assert loss() == pytest.approx(found["best_validation_loss"], rel=1e-9)
+    estimator.scaling = np.array([0.0, 1.0])
+    assert found["best_validation_loss"] < loss()
+
+
+def test_the_loss_of_pre_training_is_that_of_the_formulas() -> None:
+    """Eqs. 5 and 6, with the distrust as a standard deviation."""
+    estimator, _ = end_to_end()
+    samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.inputs, estimator.name))
+    levels, rows = torch.tensor([2e-3, 3e-3], dtype=torch.float64), torch.tensor([[3, 500, 1000]])
+    phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
+    outputs = estimator.network(samples.inputs[rows])[0]
+    unit = float(estimator.network.unit)
+    sigma = torch.sigmoid(outputs[:, 1:])
+    variance = sigma[:, 0] ** 2 + 1e-6
+    error = unit * (outputs[:, 0] - samples.targets[rows[0]])
+    expected = (0.5 * variance.log() + 0.5 * error**2 / variance).mean() + ((sigma[:, 1:] - levels) ** 2).sum(1).mean()
+    assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(expected.item(), rel=1e-12)
+
+
+def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
+    monkeypatch.setattr(cnn_ukf, "START", (KNOWN, KNOWN))  # as precise as a state that is handed over
+    estimator, training = end_to_end()
+    recording = DATA.train[1]
+    training.training = replace(training.training, steps=len(recording))
+    batch = training.cut(torch.tensor([len(DATA.train[0])]), torch.tensor([5]))
+    word = estimator.word(recording.stack(estimator.inputs))
+    start = {"vy": recording["vy_ref"][0], "yaw_rate": recording["yaw_rate"][0]}
+    ((_, (mean, *_)),) = estimator.filtered([recording], [word], [start])
+    wanted = np.arctan2(recording["vy_ref"], recording["vx"])
+    errors = [np.square(angle - wanted).mean() for angle in (word.sideslip, np.arctan2(mean[0, :, 0], recording["vx"]))]
+    assert training.loss(batch).item() == pytest.approx(sum(errors), rel=1e-6)
+
+
 def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
     """Network, adaptive noises, filter and loss (Eq. 7), through a filter in readable torch."""
     estimator, training = end_to_end()
@@ -165,9 +216,7 @@ def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step()
     firsts = torch.tensor([30, 830, 60, 100])
     batch = training.cut(firsts, torch.tensor([5]))
     batch.driven[:, 7, 1] = torch.nan
-    with pytest.raises(
-        DataError, match=r"not finite at 0\.3[78] s of recording 'first' \(step [89] of a sequence\), nor in 4 of the batch's 4"
-    ):
+    with pytest.raises(DataError, match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of the batch's 4"):
         training.loss(batch)
     assert training.place(830) == "0.30 s of recording 'second'"
 
