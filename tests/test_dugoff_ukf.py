@@ -12,6 +12,7 @@ from dugoff_drive import NOISE, TYRES, dugoff_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.track_filter import groups_of, in_nonlinear_range
 from vehest.filters.noise_levels import quiet_level
@@ -126,6 +127,20 @@ def test_process_noise_is_tuned_by_the_house_search():
     before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
     assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
     assert record.metrics["evaluations"] == 12
+
+
+def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
+    """Going on identifies again; a network trained behind half a search would then meet another filter."""
+    drives = [dugoff_drive(3.0)]
+    estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
+    before = {name: values.copy() for name, values in estimator.weights().items() if name.startswith("network.")}
+    identification = IdentificationSettings(method="nelder_mead", grid=2, max_evaluations=3)
+    answers = iter([False])
+    context = FitContext(should_stop=lambda: next(answers, True))
+    record = estimator.fit(FitData(drives, drives), EndToEndSettings(identification=identification), context)
+    assert record.interrupted
+    assert record.metrics == {"best_epoch": 0}
+    assert all(np.array_equal(values, estimator.weights()[name], equal_nan=True) for name, values in before.items())
 
 
 def test_stages_search_wide_bounds_and_then_close_to_the_best():

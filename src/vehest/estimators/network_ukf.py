@@ -125,12 +125,14 @@ class NetworkUkf(Estimator):
 
     def _fit(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
         of_filter = self.model.fit(data, training.identification, FitContext(should_stop=context.should_stop))
+        if of_filter.interrupted:  # nothing learnt yet: the network must see the filter that the whole identification finds
+            return FitRecord({}, {"best_epoch": 0}, True)
         record = self._fit_network(data, training, context, index)
         seconds = of_filter.metrics["train_seconds"]
         found = {name: value for name, value in of_filter.metrics.items() if name.startswith("noise_")}
         metrics = {**record.metrics, **found, "identification_seconds": seconds}
         metrics["train_seconds"] = record.metrics["train_seconds"] + seconds
-        return FitRecord(record.history, metrics, record.interrupted or of_filter.interrupted)
+        return FitRecord(record.history, metrics, record.interrupted)
 
     def track_filter(self) -> TrackFilter:
         """The filter, with a sideslip angle among its measurements."""
