@@ -39,7 +39,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
 BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 1.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle moves least
+QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
 BAD = 1e6  # rad², instead of a cost that is not finite
 
@@ -266,7 +266,7 @@ class DugoffUkf(Estimator):
         return {**dict(zip(TYRES, self.tyres.tolist(), strict=True)), **spread, **rms}
 
     def _sensor_levels(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Standard deviations of what is measured while the steering angle hardly moves."""
+        """Standard deviations of what is measured where the steering angle hardly deviates from a straight line."""
         pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
         found = {}
         for name in self._unknown(SENSORS[self.settings.inputs]):
