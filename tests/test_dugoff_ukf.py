@@ -129,6 +129,16 @@ def test_process_noise_is_tuned_by_the_house_search():
     assert record.metrics["evaluations"] == 12
 
 
+def test_levels_are_tuned_on_the_reference_that_is_scored():
+    drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
+    other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
+    losses = [given().fit(FitData([], [own]), data).metrics["best_validation_loss"] for own in (drive, other)]
+    assert losses[0] == losses[1]
+    blind = drive.select([name for name in drive.channels if name != "vy_ref"])
+    with pytest.raises(DataError, match="recording 'drive' has no vy_ref"):
+        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData([blind], []), IdentificationSettings(method="nelder_mead"))
+
+
 def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
     """Going on identifies again; a network trained behind half a search would then meet another filter."""
     drives = [dugoff_drive(3.0)]

@@ -18,6 +18,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
 from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
+from vehest.estimators.sample_network import reference_sideslip
 from vehest.estimators.single_track import checked_sample, require_positive
 from vehest.estimators.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
 from vehest.filters.gaussian import Filtered
@@ -235,7 +236,7 @@ class DugoffUkf(Estimator):
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
-        if data.validation and all(_has_reference(recording) for recording in data.validation):
+        if data.validation and all("vy_ref" in recording for recording in data.validation):
             metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
@@ -283,6 +284,9 @@ class DugoffUkf(Estimator):
         self, searched: Sequence[str], recordings: Sequence[Recording], training: IdentificationSettings, context: FitContext
     ) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
+        for recording in recordings:
+            if "vy_ref" not in recording:
+                raise DataError(f"recording '{recording.id}' has no vy_ref to tune noise levels on; set training.method=data")
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
@@ -300,7 +304,7 @@ class DugoffUkf(Estimator):
         for rows, steps in self._filtered(recordings, levels=levels):
             for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
                 recording = recordings[row]
-                vx, reference = recording["vx"], _reference(recording)
+                vx, reference = recording["vx"], reference_sideslip(recording)
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
                 counted = (vx >= self.settings.minimum_speed) & np.isfinite(reference)
                 counted[:skip] = False
@@ -411,17 +415,6 @@ def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
     wheels = samples[:, len(INERTIAL) :]
     forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
     return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
-
-
-def _has_reference(recording: Recording) -> bool:
-    return "sideslip_ref" in recording or "vy_ref" in recording
-
-
-def _reference(recording: Recording) -> FloatArray:
-    """Reference sideslip [rad], (T,)."""
-    if not _has_reference(recording):
-        raise DataError(f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data")
-    return recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], recording["vx"])
 
 
 def _number(value: float | None) -> float:
