@@ -161,7 +161,7 @@ class CnnUkf(NetworkUkf):
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         train = network.samples(*raw)
-        end_to_end = _EndToEnd(self, train, data.train, training)
+        end_to_end = EndToEnd(self, train, data.train, training)
         phases = [
             self._pre_training(train, network.samples(*judged), levels, training),
             Phase(
@@ -199,7 +199,7 @@ class CnnUkf(NetworkUkf):
         )
 
 
-class _EndToEnd:
+class EndToEnd:
     """Backpropagation through network and filter over sequences (Eqs. 7 and 8)."""
 
     def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:

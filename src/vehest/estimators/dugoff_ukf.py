@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -337,21 +338,22 @@ class DugoffUkf(Estimator):
     ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
         """Rows of recordings that were filtered together, padded to the longest, and what came of them."""
         model = TrackFilter(self.track())
-        process, sensors = self._noise(self.levels if levels is None else levels)
+        process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [samples_of(recordings[row].stack(self.channels)) for row in rows]
             measurements = torch.as_tensor(padded([part[0] for part in parts], np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            trusted = torch.as_tensor(np.stack([self._trusts(ay) for ay in measurements[..., 0].numpy()]))
+            trusted = torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given))
             yield rows, outcome.steps
 
-    def _trusts(self, ay: FloatArray, before: bool = False) -> Any:
+    def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
+        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
         return in_nonlinear_range(ay, self.settings.nonlinear_from, self.settings.linear_below, before)
 
-    def _noise(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+    def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of measurements where the car is linear and where it is not, (2, 4, 4).
 
         Raises:
@@ -387,7 +389,7 @@ class DugoffUkfStepper(Stepper):
     def __init__(self, estimator: DugoffUkf) -> None:
         self._estimator = estimator
         self._filter = TrackStepper(TrackFilter(estimator.track()))
-        self._process, self._sensors = (noise.numpy() for noise in estimator._noise(estimator.levels))
+        self._process, self._sensors = (noise.numpy() for noise in estimator.noise_covariances(estimator.levels))
         self._trusts = False
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -397,7 +399,7 @@ class DugoffUkfStepper(Stepper):
         if np.isinf(row).any():
             raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         measurements, inputs = samples_of(row[None])
-        self._trusts = bool(estimator._trusts(measurements[:, 0], self._trusts)[0])
+        self._trusts = bool(estimator.trusts_forces(measurements[:, 0], self._trusts)[0])
         state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])
         return dict(zip(TRACK_STATES, state.tolist(), strict=True))
 

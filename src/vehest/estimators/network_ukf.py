@@ -140,7 +140,7 @@ class NetworkUkf(Estimator):
 
     def sensor_noise(self) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of what sensors measure where the car is linear and where it is not, (2, 4, 4)."""
-        return self.model._noise(self.model.levels)
+        return self.model.noise_covariances(self.model.levels)
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
@@ -148,8 +148,7 @@ class NetworkUkf(Estimator):
 
     def trusts(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,); see `in_nonlinear_range`."""
-        found: NDArray[np.bool_] = self.model._trusts(ay, before)
-        return found
+        return self.model.trusts_forces(ay, before)
 
     def seen(self, samples: FloatArray) -> FloatArray:
         """What the network sees of samples (T, n) of ``channels``, (T, C)."""
