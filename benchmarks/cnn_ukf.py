@@ -60,7 +60,7 @@ def drives(seconds: float) -> list[Any]:
 
 def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
     """A network before its training, and its training through the filter."""
-    from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings, _EndToEnd
+    from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
     from vehest.estimators.sample_network import learnt_samples
 
     tyres = {f"{name}_{axle}": value for axle in ("front", "rear") for name, value in TYRES.items()}
@@ -71,7 +71,7 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
     estimator.network.reset([torch.Generator().manual_seed(0)])
     with torch.no_grad():
         estimator.network.get_parameter("bias_3")[0, 1:] = torch.tensor([-3.0, -6.5, -6.5])
-    return estimator, _EndToEnd(estimator, estimator.network.samples(*raw), recordings, EndToEndSettings(steps=STEPS, batch_size=BATCH))
+    return estimator, EndToEnd(estimator, estimator.network.samples(*raw), recordings, EndToEndSettings(steps=STEPS, batch_size=BATCH))
 
 
 def plain(estimator: Any, training: Any, batch: Any) -> Any:

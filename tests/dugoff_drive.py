@@ -17,14 +17,16 @@ def dugoff_track(tyres: str = "plain", *, sees_sideslip: bool = False) -> Dugoff
     return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)  # type: ignore[arg-type]
 
 
-def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name: str = "drive") -> Recording:
-    """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces."""
+def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name: str = "drive", *, straight: float = 0.0) -> Recording:
+    """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces; its last seconds lead straight ahead."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * 100)) / 100
     phases = generator.uniform(0, 6, 3)
     vx = 24.0 + 6.0 * np.sin(0.4 * time + phases[0])
     ax = 2.4 * np.cos(0.4 * time + phases[0])
     steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.2 * time) + 0.01 * np.sin(2.9 * time + phases[2])
+    if straight:  # the wheel is turned back smoothly before
+        steer *= np.cos(0.5 * np.pi * np.clip(1.0 - (seconds - straight - time) / 4.0, 0.0, 1.0)) ** 2
     track = dugoff_track()
     inputs = torch.as_tensor(np.stack([vx, steer, ax], 1))
     states = torch.zeros(len(time), 2, dtype=torch.float64)

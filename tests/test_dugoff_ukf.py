@@ -12,6 +12,7 @@ from dugoff_drive import NOISE, TYRES, dugoff_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.track_filter import groups_of, in_nonlinear_range
 from vehest.filters.noise_levels import quiet_level
@@ -41,13 +42,13 @@ def error_of(estimator: DugoffUkf, drive: Recording) -> float:
 
 
 def test_the_fit_finds_tyres_and_sensors_noise():
-    drives = [dugoff_drive(25.0, seed) for seed in (1, 2)]
+    drives = [dugoff_drive(30.0, seed, straight=5.0) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({})
     record = estimator.fit(FitData(drives, [dugoff_drive(10.0, 3)]), QUICK)
     for name in ("cornering_stiffness_front", "friction_front", "cornering_stiffness_rear", "friction_rear"):
         assert record.metrics[name] == pytest.approx(TYRES[name], rel=0.05), name
         assert record.metrics[f"{name}_spread"] < 0.02 * TYRES[name]
-    assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.35)
+    assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.2)
     assert record.metrics["noise_fy_front"] == pytest.approx(NOISE["fy"] * np.sqrt(2.0), rel=0.2)
     assert record.metrics["best_validation_loss"] < np.radians(0.3) ** 2
     assert estimator.n_parameters == 6 + 7
@@ -126,6 +127,30 @@ def test_process_noise_is_tuned_by_the_house_search():
     before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
     assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
     assert record.metrics["evaluations"] == 12
+
+
+def test_levels_are_tuned_on_the_reference_that_is_scored():
+    drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
+    other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
+    losses = [given().fit(FitData([], [own]), data).metrics["best_validation_loss"] for own in (drive, other)]
+    assert losses[0] == losses[1]
+    blind = drive.select([name for name in drive.channels if name != "vy_ref"])
+    with pytest.raises(DataError, match="recording 'drive' has no vy_ref"):
+        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData([blind], []), IdentificationSettings(method="nelder_mead"))
+
+
+def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
+    """Going on identifies again; a network trained behind half a search would then meet another filter."""
+    drives = [dugoff_drive(3.0)]
+    estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
+    before = {name: values.copy() for name, values in estimator.weights().items() if name.startswith("network.")}
+    identification = IdentificationSettings(method="nelder_mead", grid=2, max_evaluations=3)
+    answers = iter([False])
+    context = FitContext(should_stop=lambda: next(answers, True))
+    record = estimator.fit(FitData(drives, drives), EndToEndSettings(identification=identification), context)
+    assert record.interrupted
+    assert record.metrics == {"best_epoch": 0}
+    assert all(np.array_equal(values, estimator.weights()[name], equal_nan=True) for name, values in before.items())
 
 
 def test_stages_search_wide_bounds_and_then_close_to_the_best():

@@ -14,7 +14,7 @@ from test_sample_network import loaded_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
-from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings, _EndToEnd
+from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
 from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
@@ -54,7 +54,7 @@ def estimator_of(name: str, **config: object) -> NetworkUkf:
     return estimator
 
 
-def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, _EndToEnd]:
+def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, EndToEnd]:
     """A network that is not trained yet, in double precision, and its training through the filter."""
     estimator = estimator_of("cnn_ukf", dropout=dropout)
     assert isinstance(estimator, CnnUkf)
@@ -64,7 +64,7 @@ def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, _EndT
     with torch.no_grad():
         estimator.network.get_parameter("bias_3")[0, 1:] = torch.tensor([-4.0, -6.0, -6.0])
     training = EndToEndSettings(steps=30, batch_size=batch_size)
-    return estimator, _EndToEnd(estimator, estimator.network.samples(*raw), DATA.train, training)
+    return estimator, EndToEnd(estimator, estimator.network.samples(*raw), DATA.train, training)
 
 
 def gradients_of(estimator: CnnUkf, loss: torch.Tensor) -> list[torch.Tensor]:

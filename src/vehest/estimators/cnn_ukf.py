@@ -23,6 +23,7 @@ from vehest.training.sequences import Phase, train_phases
 from vehest.training.settings import IdentificationSettings, PhaseSettings
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
+MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
 MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
 
 
@@ -155,11 +156,12 @@ class CnnUkf(NetworkUkf):
         network.scale(*raw)
         network.reset([torch.Generator().manual_seed(self._seed)])
         levels = torch.tensor([self.model.levels["process_vy"], self.model.levels["process_yaw_rate"]], dtype=torch.float64)
+        levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
-            start = torch.cat([network.unit.double().reshape(1), levels])
-            network.get_parameter("bias_3")[0, 1:] = torch.logit(start.clamp(max=0.5)).to(network.unit.dtype)
+            start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
+            network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         train = network.samples(*raw)
-        end_to_end = _EndToEnd(self, train, data.train, training)
+        end_to_end = EndToEnd(self, train, data.train, training)
         phases = [
             self._pre_training(train, network.samples(*judged), levels, training),
             Phase(
@@ -177,7 +179,7 @@ class CnnUkf(NetworkUkf):
         return FitRecord(record.history, {**record.metrics, "lost_sequences": end_to_end.lost}, record.interrupted)
 
     def _pre_training(self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings) -> Phase:
-        """The network alone: a likelihood of its angle and distrust, and process noise at the filter's own levels (Eqs. 5 and 6)."""
+        """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
         network, dropout = self.network, self.settings.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
@@ -197,7 +199,7 @@ class CnnUkf(NetworkUkf):
         )
 
 
-class _EndToEnd:
+class EndToEnd:
     """Backpropagation through network and filter over sequences (Eqs. 7 and 8)."""
 
     def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:

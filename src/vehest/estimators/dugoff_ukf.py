@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -18,6 +19,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
 from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
+from vehest.estimators.sample_network import reference_sideslip
 from vehest.estimators.single_track import checked_sample, require_positive
 from vehest.estimators.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
 from vehest.filters.gaussian import Filtered
@@ -39,7 +41,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
 BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 1.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
-QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle moves least
+QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
 BAD = 1e6  # rad², instead of a cost that is not finite
 
@@ -235,7 +237,7 @@ class DugoffUkf(Estimator):
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
-        if data.validation and all(_has_reference(recording) for recording in data.validation):
+        if data.validation and all("vy_ref" in recording for recording in data.validation):
             metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
@@ -266,7 +268,7 @@ class DugoffUkf(Estimator):
         return {**dict(zip(TYRES, self.tyres.tolist(), strict=True)), **spread, **rms}
 
     def _sensor_levels(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Standard deviations of what is measured while the steering angle hardly moves."""
+        """Standard deviations of what is measured where the steering angle hardly deviates from a straight line."""
         pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
         found = {}
         for name in self._unknown(SENSORS[self.settings.inputs]):
@@ -283,6 +285,9 @@ class DugoffUkf(Estimator):
         self, searched: Sequence[str], recordings: Sequence[Recording], training: IdentificationSettings, context: FitContext
     ) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
+        for recording in recordings:
+            if "vy_ref" not in recording:
+                raise DataError(f"recording '{recording.id}' has no vy_ref to tune noise levels on; set training.method=data")
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
@@ -300,7 +305,7 @@ class DugoffUkf(Estimator):
         for rows, steps in self._filtered(recordings, levels=levels):
             for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
                 recording = recordings[row]
-                vx, reference = recording["vx"], _reference(recording)
+                vx, reference = recording["vx"], reference_sideslip(recording)
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
                 counted = (vx >= self.settings.minimum_speed) & np.isfinite(reference)
                 counted[:skip] = False
@@ -333,21 +338,22 @@ class DugoffUkf(Estimator):
     ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
         """Rows of recordings that were filtered together, padded to the longest, and what came of them."""
         model = TrackFilter(self.track())
-        process, sensors = self._noise(self.levels if levels is None else levels)
+        process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [samples_of(recordings[row].stack(self.channels)) for row in rows]
             measurements = torch.as_tensor(padded([part[0] for part in parts], np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            trusted = torch.as_tensor(np.stack([self._trusts(ay) for ay in measurements[..., 0].numpy()]))
+            trusted = torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given))
             yield rows, outcome.steps
 
-    def _trusts(self, ay: FloatArray, before: bool = False) -> Any:
+    def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
+        """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
         return in_nonlinear_range(ay, self.settings.nonlinear_from, self.settings.linear_below, before)
 
-    def _noise(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
+    def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of measurements where the car is linear and where it is not, (2, 4, 4).
 
         Raises:
@@ -383,7 +389,7 @@ class DugoffUkfStepper(Stepper):
     def __init__(self, estimator: DugoffUkf) -> None:
         self._estimator = estimator
         self._filter = TrackStepper(TrackFilter(estimator.track()))
-        self._process, self._sensors = (noise.numpy() for noise in estimator._noise(estimator.levels))
+        self._process, self._sensors = (noise.numpy() for noise in estimator.noise_covariances(estimator.levels))
         self._trusts = False
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -393,7 +399,7 @@ class DugoffUkfStepper(Stepper):
         if np.isinf(row).any():
             raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         measurements, inputs = samples_of(row[None])
-        self._trusts = bool(estimator._trusts(measurements[:, 0], self._trusts)[0])
+        self._trusts = bool(estimator.trusts_forces(measurements[:, 0], self._trusts)[0])
         state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])
         return dict(zip(TRACK_STATES, state.tolist(), strict=True))
 
@@ -411,17 +417,6 @@ def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
     wheels = samples[:, len(INERTIAL) :]
     forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
     return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
-
-
-def _has_reference(recording: Recording) -> bool:
-    return "sideslip_ref" in recording or "vy_ref" in recording
-
-
-def _reference(recording: Recording) -> FloatArray:
-    """Reference sideslip [rad], (T,)."""
-    if not _has_reference(recording):
-        raise DataError(f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data")
-    return recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], recording["vx"])
 
 
 def _number(value: float | None) -> float:

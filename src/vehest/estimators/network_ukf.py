@@ -125,12 +125,14 @@ class NetworkUkf(Estimator):
 
     def _fit(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
         of_filter = self.model.fit(data, training.identification, FitContext(should_stop=context.should_stop))
+        if of_filter.interrupted:  # nothing learnt yet: the network must see the filter that the whole identification finds
+            return FitRecord({}, {"best_epoch": 0}, True)
         record = self._fit_network(data, training, context, index)
         seconds = of_filter.metrics["train_seconds"]
         found = {name: value for name, value in of_filter.metrics.items() if name.startswith("noise_")}
         metrics = {**record.metrics, **found, "identification_seconds": seconds}
         metrics["train_seconds"] = record.metrics["train_seconds"] + seconds
-        return FitRecord(record.history, metrics, record.interrupted or of_filter.interrupted)
+        return FitRecord(record.history, metrics, record.interrupted)
 
     def track_filter(self) -> TrackFilter:
         """The filter, with a sideslip angle among its measurements."""
@@ -138,7 +140,7 @@ class NetworkUkf(Estimator):
 
     def sensor_noise(self) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of what sensors measure where the car is linear and where it is not, (2, 4, 4)."""
-        return self.model._noise(self.model.levels)
+        return self.model.noise_covariances(self.model.levels)
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
@@ -146,8 +148,7 @@ class NetworkUkf(Estimator):
 
     def trusts(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,); see `in_nonlinear_range`."""
-        found: NDArray[np.bool_] = self.model._trusts(ay, before)
-        return found
+        return self.model.trusts_forces(ay, before)
 
     def seen(self, samples: FloatArray) -> FloatArray:
         """What the network sees of samples (T, n) of ``channels``, (T, C)."""

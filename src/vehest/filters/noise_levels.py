@@ -41,7 +41,8 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
 def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], least: int, share: float = 0.1) -> float:
     """Standard deviation of several recordings of one signal while little else happens, taken together.
 
-    Recordings are cut into pieces; those count in which another signal moves least, and in them deviations from a straight line.
+    Recordings are cut into pieces; those count in which another signal deviates least from a straight line, and in them what the signal
+    itself deviates from one.
 
     Args:
         series: one array a recording, (T,).
