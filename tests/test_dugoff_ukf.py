@@ -129,6 +129,20 @@ def test_process_noise_is_tuned_by_the_house_search():
     assert record.metrics["evaluations"] == 12
 
 
+def test_sensors_levels_are_read_where_the_car_moves_and_tyres_where_loads_are_known():
+    drive, still = dugoff_drive(12.0, straight=4.0), np.arange(1200) >= 700
+    quiet = {
+        "ay": np.where(still, 0.0, drive["ay"]),
+        "vx": np.where(still, 0.0, drive["vx"]),
+        "steer": np.where(still, 0.0, drive["steer"]),
+    }
+    record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(FitData([changed(drive, quiet)], []), QUICK)
+    assert record.metrics["noise_ay"] > 0.8 * NOISE["ay"]
+    gap = changed(drive, {"ax": np.where(still, np.nan, drive["ax"])}, ("ax",))
+    with pytest.raises(DataError, match="recording 'drive': channel 'ax' has gaps"):
+        DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
+
+
 def test_levels_are_tuned_on_the_reference_that_is_scored():
     drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
     other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from scipy import optimize
 
+from vehest.data.errors import DataError
 from vehest.data.recording import FloatArray, Recording
 from vehest.estimators.tyre_fit import axle_motion
 from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres, dugoff_force
@@ -63,15 +64,18 @@ def fit_dugoff(
         generations: of each, at most.
 
     Raises:
-        DataError: a channel is missing, or hardly any samples are left.
+        DataError: a channel is missing, ``ax`` has gaps, or hardly any samples are left.
 
     Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal of Global Optimization 11, 1997.
     """
+    for recording in recordings:
+        if np.isnan(recording["ax"]).any():
+            raise DataError(f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known")
     motion = axle_motion(recordings, car, minimum_speed, measured_forces=measured_forces)
     thin = max(1, -(-motion.slip.shape[1] // MOST_SAMPLES))
     vx, steer, ax = (torch.as_tensor(row) for row in motion.driven[:, ::thin])
     forces = motion.force[:, ::thin] / np.stack([np.cos(steer.numpy()), np.ones(len(steer))])
-    loads, at_rest = car.loads(torch.nan_to_num(ax)), car.loads(torch.zeros(()))
+    loads, at_rest = car.loads(ax), car.loads(torch.zeros(()))
     found = []
     for axle in (0, 1):
         tangent = torch.as_tensor(np.tan(motion.slip[axle, ::thin]))

@@ -268,11 +268,14 @@ class DugoffUkf(Estimator):
         return {**dict(zip(TYRES, self.tyres.tolist(), strict=True)), **spread, **rms}
 
     def _sensor_levels(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Standard deviations of what is measured where the steering angle hardly deviates from a straight line."""
+        """Standard deviations of what is measured at speed where the steering angle deviates least from a straight line."""
         pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
         found = {}
         for name in self._unknown(SENSORS[self.settings.inputs]):
-            series = [recording.stack(WHEELS.get(name, (name,))).sum(1) for recording in recordings]
+            series = [
+                np.where(recording["vx"] < self.settings.minimum_speed, np.nan, recording.stack(WHEELS.get(name, (name,))).sum(1))
+                for recording in recordings
+            ]
             try:
                 found[name] = quiet_level(series, [recording["steer"] for recording in recordings], pieces)
             except ValueError as error:
