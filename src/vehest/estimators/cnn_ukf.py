@@ -151,7 +151,8 @@ class CnnUkf(NetworkUkf):
         return Word(believed(said.sideslip.numpy()), said.variance.numpy(), said.process.square().numpy())
 
     def _fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
-        raw, judged = (learnt_samples(part, self.inputs, self.name) for part in (data.train, data.validation))
+        slow = self.settings.minimum_speed
+        raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
         network = self.network = self._new_network().to(getattr(torch, training.dtype))
         network.scale(*raw)
         network.reset([torch.Generator().manual_seed(self._seed)])
@@ -161,7 +162,8 @@ class CnnUkf(NetworkUkf):
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         train = network.samples(*raw)
-        end_to_end = EndToEnd(self, train, data.train, training)
+        driven = network.samples(*learnt_samples(data.train, self.inputs, self.name))  # sequences are cut from all that was driven
+        end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
             self._pre_training(train, network.samples(*judged), levels, training),
             Phase(

@@ -98,7 +98,8 @@ class EnsembleUkf(NetworkUkf):
         return SampleNetwork(len(self.inputs), self.settings.hidden, 2, self.settings.members)
 
     def _fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
-        raw, judged = (learnt_samples(part, self.inputs, self.name) for part in (data.train, data.validation))
+        slow = self.settings.minimum_speed
+        raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
         network = self.network = self._new_network().to(getattr(torch, training.dtype))
         network.scale(*raw)
         streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.settings.members, np.uint64) >> np.uint64(1)

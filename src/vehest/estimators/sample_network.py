@@ -160,11 +160,15 @@ class SampleNetwork(nn.Module):
         return torch.from_numpy(total / len(samples.targets))
 
 
-def learnt_samples(recordings: Sequence[Recording], channels: Sequence[str], estimator: str) -> tuple[FloatArray, FloatArray]:
+def learnt_samples(
+    recordings: Sequence[Recording], channels: Sequence[str], estimator: str, minimum_speed: float = -np.inf
+) -> tuple[FloatArray, FloatArray]:
     """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,) [rad], recordings one after another.
 
+    Samples slower than ``minimum_speed`` [m/s] are left out.
+
     Raises:
-        DataError: a channel is missing or has gaps.
+        DataError: a channel is missing or has gaps, or all samples are too slow.
     """
     for recording in recordings:
         for name in (*channels, "vy_ref"):
@@ -177,8 +181,11 @@ def learnt_samples(recordings: Sequence[Recording], channels: Sequence[str], est
                     f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; "
                     f"cut them out in conf/split"
                 )
+    fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
+    if not fast.any():
+        raise DataError(f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s")
     inputs = np.concatenate([recording.stack(channels) for recording in recordings])
-    return inputs, np.concatenate([reference_sideslip(recording) for recording in recordings])
+    return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
 
 
 def reference_sideslip(recording: Recording) -> FloatArray:
