@@ -360,6 +360,9 @@ def _groups(root: Path) -> Iterable[str]:
                 yield _fenced(file)
                 continue
             yield _first_comment(file)
+            nested = re.search(r"^  - (\w+)@(\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+            if nested:
+                yield f"`{group}.{nested[2]}.*`: the options of [`{group}={nested[1]}`](#{group}{nested[1]})."
             forced = re.search(r"override /(\w+): (\w+)", file.read_text(encoding="utf-8"))
             if forced:
                 yield f"Chooses `{forced[1]}={forced[2]}`."

@@ -180,7 +180,7 @@ def test_stages_search_wide_bounds_and_then_close_to_the_best():
 def test_without_optuna_an_error_names_the_way_out(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     drives = [dugoff_drive(2.0)]
-    with pytest.raises(MissingError, match=r"training\.method=nelder_mead"):
+    with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):
         DugoffUkf.from_config({"tyres": TYRES}).fit(FitData(drives, drives), IdentificationSettings())
 
 

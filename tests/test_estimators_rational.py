@@ -291,7 +291,7 @@ def test_everything_given_needs_no_fit():
 
 def test_optuna_is_asked_for_by_name_where_it_is_absent(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    with pytest.raises(MissingError, match=r"pip install 'vehest\[tuning\]', or set training.method=nelder_mead"):
+    with pytest.raises(MissingError, match=r"pip install 'vehest\[tuning\]', or set method=nelder_mead"):
         optuna_search(lambda p: 0.0, [(0.0, 1.0)], 3, 0, FitContext())
 
 

@@ -249,7 +249,7 @@ class DugoffUkf(Estimator):
         if not chosen:
             raise DataError(
                 f"no training recording is called '{training.tyres_from}', which tyres are to be identified on; "
-                "set training.tyres_from to another pattern ('*' for all), or give estimator.tyres"
+                "set tyres_from in the identification's settings to another pattern ('*' for all), or give estimator.tyres"
             )
         s = self.settings
         fit = fit_dugoff(
@@ -290,7 +290,9 @@ class DugoffUkf(Estimator):
         """Levels with the smallest error of sideslip, as powers of ten."""
         for recording in recordings:
             if "vy_ref" not in recording:
-                raise DataError(f"recording '{recording.id}' has no vy_ref to tune noise levels on; set training.method=data")
+                raise DataError(
+                    f"recording '{recording.id}' has no vy_ref to tune noise levels on; set method=data in the identification's settings"
+                )
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))

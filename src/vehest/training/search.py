@@ -117,7 +117,7 @@ def optuna_search(
         import optuna
     except ImportError:
         raise MissingError(
-            "training.method=optuna needs Optuna: pip install 'vehest[tuning]', or set training.method=nelder_mead"
+            "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set method=nelder_mead in its settings"
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))

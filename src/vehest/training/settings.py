@@ -212,11 +212,11 @@ class IdentificationSettings(NoiseTuningSettings):
         super().__post_init__()
         for name in ("stages", "restarts", "generations"):
             if getattr(self, name) < 1:
-                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+                raise ConfigurationError(f"{name} of an identification must be at least 1, not {getattr(self, name)}")
         if self.stages > self.trials:
-            raise ConfigurationError(f"training.stages must be at most training.trials ({self.trials}), not {self.stages}")
+            raise ConfigurationError(f"stages of an identification must be at most its trials ({self.trials}), not {self.stages}")
         if not 0.0 < self.shrink <= 1.0:
-            raise ConfigurationError(f"training.shrink must lie between 0 and 1, not at {self.shrink}")
+            raise ConfigurationError(f"shrink of an identification must lie between 0 and 1, not at {self.shrink}")
 
 
 @dataclass(frozen=True)
