@@ -51,7 +51,7 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: factor_graph, gru, kalman, ksnn"),
+        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, ksnn"),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
         (["colour=red"], "unknown option 'colour'"),
