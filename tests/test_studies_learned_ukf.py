@@ -25,9 +25,10 @@ from vehest.studies.learned_ukf.candidates import candidate_of, chosen, models_b
 from vehest.studies.learned_ukf.departures import departures, settings_table
 from vehest.studies.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, swapped
 from vehest.studies.learned_ukf.lengths import lengths
-from vehest.studies.learned_ukf.order import AS_IN_THE_PAPER, TURNED, UNDECIDED, differences, order_in_words
 from vehest.studies.learned_ukf.slips import rear_slip
 from vehest.studies.learned_ukf.traces import hardest
+from vehest.studies.order import AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
+from vehest.studies.reading import median_and_range
 from vehest.training.through_filter import Drive
 
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
@@ -251,8 +252,8 @@ def test_a_metric_that_is_missing_is_said(part):
 
 
 def test_tables_show_median_and_range_beside_the_paper():
-    assert tables.median_and_range(np.array([0.3, 0.1, 0.2]), 2) == "0.20 [0.10, 0.30]"
-    assert tables.median_and_range(np.array([0.3, math.nan]), 2) == "0.30"
+    assert median_and_range(np.array([0.3, 0.1, 0.2]), 2) == "0.20 [0.10, 0.30]"
+    assert median_and_range(np.array([0.3, math.nan]), 2) == "0.30"
     runs = pd.DataFrame({"candidate": ["NNTF_UH"] * 3, **{f"{m}_weighted.tyre_a": [0.3, 0.1, 0.2] for m in ("mse", "mae", "ae99")}})
     row = tables.accuracy(runs, "tyre_a", "t", "c", authors_code=True).frame.iloc[0]
     assert (row["paper_mse"], row["median_mse"], row["code_mse"], row["n_seeds"]) == (0.0063, 0.2, 0.0158, 3)
@@ -267,7 +268,7 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not():
     def losses(level):
         return np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)])
 
-    published = {name: paper.Published(mse, 0.1, 0.1) for name, mse in (("A", 0.1), ("B", 0.2), ("C", 0.3), ("D", 0.4))}
+    published = {"A": 0.1, "B": 0.2, "C": 0.3, "D": 0.4}
     pairs = differences(
         {"A": losses(1.0), "B": losses(2.0), "C": losses(1.5), "D": losses(1.5), "X": losses(9.0)}, sequence, published, 100.0
     )
@@ -276,10 +277,12 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not():
     assert verdicts["B", "C"] == TURNED
     assert verdicts["C", "D"] == UNDECIDED
     assert [tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()] == [("A", "B"), ("B", "C"), ("C", "D")]
-    words = order_in_words(pairs, {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.5}, "tyre A")
+    words = order_in_words(pairs, {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.5}, "on tyre A")
     assert "3 in its order, 2 the other way round, and includes zero for 1" in words
     assert "The other way round: C before B; D before B." in words
     assert "do not tell apart: C and D." in words
+    level = differences({"A": losses(1.0), "B": losses(2.0)}, sequence, {"A": 0.1, "B": 0.1}, 100.0)
+    assert level["verdict"].tolist() == [LEVEL]
 
 
 def test_slip_angle_of_the_rear_axle_is_that_of_a_hand_calculation():

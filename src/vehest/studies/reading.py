@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from vehest.data.recording import Recording
+import numpy as np
+
+from vehest.data.recording import FloatArray, Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
-from vehest.report.style import MISSING
+from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import StudyArtefacts
 
 MOST_NAMED = 12
@@ -48,3 +50,12 @@ def metric_values(part: StudyArtefacts) -> dict[tuple[str, str, int, str, str], 
         (str(row["estimator"]), str(row["variant"]), int(row["seed"]), str(row["test_set"]), str(row["metric"])): float(row["value"])
         for row in metrics.to_dict("records")
     }
+
+
+def median_and_range(values: FloatArray, decimals: int) -> str:
+    """Median, lowest and highest of some seeds: ``0.0135 [0.0130, 0.0141]``; a single value alone."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return MISSING
+    words = fixed(float(np.median(finite)), decimals)
+    return words if len(finite) == 1 else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"

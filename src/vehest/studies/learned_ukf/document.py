@@ -16,7 +16,7 @@ from vehest.studies.learned_ukf.candidates import SETS, chosen, losses, models_b
 from vehest.studies.learned_ukf.departures import departures, settings_table
 from vehest.studies.learned_ukf.filtering import definiteness, drives_of, loaded
 from vehest.studies.learned_ukf.lengths import figure_7
-from vehest.studies.learned_ukf.order import differences, neighbours, order_in_words
+from vehest.studies.order import differences, order_in_words, pairs_table
 from vehest.studies.reading import recordings_of, spans_in_words, words_of_kinds
 
 MAIN = ("real", "simulated")
@@ -149,7 +149,8 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
     blocks: list[Block] = [f"## {title}\n\nAll that follows in this section is {kind}.", *_slips(part, name, where, data)]
     for test, tyre in SETS.items():
         table, sequence = losses(part, test)
-        pairs = differences(table, sequence, paper.TABLES[test], part.protocol.rate_hz)
+        published = {candidate: own.mse for candidate, own in paper.TABLES[test].items()}
+        pairs = differences(table, sequence, published, part.protocol.rate_hz)
         data[f"pairs_{test}_{name}"] = pairs
         unseen = " The paper's unseen tyre is C, ours is D: the numbers stand beside each other, they do not measure the same." * (
             test == "tyre_d"
@@ -169,9 +170,9 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
                 f"{caption}{unseen}{code} Ours: {kind}.",
                 authors_code=name == "real",
             ),
-            order_in_words(pairs, tables.medians(runs, f"mse_weighted.{test}"), tyre),
-            neighbours(
-                pairs,
+            order_in_words(pairs, tables.medians(runs, f"mse_weighted.{test}"), f"on {tyre}"),
+            pairs_table(
+                pairs[pairs["neighbours"]],
                 f"neighbours_{test}_{name}",
                 f"Differences of MSE (weighted) between neighbours in the paper's order, {tyre}; negative where the paper's order holds. "
                 f"All pairs: [CSV](tables/pairs_{test}_{name}.csv). Data: {kind}.",

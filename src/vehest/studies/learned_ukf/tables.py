@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from vehest.data.recording import FloatArray
 from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
@@ -17,20 +16,12 @@ from vehest.studies.learned_ukf import paper
 from vehest.studies.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
 from vehest.studies.learned_ukf.filtering import Definiteness
 from vehest.studies.learned_ukf.paper import Published
+from vehest.studies.reading import median_and_range
 
 METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "MAE"), "ae99": ("ae99_weighted", "99%-AE")}
 """Attribute of `Published` -> metric, and its header."""
 
 STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
-
-
-def median_and_range(values: FloatArray, decimals: int) -> str:
-    """``0.0135 [0.0130, 0.0141]``; a single value alone."""
-    finite = values[np.isfinite(values)]
-    if not len(finite):
-        return MISSING
-    words = fixed(float(np.median(finite)), decimals)
-    return words if len(finite) == 1 else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"
 
 
 def accuracy(runs: pd.DataFrame, test: str, name: str, caption: str, *, authors_code: bool) -> Table:

@@ -13,40 +13,41 @@ from vehest.data.recording import FloatArray
 from vehest.evaluation.significance import paired_difference
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
-from vehest.studies.learned_ukf.paper import Published
 
-AS_IN_THE_PAPER, TURNED, UNDECIDED = "as in the paper", "the other way round", "undecided"
+AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL = "as in the paper", "the other way round", "undecided", "level in the paper"
 
 
 def differences(
-    losses: Mapping[str, FloatArray], sequence: NDArray[np.int64], published: Mapping[str, Published], rate_hz: float
+    losses: Mapping[str, FloatArray], sequence: NDArray[np.int64], published: Mapping[str, float], rate_hz: float
 ) -> pd.DataFrame:
-    """Every pair of candidates, the one with the lower MSE in the paper first.
+    """Every pair of candidates, the one with the lower mean loss in the paper first; of equal ones the first of `losses`.
 
     Args:
         losses: candidate -> loss of each seed at each sample, (S, K).
         sequence: of each sample, (K,); whole sequences are resampled.
-        published: the paper's table; candidates that it does not have are left out.
+        published: candidate -> mean loss in the paper; candidates that it does not have are left out.
         rate_hz: of the samples.
 
     Returns:
-        Columns: first, second, neighbours (in the paper's order), paper (difference of MSE), mean, low, high, p_value (of means over
-        seeds), median, median_low, median_high (of medians over seeds), verdict.
+        Columns: first, second, neighbours (in the paper's order), paper (difference of mean losses), mean, low, high, p_value (of means
+        over seeds), median, median_low, median_high (of medians over seeds), verdict.
 
     Raises:
         DataError: there are fewer than two sequences, or a loss is not finite.
     """
-    order = sorted((name for name in losses if name in published), key=lambda name: published[name].mse)
+    order = sorted((name for name in losses if name in published), key=published.__getitem__)
     rows = []
     for (place, first), (other, second) in itertools.combinations(enumerate(order), 2):
         own = paired_difference(losses[first], losses[second], sequence, rate_hz=rate_hz)
         verdict = AS_IN_THE_PAPER if own.mean.high < 0 else TURNED if own.mean.low > 0 else UNDECIDED
+        if published[first] == published[second]:
+            verdict = LEVEL
         rows.append(
             {
                 "first": first,
                 "second": second,
                 "neighbours": other == place + 1,
-                "paper": published[first].mse - published[second].mse,
+                "paper": published[first] - published[second],
                 **{"mean": own.mean.value, "low": own.mean.low, "high": own.mean.high, "p_value": own.mean.p_value},
                 **{"median": own.median.value, "median_low": own.median.low, "median_high": own.median.high},
                 "verdict": verdict,
@@ -55,15 +56,17 @@ def differences(
     return pd.DataFrame(rows)
 
 
-def neighbours(pairs: pd.DataFrame, name: str, caption: str) -> Table:
-    """The pairs that stand beside each other in the paper's order."""
-    own = pairs[pairs["neighbours"]].copy()
+def pairs_table(pairs: pd.DataFrame, name: str, caption: str, decimals: int = 4) -> Table:
+    """Pairs of `differences`, in words."""
+    own = pairs.copy()
     for kind, low, high in (("mean", "low", "high"), ("median", "median_low", "median_high")):
-        own[f"{kind}_in_words"] = [f"{fixed(row[kind], 4)} [{fixed(row[low], 4)}, {fixed(row[high], 4)}]" for row in own.to_dict("records")]
+        own[f"{kind}_in_words"] = [
+            f"{fixed(row[kind], decimals)} [{fixed(row[low], decimals)}, {fixed(row[high], decimals)}]" for row in own.to_dict("records")
+        ]
     columns = {
-        "first": Column("lower MSE in the paper"),
-        "second": Column("the next"),
-        "paper": Column("difference, paper", decimals=4),
+        "first": Column("lower in the paper"),
+        "second": Column("higher"),
+        "paper": Column("difference, paper", decimals=decimals),
         "mean_in_words": Column("difference of means over seeds [95 % interval]"),
         "median_in_words": Column("of medians over seeds [95 % interval]"),
         "verdict": Column("here"),
@@ -71,21 +74,23 @@ def neighbours(pairs: pd.DataFrame, name: str, caption: str) -> Table:
     return Table(name, caption, own.drop(columns="neighbours"), columns)
 
 
-def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], tyre: str) -> str:
+def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str, decimals: int = 4) -> str:
     """How many pairs are as in the paper, which are the other way round, and which of its neighbours cannot be told apart.
 
     Args:
         pairs: from `differences`.
-        medians: candidate -> median over seeds of its MSE, of all that are compared.
-        tyre: for people.
+        medians: candidate -> median over seeds of its mean loss, of all that are compared.
+        where: on which data, and of what, for people: ``on tyre A``.
+        decimals: of the medians.
     """
     ours = sorted(medians, key=medians.__getitem__)
-    words = f"Order on {tyre} by the median of seeds, best first: {', '.join(f'{name} ({fixed(medians[name], 4)})' for name in ours)}."
+    shown = ", ".join(f"{name} ({fixed(medians[name], decimals)})" for name in ours)
+    words = f"Order {where} by the median of seeds, best first: {shown}."
     if pairs.empty:
         return words
     counts = {verdict: int((pairs["verdict"] == verdict).sum()) for verdict in (AS_IN_THE_PAPER, TURNED, UNDECIDED)}
     words += (
-        f" Of {len(pairs)} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its order, "
+        f" Of {sum(counts.values())} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its order, "
         f"{counts[TURNED]} the other way round, and includes zero for {counts[UNDECIDED]}."
     )
     turned = [f"{row['second']} before {row['first']}" for row in pairs[pairs["verdict"] == TURNED].to_dict("records")]
