@@ -381,6 +381,48 @@ def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
     assert not fired(changed(dropped, ax=braked)) & {("dropout", "wheel_speed_rl")}
 
 
+def backwards(recording: Recording, *stretches: tuple[int, int], speed: float = -2.0) -> Recording:
+    """The same drive, with stretches of samples in which its speed and its reference's are negative."""
+    slow = {name: recording[name].copy() for name in ("vx", "vx_ref")}
+    for samples in slow.values():
+        for start, stop in stretches:
+            samples[start:stop] = np.linspace(0.6 * speed, speed, stop - start)
+    return replace(recording, channels={**recording.channels, **slow})
+
+
+def reversing(recording: Recording) -> list[Finding]:
+    return [finding for finding in checks_of_recording(recording) if finding.check == "reverse"]
+
+
+def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_speed() -> None:
+    (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
+    assert (found.level, found.channel) == ("note", "vx")
+    assert "goes backwards 2 times" in found.message
+    assert "the longest for 2.5 s from 40 s, lowest -2 m/s" in found.message
+    assert "start and stop of a split" in found.message
+    assert "sign: -1" in found.message
+
+
+def test_a_drive_with_the_other_sign_of_vx_goes_backwards_throughout() -> None:
+    (found,) = reversing(changed(clean_drive(), vx=np.negative))
+    assert "goes backwards 1 times" in found.message
+    assert "for 60 s from 10 s" in found.message
+
+
+def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed() -> None:
+    drive = backwards(clean_drive(), (1000, 1150))
+    forwards = changed(drive, vx=np.abs)
+    assert not reversing(forwards)
+    without = replace(forwards, channels={name: samples for name, samples in forwards.channels.items() if name != "vx"})
+    assert [found.channel for found in reversing(without)] == ["vx_ref"]
+    assert not reversing(without.select(["yaw_rate", "ay"]))
+
+
+@pytest.mark.parametrize(("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)])
+def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length: int, speed: float, noted: int) -> None:
+    assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted
+
+
 def test_bad_input_of_a_single_track_filter_is_told_apart() -> None:
     whole = clean_drive()
     assert ("sign", "yaw_rate") in fired(changed(whole, yaw_rate=np.negative))

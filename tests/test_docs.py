@@ -294,7 +294,7 @@ def test_pages_know_every_name():
         assert f"(sources/{source}.md)" in data
         for name in class_of(source).keys:
             assert f"`{name}`" in own, f"docs/sources/{source}.md does not explain {name}"
-    named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated"}
+    named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated", "offset", "dropout", "reverse"}
     for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
         assert f"`{name}`" in data, f"docs/data.md does not explain {name}"
     for name in {*estimator_names(), *UNITS}:
@@ -331,6 +331,7 @@ def test_stated_limits_of_checks_are_those_of_the_code():
     text = " ".join(page("docs/data.md").split())
     assert f"more than {100 * checks.SATURATED_FRACTION:g} % of the samples" in text
     assert f"exactly the same for {checks.STUCK_SECONDS:g} s or more" in text
+    assert f"lies below -{checks.REVERSE_SPEED:g} m/s for {checks.REVERSE_SECONDS:g} s or more" in text
     low, high = checks.KINEMATIC_BAND_HZ
     assert f"correlation below {checks.SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
 

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import pytest
 
 from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalSettings, TrackNoise
+from vehest.report.document import Table
+from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.heavy_ekf import tables, tyres, watching
 from vehest.studies.heavy_ekf.document import WHEELS
+from vehest.studies.heavy_ekf.subjects import Filter
 from vehest.vehicle.parameters import SingleTrackParameters
 
 RATE = 20.0
@@ -51,6 +55,17 @@ def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte: RationalFilter) ->
     sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
     limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))
     assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
+
+
+def test_table_of_bad_input_names_the_drive_backwards(ratte: RationalFilter) -> None:
+    drive = short_drive()
+    filters = {"RATTE": Filter("RATTE", cast("EvaluatedModel", None), ratte)}
+    table, *words = watching.bad_input_table(filters, drive, [drive], WHEELS, 2.0, "SIMULATED")
+    assert isinstance(table, Table)
+    said = table.frame.set_index("fault")["check"]
+    assert said["nothing"] == "–"
+    assert said["the drive backwards"] == "reverse: vx"
+    assert not any("the drive backwards" in str(block) for block in words)
 
 
 def test_monitor_is_the_mean_over_measured_numbers_in_windows() -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -40,6 +41,8 @@ DROPOUT_SHARE = 0.1  # of the other wheels' median
 DROPOUT_SECONDS = 0.1
 DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
+REVERSE_SPEED = 0.5  # m/s
+REVERSE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -395,6 +398,32 @@ def _wheel_dropout(recording: Recording) -> list[Finding]:
     return findings
 
 
+def _reverse(recording: Recording) -> list[Finding]:
+    """Driving backwards is legitimate, but most estimators take the car to go forwards."""
+    speed = "vx" if "vx" in recording else "vx_ref"
+    if speed not in recording:
+        return []
+    samples = recording[speed]
+    starts, lengths = _long_runs(samples < -REVERSE_SPEED, at_least=math.ceil(REVERSE_SECONDS * recording.rate_hz))
+    backwards = samples[starts] < -REVERSE_SPEED
+    starts, lengths = starts[backwards], lengths[backwards]
+    if not len(starts):
+        return []
+    start, length = int(starts[np.argmax(lengths)]), int(lengths.max())
+    lowest = min(float(samples[begin : begin + count].min()) for begin, count in zip(starts, lengths, strict=True))
+    return [
+        Finding(
+            "note",
+            "reverse",
+            speed,
+            f"goes backwards {len(starts)} times (below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest for "
+            f"{length / recording.rate_hz:.3g} s from {recording.time[start]:.12g} s, lowest {lowest:.3g} m/s; what estimators say there "
+            "does not count if they take the car to go forwards: leave the range out (start and stop of a split), or set sign: -1 for the "
+            "speed if the drive goes forwards",
+        )
+    ]
+
+
 def _standstill(recording: Recording) -> BoolArray:
     """Where the car stands: the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
     standing = np.zeros(len(recording), dtype=bool)
@@ -440,4 +469,5 @@ _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     _saturated,
     _steering_offset,
     _wheel_dropout,
+    _reverse,
 )

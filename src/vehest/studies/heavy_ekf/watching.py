@@ -155,7 +155,7 @@ def bad_input_table(
         said = [
             f"{finding.check}: {finding.channel}"
             for finding in checks_of_recording(damaged)
-            if (finding.level != "note" or finding.check == "nan") and (finding.check, finding.channel) not in clean
+            if (finding.level != "note" or finding.check in ("nan", "reverse")) and (finding.check, finding.channel) not in clean
         ]
         row: dict[str, object] = {"fault": fault, "check": "; ".join(dict.fromkeys(said)) or MISSING}
         alarmed = False
