@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from conftest import planar_drive
 from vehest.data.windows import windows_of
@@ -17,6 +18,7 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn, KsnnSettings
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.recurrent import RecurrentSettings
+from vehest.stages import group
 from vehest.training.members import FlatParameters, predict_members
 
 STRUCTURES = [
@@ -198,3 +200,14 @@ def test_observer_resets_below_the_threshold():
     vy, vx = observe(measurements, 5.0, 0.1, 0.01)
     assert (vy == 0.0).all()
     assert (vx == 20.0).all()
+
+
+def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads(*_: object) -> list[int]:
+        return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+    monkeypatch.setattr(group, "_run_group", threads)
+    with threadpool_limits(2, "blas"):  # what a process on two cores starts with
+        seen = group.run_group(group.Group([], None, frozenset()), lambda: False, lambda progress: None)
+        assert set(seen) == {1}
+        assert set(threads()) == {2}

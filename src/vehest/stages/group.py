@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from vehest.data.splits import Split
+from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
 from vehest.stages.artefacts import Artefact, Status, find, make
 from vehest.stages.evaluate import plan_evaluate, write_evaluation
@@ -88,9 +89,14 @@ def is_finished(group: Group, member: Member) -> bool:
 def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
     """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
 
-    On one thread: recursions over small states gain nothing from more, and groups run side by side.
+    On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
     """
     torch.set_num_threads(1)
+    with one_blas_thread():
+        return _run_group(group, should_stop, on_progress)
+
+
+def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
     models = {member.job.plan.key: member.model for member in existing(group)}
     if "train" in group.force:
         for job in group.jobs:
