@@ -141,6 +141,7 @@ def five_seconds(name: str, channels: Iterable[str]) -> Recording:
     """A recording beyond 7 m/s² from 2.5 s on, and slower than 5 m/s from 4.5 s on."""
     sample = np.arange(500)
     made = {"ay": np.where(sample < 250, -6.0, -8.0), "vx": np.where(sample < 450, 15.0, 4.0)}
+    made["sideslip_ref"] = np.where(sample < 400, 0.1, -0.5)
     return Recording(name, "bmw_545i", 100.0, 0.0, made).select(channels)
 
 
@@ -164,7 +165,8 @@ def test_splits_take_the_drives_by_their_names() -> None:
 
 def test_the_limited_split_learns_below_7_and_is_tested_on_everything() -> None:
     full, limited = split("sim_bmw"), split("sim_bmw_limited")
-    assert {span.stop for span in full.train + full.validation} == {4.5}  # below 5 m/s after that
+    assert {span.stop for span in full.train + full.validation} == {4.0}  # a spin after that
+    assert {span.stop for span in full.tests["test"]} == {4.5}  # below 5 m/s after that
     assert {span.stop for span in limited.train + limited.validation} == {2.5}  # beyond 7 m/s² after that
     assert limited.tests == full.tests
     assert limited.kept["train"].seconds == pytest.approx(161 * 2.5)
