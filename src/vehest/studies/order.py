@@ -90,8 +90,8 @@ def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str
         return words
     counts = {verdict: int((pairs["verdict"] == verdict).sum()) for verdict in (AS_IN_THE_PAPER, TURNED, UNDECIDED)}
     words += (
-        f" Of {sum(counts.values())} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its order, "
-        f"{counts[TURNED]} the other way round, and includes zero for {counts[UNDECIDED]}."
+        f" Of {sum(counts.values())} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its "
+        f"order, {counts[TURNED]} the other way round, and includes zero for {counts[UNDECIDED]}."
     )
     turned = [f"{row['second']} before {row['first']}" for row in pairs[pairs["verdict"] == TURNED].to_dict("records")]
     if turned:
