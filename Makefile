@@ -12,7 +12,7 @@ JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -69,6 +69,9 @@ learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with smaller b
 
 heavy_ekf: $(INSTALLED) ## a heavy vehicle's laps by Kalman filters whose tyres adapt, simulated, and the real Ferrari with VEHEST_DATA: minutes
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
+
+cnn_ukf: $(INSTALLED) ## the tables and figures of the UKF-informed network's paper, simulated, and the real Ferrari with VEHEST_DATA: hours
+	$(BIN)/vehest run pipelines/cnn_ukf.yaml
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml

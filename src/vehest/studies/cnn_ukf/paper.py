@@ -1,0 +1,59 @@
+"""What Bertipaglia et al. 2024 report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+MODEL, DATA, DEEP, CNN = "Model-based", "Data-driven", "DE-UKF", "CNN-UKF"
+SMOOTH = "Model-based, smooth tyres"
+"""Not in the paper: the filter of the CNN-UKF alone."""
+
+CANDIDATES = (MODEL, SMOOTH, DATA, DEEP, CNN)
+"""In the order of Table II."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """A row of Tables II and III.
+
+    Args:
+        mse: mean squared error of the sideslip angle [deg²].
+        mse_nonlinear: of samples with |ay| ≥ 4 m/s² [deg²].
+        max_error: largest absolute error of a manoeuvre, mean over manoeuvres [deg].
+        max_error_nonlinear: of samples with |ay| ≥ 4 m/s² [deg].
+    """
+
+    mse: float
+    mse_nonlinear: float
+    max_error: float
+    max_error_nonlinear: float
+
+
+TABLE_II: Mapping[str, Published] = {
+    MODEL: Published(0.161, 0.277, 1.111, 0.991),
+    DATA: Published(0.096, 0.157, 1.293, 1.123),
+    DEEP: Published(0.087, 0.157, 0.981, 0.822),
+    CNN: Published(0.086, 0.118, 0.979, 0.776),
+}
+"""Full set."""
+
+TABLE_III: Mapping[str, Published] = {
+    MODEL: Published(0.161, 0.277, 1.111, 0.991),
+    DATA: Published(0.223, 0.358, 1.445, 1.284),
+    DEEP: Published(0.157, 0.270, 1.103, 0.983),
+    CNN: Published(0.156, 0.269, 1.099, 0.975),
+}
+"""Limited set."""
+
+TABLES: Mapping[str, Mapping[str, Published]] = {"full": TABLE_II, "limited": TABLE_III}
+"""Part -> its table."""
+
+SCALING: Mapping[str, tuple[float, float]] = {"full": (-4.2690, 0.7901), "limited": (-1.4353, 1.465)}
+"""Part -> p₁ and p₂ of Eq. 11."""
+
+LEVELS = (7e-4, 2e-3)
+"""[m/s, rad/s] deviations of a step, tuned for the model-based approach (Section III-C)."""
+
+STIFFNESS_STEP = 0.1
+"""By which share both axles' cornering stiffnesses are off in Fig. 14."""

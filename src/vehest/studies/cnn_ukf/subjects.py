@@ -1,0 +1,179 @@
+"""What the study looks at: trainings, what they make of each manoeuvre, and manoeuvres as the paper prepares them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import FloatArray, Recording
+from vehest.data.splits import VALIDATION, Span
+from vehest.data.store import read_recording
+from vehest.data.transforms import LowPass, RemoveOutliers
+from vehest.evaluation.manoeuvres import Kpis, is_nonlinear, kpis, manoeuvres_of, sideslip_error
+from vehest.evaluation.metrics import Scored, score_all
+from vehest.evaluation.significance import sequence_labels
+from vehest.report.style import Line
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.cnn_ukf import paper
+
+TEST = "test"
+CUTOFF_HZ = 5.0
+OFFLINE = (RemoveOutliers(), LowPass(CUTOFF_HZ, design="fir"), LowPass(CUTOFF_HZ, channels=("vy_ref",), design="fir"))
+"""Preprocessing of the paper (Section IV-A), of measurements and of the reference."""
+
+LINES = {
+    paper.MODEL: Line("#0b4f9c", "dashed", "s"),
+    paper.SMOOTH: Line("#4aa5e0", "dotted", "P"),
+    paper.DATA: Line("#b8480b", "dashdot", "o"),
+    paper.DEEP: Line("#00876c", "dotted", "D"),
+    paper.CNN: Line("#d6336c", "solid", "^"),
+}
+KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
+"""Attribute of `Kpis` and of `paper.Published` -> header."""
+
+Manoeuvres = Mapping[str, Sequence[Scored]]
+"""Recording -> what was scored of it."""
+
+_NAMES = {
+    ("dugoff_ukf", False): paper.MODEL,
+    ("dugoff_ukf", True): paper.SMOOTH,
+    ("sideslip_ffnn", False): paper.DATA,
+    ("ensemble_ukf", False): paper.DEEP,
+    ("cnn_ukf", False): paper.CNN,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One training and what it makes of the validation and the test manoeuvres.
+
+    Args:
+        candidate: what the report calls it.
+        model: where it comes from.
+        validation: what was scored of each manoeuvre that stopped it.
+        test: what was scored of each manoeuvre it is tested on.
+    """
+
+    candidate: str
+    model: EvaluatedModel
+    validation: Manoeuvres
+    test: Manoeuvres
+
+    @property
+    def kpis(self) -> Kpis:
+        """Of the test."""
+        return kpis(self.test)
+
+
+def candidate_of(model: EvaluatedModel) -> str:
+    """What the paper calls a model; its own title if it has none like it."""
+    return _NAMES.get((model.estimator, model.variant.endswith("_smooth")), model.title)
+
+
+def runs_of(part: StudyArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
+    """Candidate -> its seeds, in the order of Table II; others come last.
+
+    Args:
+        part: of the study.
+        prepared: its recordings.
+
+    Raises:
+        DataError: two models of one candidate have the same seed.
+    """
+    groups: dict[str, list[Run]] = {}
+    for model in part.models:
+        validation, test = (manoeuvres_of(prepared.spans(name), prepared.scored(model, name)) for name in (VALIDATION, TEST))
+        groups.setdefault(candidate_of(model), []).append(Run(candidate_of(model), model, validation, test))
+    for name, runs in groups.items():
+        if len({run.model.seed for run in runs}) != len(runs):
+            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
+    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
+    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in order}
+
+
+def chosen(runs: Sequence[Run]) -> Run:
+    """The seed with the lowest mean squared error on the validation manoeuvres. Test manoeuvres choose nothing."""
+    return min(runs, key=lambda run: kpis(run.validation).mse)
+
+
+def losses(runs: Mapping[str, Sequence[Run]], *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
+    """Squared errors of the test [deg²] of every seed at every sample that counts, and the manoeuvre that each sample belongs to.
+
+    Returns:
+        Candidate -> (seeds, K); and (K,).
+    """
+    table, lengths = {}, [0]
+    for candidate, own in runs.items():
+        seeds = []
+        for run in own:
+            pieces = []
+            for parts in run.test.values():
+                squares = np.square(np.concatenate([sideslip_error(part) for part in parts]))
+                kept = np.concatenate([is_nonlinear(part) for part in parts])
+                pieces.append(squares[kept] if nonlinear_only else squares)
+            lengths = [len(piece) for piece in pieces]
+            seeds.append(np.concatenate(pieces))
+        table[candidate] = np.stack(seeds)
+    return table, sequence_labels(lengths)
+
+
+def kpi_table(runs: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
+    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse``; a row a run."""
+    rows = [
+        {"candidate": candidate, "seed": run.model.seed}
+        | {name: getattr(run.kpis, name) for name in KPIS}
+        | {"validation_mse": kpis(run.validation).mse}
+        for candidate, own in runs.items()
+        for run in own
+    ]
+    return pd.DataFrame(rows)
+
+
+class Prepared:
+    """Recordings of a part as the paper prepares them, at the evaluation rate; what they were scored against here.
+
+    The evaluation scores against the reference as it was measured. The paper's is low-passed as the measurements are, and whether a
+    sample counts as non-linear is a matter of the low-passed lateral acceleration.
+    """
+
+    def __init__(self, part: StudyArtefacts) -> None:
+        self._part = part
+        self._read: dict[tuple[str, str], Recording] = {}
+
+    def spans(self, test: str) -> Sequence[Span]:
+        """Ranges of a test set, or of the validation."""
+        return self._part.split.validation if test == VALIDATION else self._part.split.tests[test]
+
+    def recording(self, dataset: str, recording: str) -> Recording:
+        """All of a recording."""
+        key = dataset, recording
+        if key not in self._read:
+            prepared = read_recording(self._part.references[key])
+            for transform in OFFLINE:
+                prepared = transform(prepared)
+            self._read[key] = prepared
+        return self._read[key]
+
+    def seen(self, test: str) -> list[Recording]:
+        """What an estimator saw of each range of a test set, if it was prepared offline: with its warm-up, without references."""
+        return [
+            self.recording(span.dataset, span.recording)
+            .cut(span.start - self._part.protocol.warm_up_seconds, span.stop)
+            .without_references()
+            for span in self.spans(test)
+        ]
+
+    def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
+        """Estimates of a model and prepared references, range by range."""
+        return self.score([model.estimate(test, position) for position in range(len(self.spans(test)))], test)
+
+    def score(self, estimates: Sequence[Estimate], test: str) -> list[Scored]:
+        """Estimates, one a range, and prepared references."""
+        spans = self.spans(test)
+        return score_all(estimates.__getitem__, spans, lambda span: self.recording(span.dataset, span.recording), self._part.protocol)
