@@ -27,7 +27,7 @@ from vehest.studies.learned_ukf.filtering import definiteness, drives_of, filter
 from vehest.studies.learned_ukf.lengths import lengths
 from vehest.studies.learned_ukf.slips import rear_slip
 from vehest.studies.learned_ukf.traces import hardest
-from vehest.studies.order import AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
+from vehest.studies.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest.studies.reading import median_and_range
 from vehest.training.through_filter import Drive
 
@@ -281,8 +281,16 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not():
     assert "3 in its order, 2 the other way round, and includes zero for 1" in words
     assert "The other way round: C before B; D before B." in words
     assert "do not tell apart: C and D." in words
-    level = differences({"A": losses(1.0), "B": losses(2.0)}, sequence, {"A": 0.1, "B": 0.1}, 100.0)
-    assert level["verdict"].tolist() == [LEVEL]
+
+
+def test_pairs_that_are_level_in_the_paper_have_a_verdict_of_their_own_and_share_their_neighbours():
+    generator = np.random.default_rng(0)
+    table = {name: level * generator.uniform(0.9, 1.1, (3, 600)) for name, level in (("A", 1.0), ("B", 2.0), ("C", 2.0), ("D", 3.0))}
+    pairs = differences(table, np.repeat(np.arange(12), 50), {"A": 0.1, "B": 0.1, "C": 0.1, "D": 0.2}, 100.0)
+    verdicts = {(row["first"], row["second"]): row["verdict"] for row in pairs.to_dict("records")}
+    assert (verdicts["A", "B"], verdicts["B", "C"], verdicts["C", "D"]) == (APART, LEVEL, AS_IN_THE_PAPER)
+    assert {tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()} == {("A", "D"), ("B", "D"), ("C", "D")}
+    assert "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C." in order_in_words(pairs, {}, "x")
 
 
 def test_slip_angle_of_the_rear_axle_is_that_of_a_hand_calculation():

@@ -14,7 +14,13 @@ from vehest.evaluation.significance import paired_difference
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 
-AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL = "as in the paper", "the other way round", "undecided", "level in the paper"
+AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL, APART = (
+    "as in the paper",
+    "the other way round",
+    "undecided",
+    "level in the paper, not told apart here",
+    "level in the paper, told apart here",
+)
 
 
 def differences(
@@ -29,24 +35,25 @@ def differences(
         rate_hz: of the samples.
 
     Returns:
-        Columns: first, second, neighbours (in the paper's order), paper (difference of mean losses), mean, low, high, p_value (of means
-        over seeds), median, median_low, median_high (of medians over seeds), verdict.
+        Columns: first, second, neighbours (no third value of the paper lies between), paper (difference of mean losses),
+        mean, low, high, p_value (of means over seeds), median, median_low, median_high (of medians over seeds), verdict.
 
     Raises:
         DataError: there are fewer than two sequences, or a loss is not finite.
     """
     order = sorted((name for name in losses if name in published), key=published.__getitem__)
+    places = {value: place for place, value in enumerate(sorted({published[name] for name in order}))}
     rows = []
-    for (place, first), (other, second) in itertools.combinations(enumerate(order), 2):
+    for first, second in itertools.combinations(order, 2):
         own = paired_difference(losses[first], losses[second], sequence, rate_hz=rate_hz)
         verdict = AS_IN_THE_PAPER if own.mean.high < 0 else TURNED if own.mean.low > 0 else UNDECIDED
         if published[first] == published[second]:
-            verdict = LEVEL
+            verdict = LEVEL if own.mean.low <= 0.0 <= own.mean.high else APART
         rows.append(
             {
                 "first": first,
                 "second": second,
-                "neighbours": other == place + 1,
+                "neighbours": places[published[second]] == places[published[first]] + 1,
                 "paper": published[first] - published[second],
                 **{"mean": own.mean.value, "low": own.mean.low, "high": own.mean.high, "p_value": own.mean.p_value},
                 **{"median": own.median.value, "median_low": own.median.low, "median_high": own.median.high},
@@ -93,6 +100,10 @@ def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str
         f" Of {sum(counts.values())} pairs that the paper ranks, the 95 % interval of the difference has {counts[AS_IN_THE_PAPER]} in its "
         f"order, {counts[TURNED]} the other way round, and includes zero for {counts[UNDECIDED]}."
     )
+    level = [f"{row['first']} and {row['second']}" for row in pairs[pairs["verdict"].isin((LEVEL, APART))].to_dict("records")]
+    if level:
+        apart = [f"{row['first']} and {row['second']}" for row in pairs[pairs["verdict"] == APART].to_dict("records")]
+        words += f" Level in the paper: {'; '.join(level)}; told apart here: {'; '.join(apart) or 'none'}."
     turned = [f"{row['second']} before {row['first']}" for row in pairs[pairs["verdict"] == TURNED].to_dict("records")]
     if turned:
         words += f" The other way round: {'; '.join(turned)}."

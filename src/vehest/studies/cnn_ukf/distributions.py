@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ from vehest.evaluation.manoeuvres import BIN, ErrorDistribution, error_distribut
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import StudyArtefacts
-from vehest.studies.cnn_ukf.subjects import LINES, Prepared, Run, chosen
+from vehest.studies.cnn_ukf.subjects import LINES, Prepared, Run, Runs, chosen
 from vehest.studies.reading import median_and_range
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
@@ -38,12 +38,12 @@ def figure_4(parts: Mapping[str, StudyArtefacts], prepared: Mapping[str, Prepare
     for name, (sideslip, ay) in driven.items():
         inside = 100.0 * float(np.mean(np.abs(sideslip) <= 3.0))
         sentences.append(
-            f"{titles[name]}: {len(ay) / 6000.0:.0f} min, |β| ≤ 3° in {fixed(inside, 1)} % of samples, |β| up to "
-            f"{fixed(float(np.abs(sideslip).max()), 0)}°, |ay| up to {fixed(float(np.abs(ay).max()), 1)} m/s²"
+            f"{titles[name]}: {len(ay) / (60.0 * parts[name].protocol.rate_hz):.0f} min, |β| ≤ 3° in {fixed(inside, 1)} % of samples, |β| "
+            f"up to {fixed(float(np.abs(sideslip).max()), 0)}°, |ay| up to {fixed(float(np.abs(ay).max()), 1)} m/s²"
         )
     caption = (
-        f"Distribution of sideslip angle and lateral acceleration (Figure 4 of the paper), bins of 1° and 1 m/s², training, validation and "
-        f"test together; test drives are the same in both sets, and not cut. {'. '.join(sentences)}. Data: {data}."
+        "Distribution of sideslip angle and lateral acceleration (Figure 4 of the paper), bins of 1° and 1 m/s², training, validation and "
+        f"test together; the test is the same in both, and has all lateral accelerations. {'. '.join(sentences)}. Data: {data}."
     )
     return Figure("figure_4", caption, figure)
 
@@ -56,7 +56,7 @@ def _driven(part: StudyArtefacts, prepared: Prepared) -> tuple[FloatArray, Float
     return np.concatenate(sideslip), np.concatenate([piece["ay"] for piece in pieces])
 
 
-def errors_figure(runs: Mapping[str, Sequence[Run]], name: str, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
+def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
     """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation.
 
     Returns:
@@ -85,8 +85,7 @@ def errors_figure(runs: Mapping[str, Sequence[Run]], name: str, number: int, tit
     )
     caption = (
         f"Distribution of the sideslip angle's error where |ay| ≥ 4 m/s² (Figure {number} of the paper), {title}, bins of {BIN:g}°; of "
-        "each "
-        f"method the seed that validation chooses. Above: mean and standard deviation: {shown}. Data: {data}."
+        f"each method the seed that validation chooses. Above: mean and standard deviation: {shown}. Data: {data}."
     )
     rows = [
         {"candidate": candidate, "from_deg": low, "samples": count}
@@ -100,7 +99,7 @@ def _distribution(run: Run) -> ErrorDistribution:
     return error_distribution([part for parts in run.test.values() for part in parts])
 
 
-def groups(runs: Mapping[str, Sequence[Run]], name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:
+def groups(runs: Runs, name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
     of_run = {candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()}
     known = list(next(iter(of_run.values()))[0])

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
+from vehest.estimators.cnn_ukf import MOST_NOISE
+from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Block, Column, Document, Table
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import PartsArtefacts, StudyArtefacts
 from vehest.studies.cnn_ukf import distributions, paper, reasons, robustness, tables, traces
-from vehest.studies.cnn_ukf.subjects import CUTOFF_HZ, TEST, Prepared, Run, chosen, kpi_table, losses, runs_of
+from vehest.studies.cnn_ukf.subjects import (
+    CUTOFF_HZ,
+    TEST,
+    Prepared,
+    Run,
+    Runs,
+    candidate_of,
+    chosen,
+    kpi_table,
+    losses,
+    runs_of,
+)
 from vehest.studies.order import differences, order_in_words, pairs_table
 from vehest.studies.reading import spans_in_words, words_of_kinds
 
@@ -20,29 +33,12 @@ FULL, LIMITED, ALONE, CAUSAL, FERRARI = "full", "limited", "limited_alone", "cau
 ON_THE_SAME_TEST = (FULL, LIMITED, ALONE, CAUSAL)
 ROMAN = {FULL: "II", LIMITED: "III"}
 
-Runs = Mapping[str, Sequence[Run]]
-
-DEPARTURES = (
-    "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, and by a car with the paper's mass, "
-    "inertia and wheelbase; its tyres, springs and sensors are assumed. Nothing is learnt from the seconds in which two training drives "
-    "spin.",
-    "The limited set's filters have tyres and levels of noise of the full one, as the paper's model has the same errors in both tables.",
-    "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper says smooth tyres of "
-    "the "
-    "training only. The same filter alone stands beside it.",
-    "σ_DD is a standard deviation everywhere, R = σ_DD² + 1e-6 rad², where Eq. 6 has a variance; Eq. 11 scales the variance of the "
-    "networks' angles, in rad², and R is its result.",
-    "Pre-training aims at the levels of process noise that the identification finds for this data, not at the paper's.",
-    "Epochs, patience and batches that the paper leaves open, hysteresis and factor of the forces' noise: docs/estimators.md. The paper "
-    "optimises further settings of its networks by Bayesian optimisation and does not say which; here none are.",
-)
-
 
 def build_parts(artefacts: PartsArtefacts) -> Document:
     """The report of the study.
 
     Raises:
-        DataError: part ``full`` is missing, or test sets are not called ``test``.
+        DataError: part ``full`` or one of its four methods is missing, or test sets are not called ``test``.
     """
     if FULL not in artefacts.parts:
         raise DataError(f"study '{artefacts.study}' needs part '{FULL}'")
@@ -52,6 +48,9 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     parts = {name: artefacts.parts[name] for name in ON_THE_SAME_TEST if name in artefacts.parts}
     prepared = {name: Prepared(part) for name, part in parts.items()}
     runs = {name: runs_of(part, prepared[name]) for name, part in parts.items()}
+    missing = [candidate for candidate in paper.TABLE_II if candidate not in runs[FULL]]
+    if missing:
+        raise DataError(f"study '{artefacts.study}': no {' and no '.join(missing)} among the models of part '{FULL}'; it needs all four")
     data: dict[str, pd.DataFrame] = {f"kpis_{name}": kpi_table(own) for name, own in runs.items()}
     blocks: list[Block] = [*_headline(artefacts, runs), overview(artefacts, runs), *_how_it_was_made(artefacts, parts)]
     main = {name: parts[name] for name in (FULL, LIMITED) if name in parts}
@@ -68,6 +67,45 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         blocks += _ferrari(artefacts.parts[FERRARI], artefacts.titles[FERRARI])
     blocks += _filters_and_budget(artefacts, parts, runs)
     return Document(artefacts.title, blocks, data)
+
+
+def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
+    """Sentences, of what departs; settings from the trainings."""
+    trainings = {candidate_of(model): model.training for part in parts.values() for model in part.models}
+    lines = [
+        "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, by a car with the paper's mass, "
+        "inertia and wheelbase; its tyres, springs and sensors are assumed, each drive has sensors' offsets of its own. Nothing is "
+        "learnt, and nothing stopped, on moments that the split leaves out as beyond what the paper's drives show (docs/cnn_ukf.md).",
+        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper says smooth tyres "
+        "of the training only. The same filter alone stands beside it.",
+        f"σ_DD is a standard deviation everywhere, R = σ_DD² + {LEAST_VARIANCE:g} rad², where Eq. 6 has a variance; Eq. 11 scales the "
+        "variance of the networks' angles, in rad², and R is its result.",
+        f"Pre-training aims at the levels of process noise that the identification finds for this data, but at {MOST_NOISE:g} at most, "
+        "since a logistic function ends at 1; the paper's are far smaller.",
+    ]
+    if LIMITED in parts:
+        lines.append(
+            "The limited set's filters are given the tyres and levels of noise of the full one, as the paper's model has the same errors "
+            "in both tables. It is cut where the unfiltered |ay| exceeds the limit, into whole stretches of two seconds and more."
+        )
+    if paper.DEEP in trainings:
+        phase = trainings[paper.DEEP]["phase"]
+        if phase["patience"]:
+            lines.append(
+                f"Ensemble: training ends {phase['patience']} epochs after the best mean likelihood on validation, at "
+                f"{phase['max_epochs']} at the latest, and the best is kept (paper: {paper.MEMBER_EPOCHS} epochs)."
+            )
+    if paper.CNN in trainings:
+        own = trainings[paper.CNN]
+        if own["batch_size"] != paper.BATCH:
+            lines.append(
+                f"End to end, batches are {own['batch_size']} sequences of {own['steps']} samples (paper: batches of {paper.BATCH})."
+            )
+    return [
+        *lines,
+        "What the paper leaves open (epochs, patience, hysteresis and factor of the forces' noise): docs/estimators.md. It optimises "
+        "further settings of its networks by Bayesian optimisation and does not say which; here none are.",
+    ]
 
 
 def overview(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> Table:
@@ -87,9 +125,9 @@ def overview(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> Table:
     for kpi, header in (("mse", "MSE"), ("mse_nonlinear", "MSE_nl")):
         columns |= {f"paper_{kpi}": Column(f"{header}, paper [deg²]", decimals=3), f"ours_{kpi}": Column(f"{header}, ours", decimals=3)}
     columns["n_seeds"] = Column("seeds", decimals=0)
-    return Table(
-        "overview", "The short of it: squared errors of the sideslip angle, ours as medians of seeds.", pd.DataFrame(rows), columns
-    )
+    kind = words_of_kinds(artefacts.parts[FULL]).upper()
+    caption = f"The short of it: squared errors of the sideslip angle, ours as medians of seeds. Data: {kind}; the paper's are real."
+    return Table("overview", caption, pd.DataFrame(rows), columns)
 
 
 def _headline(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> list[Block]:
@@ -106,7 +144,7 @@ def _headline(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> list[Block
             known = listed([f"{candidate} {fixed(own.mse_nonlinear, 3)}" for candidate, own in paper.TABLES[name].items()])
             sentences.append(f"{artefacts.titles[name]}, MSE_nl [deg²], medians of seeds, best first: {shown} (paper: {known}).")
     if FERRARI in artefacts.parts:
-        best = tables.another_car(artefacts.parts[FERRARI], "x", "").frame
+        best = tables.another_car(artefacts.parts[FERRARI])
         shown = listed([f"{row['title']} {fixed(row['median'], 3)}°" for row in best.head(3).to_dict("records")])
         sentences.append(f"{artefacts.titles[FERRARI]}, RMSE(β), the best three of {len(best)}: {shown}.")
     return [words, "\n\n".join(sentences), artefacts.about]
@@ -118,11 +156,9 @@ def _how_it_was_made(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefac
     lines = [
         f"Command: `{artefacts.command}`, with Optuna installed",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; estimators may start up to {protocol.warm_up_seconds:g} s before "
-        "a "
-        f"{protocol.piece}, of which the first {protocol.skip_seconds:g} s are not scored, for anyone.{protocol.start_in_words}",
+        f"a {protocol.piece}, of which the first {protocol.skip_seconds:g} s are not scored, for anyone.{protocol.start_in_words}",
         f"Preprocessing, as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz on measurements and reference; "
-        "both look "
-        "ahead. KPIs are against the low-passed reference, whatever the estimator saw.",
+        "both look ahead. KPIs are against the low-passed reference, whatever the estimator saw.",
         "KPIs: MSE over all samples; MSE_nl over those with |ay| ≥ 4 m/s²; ME and ME_nl are the largest absolute error of each manoeuvre, "
         "averaged over manoeuvres.",
         "Ours: the median over seeds, and in brackets the lowest and the highest seed. Figures that show one seed show the one with the "
@@ -146,7 +182,7 @@ def _how_it_was_made(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefac
     return [
         "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines),
         Table("data", "What was used for what.", rows, columns | {"test": Column("test")}),
-        "## What departs from the paper\n\n" + "\n".join(f"- {line}" for line in DEPARTURES),
+        "## What departs from the paper\n\n" + "\n".join(f"- {line}" for line in departures(parts)),
     ]
 
 
@@ -174,7 +210,10 @@ def _set(name: str, artefacts: PartsArtefacts, runs: Runs, prepared: Prepared, d
         runs, f"figure_{5 if name == FULL else 11}", 5 if name == FULL else 11, title.lower(), kind
     )
     data[f"errors_{name}"] = values
-    blocks += [figure, *distributions.groups(runs, f"groups_{name}", title.lower(), kind, 6 if name == FULL else None)]
+    blocks += [
+        figure,
+        *distributions.groups(runs, "figure_6" if name == FULL else "groups_limited", title.lower(), kind, 6 if name == FULL else None),
+    ]
     caption = (
         f"What hybrids' networks say, and what their filters make of it, {title.lower()}: medians of seeds, lowest and highest. σ_DD: "
         f"deviation of the network's angle as the filter takes it, median over samples. Data: {kind}."
@@ -183,10 +222,12 @@ def _set(name: str, artefacts: PartsArtefacts, runs: Runs, prepared: Prepared, d
     blocks += _traces(name, part, picked, prepared, kind)
     consistent = (
         f"What the paper does not report, {title.lower()}: MSE against the reference as it was measured, share of vy's errors within one "
-        "and "
-        f"two of the filter's own standard deviations, normalised innovations squared (1 for a consistent filter). Data: {kind}."
+        f"and two of the filter's own standard deviations, normalised innovations squared (1 for a consistent filter). Data: {kind}."
     )
-    blocks += [tables.consistency(part, runs, f"consistency_{name}", consistent), *reasons.why(name, runs, title, kind)]
+    blocks += [
+        tables.consistency(part, runs, f"consistency_{name}", consistent),
+        *reasons.why(name, runs, title, part.protocol.rate_hz, kind),
+    ]
     return blocks
 
 
@@ -194,26 +235,33 @@ def _traces(name: str, part: StudyArtefacts, picked: Mapping[str, Run], prepared
     warm_up = part.protocol.warm_up_seconds
     if name == LIMITED:
         turn = traces.manoeuvre_of(part, prepared, "J-turn")
-        what = "J-turn with the largest sideslip angle of the test, learnt on the limited set"
+        what = "J-turn with the largest sideslip angle of those in the test in which the car does not spin, learnt on the limited set"
         blocks: list[Block] = [traces.compared(picked, turn, "figure_12", 12, what, kind)]
         return [*blocks, traces.angles_of_networks(picked, prepared, warm_up, turn, "figure_13", 13, "The same J-turn, hybrids", kind)]
     slalom, spiral, lap = (traces.manoeuvre_of(part, prepared, group) for group in ("slalom", "spiral", "lap"))
-    model = picked[paper.MODEL]
+    deep = picked[paper.DEEP]
     return [
-        traces.compared(picked, slalom, "figure_7", 7, "Slalom with the largest sideslip angle of the test", kind),
-        traces.inner_life(picked, prepared, warm_up, slalom, "figure_8", 8, "The same slalom, hybrids", tables.process_levels(model), kind),
-        traces.compared(picked, spiral, "figure_9", 9, "Spiral with the largest sideslip angle of the test", kind),
+        traces.compared(picked, slalom, "figure_7", 7, "Slalom with the largest sideslip angle of those without a spin", kind),
+        traces.inner_life(picked, prepared, warm_up, slalom, "figure_8", 8, "The same slalom, hybrids", tables.process_levels(deep), kind),
+        traces.compared(picked, spiral, "figure_9", 9, "Spiral with the largest sideslip angle of those without a spin", kind),
         traces.lap(picked, prepared, warm_up, lap, kind),
     ]
 
 
 def _alone(runs: Mapping[str, Runs], kind: str) -> list[Block]:
-    caption = (
-        "The filters alone with tyres and noise identified on the limited set itself, beside those of the full set. Drives that stay "
-        "below 7 "
-        f"m/s² do not show how much grip there is. Data: {kind}."
-    )
-    return ["## Tyres from the limited set", tables.accuracy(runs[ALONE], paper.TABLES[LIMITED], "limited_alone", caption)]
+    """The filters with tyres of the full set and with tyres from the limited one."""
+    shown, found = {}, []
+    for candidate, own in runs[ALONE].items():
+        if LIMITED in runs and candidate in runs[LIMITED]:
+            shown[f"{candidate}, from the full set"] = runs[LIMITED][candidate]
+            found.append(
+                f"{candidate} {tables.frictions(runs[LIMITED], candidate)} from the full set, {tables.frictions(runs[ALONE], candidate)} "
+                "from the limited one"
+            )
+        shown[f"{candidate}, from the limited set"] = own
+    caption = f"The filters alone, tyres and noise identified on the full set and on the limited one. Data: {kind}."
+    words = f"Friction of the front and the rear tyres: {'; '.join(found)}." if found else ""
+    return ["## Tyres from the limited set", tables.accuracy(shown, {}, "limited_alone", caption), *([words] if words else [])]
 
 
 def _robustness(runs: Runs, prepared: Prepared, kind: str, data: dict[str, pd.DataFrame]) -> list[Block]:
@@ -230,10 +278,8 @@ def _robustness(runs: Runs, prepared: Prepared, kind: str, data: dict[str, pd.Da
 def _causal(runs: Mapping[str, Runs], kind: str) -> list[Block]:
     caption = (
         f"Cost of a preprocessing that a car can have: a second-order Butterworth low-pass of {CUTOFF_HZ:g} Hz, run forward, without "
-        "removal "
-        "of outliers, in training, identification and use, beside the paper's, which looks ahead. Both against the same reference, "
-        "low-passed "
-        f"at zero phase. Offline: all seeds; causal: as many as its table of budget says. Data: {kind}."
+        "removal of outliers, in training, identification and use, beside the paper's, which looks ahead. Both against the same "
+        f"reference, low-passed at zero phase. Ratios are of the same seeds. Data: {kind}."
     )
     return ["## What causal preprocessing costs", tables.causal_cost(runs[FULL], runs[CAUSAL], "causal", caption)]
 
@@ -241,14 +287,11 @@ def _causal(runs: Mapping[str, Runs], kind: str) -> list[Block]:
 def _ferrari(part: StudyArtefacts, title: str) -> list[Block]:
     kind = words_of_kinds(part).upper()
     caption = (
-        f"{title}: all four methods without tyre forces (`inputs=imu`, at 100 Hz, no preprocessing), tyres identified on the training "
-        "range, "
-        f"beside the other families, read at {part.protocol.rate_hz:g} Hz. Learnt on {spans_in_words(part.split.train)}, stopped on "
-        f"{spans_in_words(part.split.validation)}, tested on {spans_in_words(part.split.tests[TEST])}; medians of seeds, lowest and "
-        "highest. "
-        f"Data: {kind}."
+        f"{title}: the paper's methods as their titles say, beside the other families, read at {part.protocol.rate_hz:g} Hz. Learnt on "
+        f"{spans_in_words(part.split.train)}, stopped on {spans_in_words(part.split.validation)}, tested on "
+        f"{spans_in_words(part.split.tests[TEST])}; medians of seeds, lowest and highest. Data: {kind}."
     )
-    return ["## Another car, without tyre forces", tables.another_car(part, "ferrari", caption)]
+    return ["## Another car, without tyre forces", tables.another_car_table(part, "ferrari", caption)]
 
 
 def _filters_and_budget(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefacts], runs: Mapping[str, Runs]) -> list[Block]:
@@ -256,21 +299,32 @@ def _filters_and_budget(artefacts: PartsArtefacts, parts: Mapping[str, StudyArte
     blocks: list[Block] = ["## Filters and budget"]
     if LIMITED in runs:
         blocks.append(tables.given_as_found(runs[FULL], runs[LIMITED]))
-    vy, yaw_rate = paper.LEVELS
+    total = sum(float(table["value"].sum()) for table in (_seconds(part) for part in artefacts.parts.values()))
+    kind = words_of_kinds(parts[FULL]).upper()
     blocks += [
         tables.filters(
             titled,
             "filters",
-            f"Tyres and levels of noise of all filters. The paper's σ_Vy and σ_ψ̇ of a step are {vy:g} m/s and {yaw_rate:g} rad/s; its "
-            "tyres are not "
-            f"given. A hybrid whose network says the process noise uses its levels in pre-training only.",
+            "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that says the process noise takes the "
+            f"filter's for its start alone. Data: {kind}.",
         ),
-        tables.scaling(titled, "scaling", "Scaling of the ensemble's variance (Eq. 11), tuned on validation manoeuvres."),
+        tables.scaling(
+            titled,
+            "scaling",
+            "Scaling of the ensemble's variance (Eq. 11), tuned on validation manoeuvres; ours is in rad², the paper's unit is not known. "
+            f"Data: {kind}.",
+        ),
         tables.budget(
             {name: (artefacts.titles[name], part, runs[name]) for name, part in parts.items()},
             "budget",
-            "What was spent: seeds, epochs and time, on the machine that `provenance.json` names; medians of seeds. An online step is one "
-            "sample through `step()`.",
+            "What was spent: seeds, epochs and time of one core, on the machine that `provenance.json` names; medians of seeds. An online "
+            f"step is one sample through `step()`. Data: {kind}.",
         ),
+        f"All trainings of all parts together: {fixed(total / 3600.0, 1)} h of one core, beside simulation, evaluation and this report.",
     ]
     return blocks
+
+
+def _seconds(part: StudyArtefacts) -> pd.DataFrame:
+    """Times of all trainings of a part [s], one row each."""
+    return part.metrics[(part.metrics["metric"] == "train_seconds") & (part.metrics["test_set"] == TEST)]

@@ -52,8 +52,21 @@ TABLES: Mapping[str, Mapping[str, Published]] = {"full": TABLE_II, "limited": TA
 SCALING: Mapping[str, tuple[float, float]] = {"full": (-4.2690, 0.7901), "limited": (-1.4353, 1.465)}
 """Part -> p₁ and p₂ of Eq. 11."""
 
-LEVELS = (7e-4, 2e-3)
-"""[m/s, rad/s] deviations of a step, tuned for the model-based approach (Section III-C)."""
+LEVELS: Mapping[str, float] = {
+    "process_vy": 7e-4,
+    "process_yaw_rate": 2e-3,
+    "ay": 0.033,
+    "yaw_rate": 0.001,
+    "fy_front": 26.0,
+    "fy_rear": 56.0,
+}
+"""Deviations of a step's process noise [m/s, rad/s] and of the sensors [m/s², rad/s, N, N] (Sections III-B and III-C)."""
+
+MEMBER_EPOCHS = 30
+"""Epochs of each network of the ensemble (Section IV-C)."""
+
+BATCH = 256
+"""Of both phases of the CNN-UKF's training (Section III-C)."""
 
 STIFFNESS_STEP = 0.1
 """By which share both axles' cornering stiffnesses are off in Fig. 14."""

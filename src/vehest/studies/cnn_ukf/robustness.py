@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
@@ -14,19 +14,18 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS
-from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.manoeuvres import kpis, manoeuvres_of
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.cnn_ukf import paper
-from vehest.studies.cnn_ukf.subjects import LINES, TEST, Prepared, Run
+from vehest.studies.cnn_ukf.subjects import LINES, TEST, Prepared, Runs, filter_of
 from vehest.studies.reading import median_and_range
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
 COMBINATIONS = tuple(itertools.product(STEPS, STEPS))
 """Shares by which the front and the rear axle's cornering stiffness are off."""
+NOMINAL = COMBINATIONS.index((0.0, 0.0))
 
 WITHOUT_FILTER = (paper.DATA,)
 
@@ -38,14 +37,14 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
         DataError: it has none.
     """
     changed = copy.deepcopy(fitted)
-    of_filter = changed.model if isinstance(changed, NetworkUkf) else changed
-    if not isinstance(of_filter, DugoffUkf):
+    of_filter = filter_of(changed)
+    if of_filter is None:
         raise DataError(f"estimator '{fitted.name}' has no cornering stiffness")
     of_filter.tyres[[0, len(DUGOFF_PARAMETERS)]] *= 1.0 + np.array([front, rear])
     return changed
 
 
-def errors(runs: Mapping[str, Sequence[Run]], prepared: Prepared) -> pd.DataFrame:
+def errors(runs: Runs, prepared: Prepared) -> pd.DataFrame:
     """MSE and MSE_nl of every run with every combination; a network alone has the same with all.
 
     Returns:
@@ -85,26 +84,32 @@ def figure_14(table: pd.DataFrame, data: str) -> Figure:
                 axes.fill_between(at, low, high, color=line.colour, alpha=0.15, linewidth=0)
                 axes.plot(at, middle, color=line.colour, linestyle=line.dash, marker=line.marker, label=candidate)
             axes.set_xticks(range(len(labels)), labels)
-            axes.set_xlabel("change of the front axle's stiffness (above) and of the rear's [%]")
+            axes.set_xlabel("front (above) and rear stiffness off by [%]")
             axes.set_ylabel(label)
             axes.set_ylim(bottom=0.0)
         legend_above(figure, panels[0], columns=5)
     caption = (
-        f"Errors of the test where both axles' cornering stiffnesses in the filters are off by 10 % (Figure 14 of the paper): medians of "
+        "Errors of the test where both axles' cornering stiffnesses in the filters are off by 10 % (Figure 14 of the paper): medians of "
         f"seeds, bands from the lowest to the highest. Nothing is trained again. Data: {data}."
     )
     return Figure("figure_14", caption, figure)
 
 
 def sensitivity_table(table: pd.DataFrame, data: str) -> Table:
-    """The spread over the combinations: how much a method depends on its tyres."""
+    """How far errors move over the combinations: as identified, best, worst, and the worst one.
+
+    Args:
+        table: from `errors`.
+        data: real or simulated.
+    """
     rows = []
     for candidate in dict.fromkeys(table["candidate"]):
         row: dict[str, object] = {"candidate": candidate}
         for column in ("mse", "mse_nonlinear"):
             seeds = _by_combination(table, candidate, column)
-            nominal = seeds[COMBINATIONS.index((0.0, 0.0))]
+            nominal = seeds[NOMINAL]
             row |= {f"{column}_nominal": median_and_range(nominal, 3), f"{column}_worst": median_and_range(seeds.max(axis=0), 3)}
+            row[f"{column}_range"] = float(np.median(np.ptp(seeds, axis=0)))
             row[f"{column}_ratio"] = float(np.median(seeds.max(axis=0) / nominal))
             worst = int(np.median(seeds, axis=1).argmax())
             row[f"{column}_where"] = " / ".join(f"{100 * share:+.0f} %" for share in COMBINATIONS[worst])
@@ -115,27 +120,30 @@ def sensitivity_table(table: pd.DataFrame, data: str) -> Table:
             f"{column}_nominal": Column(f"{header}, as identified [deg²]"),
             f"{column}_worst": Column("worst combination [deg²]"),
             f"{column}_where": Column("which, front / rear"),
-            f"{column}_ratio": Column("worst over nominal", decimals=2),
+            f"{column}_range": Column("worst - best [deg²]", decimals=3),
+            f"{column}_ratio": Column("worst over as identified", decimals=2),
         }
-    caption = f"How much errors grow where cornering stiffnesses are off: medians of seeds, lowest and highest. Data: {data}."
+    caption = f"How errors move where cornering stiffnesses are off: medians of seeds, lowest and highest. Data: {data}."
     return Table("sensitivity", caption, pd.DataFrame(rows), columns)
 
 
 def in_words(table: pd.DataFrame) -> str:
-    """Whether hybrids depend on the tyres less than the model does, and DE-UKF less than CNN-UKF, as in the paper."""
-    ratio = {}
-    for candidate in dict.fromkeys(table["candidate"]):
-        seeds = _by_combination(table, candidate, "mse")
-        ratio[candidate] = float(np.median(seeds.max(axis=0) / seeds[COMBINATIONS.index((0.0, 0.0))]))
-    shown = ", ".join(f"{candidate} {fixed(value, 2)}" for candidate, value in ratio.items() if candidate not in WITHOUT_FILTER)
-    words = f"Worst MSE over nominal MSE: {shown} (medians of seeds). "
-    if not {paper.MODEL, paper.DEEP, paper.CNN} <= set(ratio):
-        return words
-    less = [name for name in (paper.DEEP, paper.CNN) if ratio[name] < ratio[paper.MODEL]]
-    here = "both do" if len(less) == 2 else f"only {less[0]} does" if less else "neither does"
-    least = paper.DEEP if ratio[paper.DEEP] < ratio[paper.CNN] else paper.CNN
-    words += f"The paper's hybrids depend on the tyres less than its model does, and DE-UKF least. Here {here}, and of the two "
-    return words + f"{least} depends on them less."
+    """Whether hybrids depend on the tyres less than the model does, and CNN-UKF stays below DE-UKF, as in the paper."""
+    names = [name for name in (paper.MODEL, paper.SMOOTH, paper.DEEP, paper.CNN) if name in set(table["candidate"])]
+    sentences = []
+    for column, header in (("mse", "MSE"), ("mse_nonlinear", "MSE_nl")):
+        found = {name: _by_combination(table, name, column) for name in names}
+        shown = ", ".join(
+            f"{name} {fixed(float(np.median(np.ptp(own, axis=0))), 3)} deg² ({fixed(float(np.median(own.max(axis=0) / own[NOMINAL])), 2)})"
+            for name, own in found.items()
+        )
+        sentences.append(f"Worst less best {header} over the nine combinations, and worst over that as identified in brackets: {shown}.")
+        if paper.DEEP in found and paper.CNN in found:
+            below = int((np.median(found[paper.CNN], axis=1) < np.median(found[paper.DEEP], axis=1)).sum())
+            known = "all" if column == "mse_nonlinear" else "all but that with both axles 10 % stiffer"
+            sentences.append(f"CNN-UKF lies below DE-UKF in {below} of {len(COMBINATIONS)} combinations (paper: in {known}).")
+    words = " ".join(sentences)
+    return f"The paper's hybrids depend on the tyres less than its model does, its DE-UKF least. Here, medians of seeds: {words}"
 
 
 def _by_combination(table: pd.DataFrame, candidate: str, column: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

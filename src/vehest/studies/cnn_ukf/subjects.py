@@ -15,6 +15,9 @@ from vehest.data.recording import FloatArray, Recording
 from vehest.data.splits import VALIDATION, Span
 from vehest.data.store import read_recording
 from vehest.data.transforms import LowPass, RemoveOutliers
+from vehest.estimators.base import Estimator
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.manoeuvres import Kpis, is_nonlinear, kpis, manoeuvres_of, sideslip_error
 from vehest.evaluation.metrics import Scored, score_all
 from vehest.evaluation.significance import sequence_labels
@@ -31,14 +34,14 @@ LINES = {
     paper.MODEL: Line("#0b4f9c", "dashed", "s"),
     paper.SMOOTH: Line("#4aa5e0", "dotted", "P"),
     paper.DATA: Line("#b8480b", "dashdot", "o"),
-    paper.DEEP: Line("#00876c", "dotted", "D"),
+    paper.DEEP: Line("#00876c", "solid", "D"),
     paper.CNN: Line("#d6336c", "solid", "^"),
 }
 KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
 
 Manoeuvres = Mapping[str, Sequence[Scored]]
-"""Recording -> what was scored of it."""
+"""Recording -> what was scored of it: one range."""
 
 _NAMES = {
     ("dugoff_ukf", False): paper.MODEL,
@@ -71,21 +74,41 @@ class Run:
         return kpis(self.test)
 
 
+Runs = Mapping[str, Sequence[Run]]
+"""Candidate -> its seeds."""
+
+
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model; its own title if it has none like it."""
-    return _NAMES.get((model.estimator, model.variant.endswith("_smooth")), model.title)
+    """What the paper calls a model.
+
+    Raises:
+        DataError: it has none like it.
+    """
+    name = model.estimator, model.variant.endswith("_smooth")
+    if name not in _NAMES:
+        raise DataError(f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study")
+    return _NAMES[name]
+
+
+def filter_of(fitted: Estimator) -> DugoffUkf | None:
+    """The filter of a fitted method; none if it has none."""
+    of_filter = fitted.model if isinstance(fitted, NetworkUkf) else fitted
+    return of_filter if isinstance(of_filter, DugoffUkf) else None
 
 
 def runs_of(part: StudyArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its seeds, in the order of Table II; others come last.
+    """Candidate -> its seeds, in the order of Table II.
 
     Args:
         part: of the study.
         prepared: its recordings.
 
     Raises:
-        DataError: two models of one candidate have the same seed.
+        DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
     """
+    recordings = [span.recording for span in prepared.spans(TEST)]
+    if len(set(recordings)) != len(recordings):
+        raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")
     groups: dict[str, list[Run]] = {}
     for model in part.models:
         validation, test = (manoeuvres_of(prepared.spans(name), prepared.scored(model, name)) for name in (VALIDATION, TEST))
@@ -93,8 +116,7 @@ def runs_of(part: StudyArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     for name, runs in groups.items():
         if len({run.model.seed for run in runs}) != len(runs):
             raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
-    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in order}
+    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in paper.CANDIDATES if name in groups}
 
 
 def chosen(runs: Sequence[Run]) -> Run:
@@ -102,7 +124,7 @@ def chosen(runs: Sequence[Run]) -> Run:
     return min(runs, key=lambda run: kpis(run.validation).mse)
 
 
-def losses(runs: Mapping[str, Sequence[Run]], *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
+def losses(runs: Runs, *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
     """Squared errors of the test [deg²] of every seed at every sample that counts, and the manoeuvre that each sample belongs to.
 
     Returns:
@@ -123,7 +145,7 @@ def losses(runs: Mapping[str, Sequence[Run]], *, nonlinear_only: bool = False) -
     return table, sequence_labels(lengths)
 
 
-def kpi_table(runs: Mapping[str, Sequence[Run]]) -> pd.DataFrame:
+def kpi_table(runs: Runs) -> pd.DataFrame:
     """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse``; a row a run."""
     rows = [
         {"candidate": candidate, "seed": run.model.seed}
@@ -168,6 +190,10 @@ class Prepared:
             .without_references()
             for span in self.spans(test)
         ]
+
+    def learnt(self) -> list[Recording]:
+        """The ranges of the training, references included."""
+        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.train]
 
     def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
         """Estimates of a model and prepared references, range by range."""

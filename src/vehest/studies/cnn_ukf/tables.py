@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,21 +12,30 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.data.recording import FloatArray
 from vehest.data.splits import VALIDATION
-from vehest.estimators.dugoff_ukf import LEVELS, TYRES, DugoffUkf
+from vehest.estimators.dugoff_ukf import LEVELS, TYRES
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.consistency import COVERAGE
-from vehest.evaluation.manoeuvres import is_nonlinear
+from vehest.evaluation.manoeuvres import is_nonlinear, sideslip_error
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.cnn_ukf import paper
-from vehest.studies.cnn_ukf.subjects import KPIS, TEST, Prepared, Run
+from vehest.studies.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, chosen, filter_of
 from vehest.studies.cnn_ukf.traces import HYBRIDS, words_of
 from vehest.studies.reading import median_and_range, metric_values
 
-Runs = Mapping[str, Sequence[Run]]
+SAME = 0.01  # difference up to which given tyres and levels are those that were found
+PROCESS = ("process_vy", "process_yaw_rate")
+LEVEL_HEADERS = {
+    "process_vy": "σ_Vy [m/s]",
+    "process_yaw_rate": "σ_ψ̇ [rad/s]",
+    "ay": "σ_ay [m/s²]",
+    "yaw_rate": "σ of the gyroscope [rad/s]",
+    "fy_front": "σ_Fyf [N]",
+    "fy_rear": "σ_Fyr [N]",
+    "force_factor": "factor of forces, linear",
+}
 
 
 def kpi_values(runs: Runs, candidate: str, name: str) -> FloatArray:
@@ -83,25 +93,35 @@ def networks_alone(runs: Runs, prepared: Prepared, name: str, caption: str) -> T
     for candidate in (candidate for candidate in HYBRIDS if candidate in runs):
         found: dict[str, list[float]] = {}
         for run in runs[candidate]:
-            squares, variances, beyond = [], [], []
+            squares, variances, beyond, processes = [], [], [], []
             for drive, span, word in zip(drives, spans, words_of(run, drives), strict=True):
                 (part,) = run.test[span.recording]
                 at = np.rint((part.time - drive.start_time) * drive.rate_hz).astype(np.int64)
-                said = np.degrees(word.sideslip[at] - part.sideslip_ref)
-                squares.append(np.square(said))
+                squares.append(np.square(sideslip_error(replace(part, sideslip=word.sideslip[at]))))
                 variances.append(np.degrees(np.degrees(word.variance[at])))
                 beyond.append(is_nonlinear(part))
+                if word.process is not None:
+                    processes.append(np.sqrt(word.process[at]))
             square, variance, nonlinear = (np.concatenate(pieces) for pieces in (squares, variances, beyond))
-            of_run = {"mse": float(square.mean()), "mse_nonlinear": float(square[nonlinear].mean())}
+            of_run = {
+                "train_mse": _training_error(run, prepared),
+                "mse": float(square.mean()),
+                "mse_nonlinear": float(square[nonlinear].mean()),
+            }
             of_run |= {"filter_mse": run.kpis.mse, "filter_mse_nonlinear": run.kpis.mse_nonlinear}
             of_run |= {"linear_sigma": float(np.sqrt(np.median(variance[~nonlinear])))}
             of_run |= {"nonlinear_sigma": float(np.sqrt(np.median(variance[nonlinear])))}
+            for place, level in enumerate(PROCESS):
+                process = np.concatenate(processes)[:, place] if processes else np.full(len(nonlinear), math.nan)
+                of_run |= {f"linear_{level}": float(np.median(process[~nonlinear]))}
+                of_run |= {f"nonlinear_{level}": float(np.median(process[nonlinear]))}
             for key, value in of_run.items():
                 found.setdefault(key, []).append(value)
-        shown = {key: median_and_range(np.array(values), 3) for key, values in found.items()}
+        shown = {key: median_and_range(np.array(values), 5 if key.endswith("process_vy") else 3) for key, values in found.items()}
         rows.append({"candidate": candidate, **shown, **{f"median_{key}": float(np.median(values)) for key, values in found.items()}})
     columns = {
         "candidate": Column("method"),
+        "train_mse": Column("MSE, network, training manoeuvres [deg²]"),
         "mse": Column("MSE, network [deg²]"),
         "filter_mse": Column("MSE, filter [deg²]"),
         "mse_nonlinear": Column("MSE_nl, network [deg²]"),
@@ -109,38 +129,50 @@ def networks_alone(runs: Runs, prepared: Prepared, name: str, caption: str) -> T
         "linear_sigma": Column("σ_DD below 4 m/s² [deg]"),
         "nonlinear_sigma": Column("σ_DD from 4 m/s² on [deg]"),
     }
+    for level in PROCESS:
+        columns |= {f"linear_{level}": Column(f"{LEVEL_HEADERS[level]}, below"), f"nonlinear_{level}": Column("from 4 m/s² on")}
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
+def _training_error(run: Run, prepared: Prepared) -> float:
+    """Mean squared error of what the network says of the manoeuvres it was trained on [deg²]."""
+    drives = prepared.learnt()
+    squares = [
+        np.square(np.degrees(word.sideslip - np.arctan2(drive["vy_ref"], drive["vx"])))
+        for drive, word in zip(drives, words_of(run, drives), strict=True)
+    ]
+    return float(np.concatenate(squares).mean())
+
+
 def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row.
+    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives.
 
     Args:
         parts: name -> title and runs.
         name: of the file.
         caption: of the table.
     """
-    rows = []
+    rows: list[dict[str, object]] = [
+        {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}
+    ]
     for title, runs in parts.values():
         for candidate, own in runs.items():
             for run in own:
-                fitted = load_model(run.model.model_folder)
-                of_filter = fitted.model if isinstance(fitted, NetworkUkf) else fitted
-                if not isinstance(of_filter, DugoffUkf):
-                    continue
-                row: dict[str, object] = {"part": title, "candidate": candidate, "seed": run.model.seed}
-                row |= dict(zip(TYRES, of_filter.tyres.tolist(), strict=True))
-                rows.append(row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS})
-    columns = {"part": Column("part"), "candidate": Column("method"), "seed": Column("seed")}
+                of_filter = filter_of(load_model(run.model.model_folder))
+                if of_filter is not None:
+                    row: dict[str, object] = {"part": title, "candidate": candidate, "seed": run.model.seed}
+                    row |= dict(zip(TYRES, of_filter.tyres.tolist(), strict=True))
+                    rows.append(row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS})
+    for row in rows:
+        row |= {f"shown_{level}": significant(float(row[level])) for level in LEVELS}  # type: ignore[arg-type]
+    columns = {"part": Column("part"), "candidate": Column("method"), "seed": Column("seed", decimals=0)}
     for axle in ("front", "rear"):
         columns |= {
             f"cornering_stiffness_{axle}": Column(f"C, {axle} [N/rad]", decimals=0),
             f"friction_{axle}": Column(f"μ₀, {axle}", decimals=3),
             f"reduction_{axle}": Column(f"e_r, {axle} [s/m]", decimals=4),
         }
-    columns["process_vy"] = Column("σ_Vy [m/s]", each=True)
-    columns["process_yaw_rate"] = Column("σ_ψ̇ [rad/s]", each=True)
-    columns["force_factor"] = Column("factor of forces, linear", each=True)
+    columns |= {f"shown_{level}": Column(header) for level, header in LEVEL_HEADERS.items()}
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
@@ -162,25 +194,40 @@ def scaling(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> T
 
 
 def causal_cost(offline: Runs, causal: Runs, name: str, caption: str) -> Table:
-    """Errors with the paper's preprocessing and with one that a car can have."""
+    """Errors with the paper's preprocessing and with one that a car can have; ratios of the same seeds.
+
+    Args:
+        offline: of the part with the paper's.
+        causal: of the other.
+        name: of the file.
+        caption: of the table.
+    """
     rows = []
     for candidate in (candidate for candidate in offline if candidate in causal):
-        row: dict[str, object] = {"candidate": candidate, "n_offline": len(offline[candidate]), "n_causal": len(causal[candidate])}
+        row: dict[str, object] = {"candidate": candidate, "seeds": f"{len(offline[candidate])}, {len(causal[candidate])}"}
+        by_seed = {run.model.seed: run for run in offline[candidate]}
         for kpi in KPIS:
-            before, after = kpi_values(offline, candidate, kpi), kpi_values(causal, candidate, kpi)
-            row |= {f"offline_{kpi}": median_and_range(before, 3), f"causal_{kpi}": median_and_range(after, 3)}
-            row[f"ratio_{kpi}"] = float(np.median(after) / np.median(before))
+            row |= {f"offline_{kpi}": median_and_range(kpi_values(offline, candidate, kpi), 3)}
+            row |= {f"causal_{kpi}": median_and_range(kpi_values(causal, candidate, kpi), 3)}
+            ratios = [
+                getattr(run.kpis, kpi) / getattr(by_seed[run.model.seed].kpis, kpi)
+                for run in causal[candidate]
+                if run.model.seed in by_seed
+            ]
+            row[f"ratio_{kpi}"] = float(np.median(ratios)) if ratios else math.nan
         rows.append(row)
-    columns = {"candidate": Column("method")}
+    columns = {"candidate": Column("method"), "seeds": Column("seeds, offline and causal")}
     for kpi, header in KPIS.items():
         columns |= {f"offline_{kpi}": Column(f"{header}, offline"), f"causal_{kpi}": Column("causal")}
-        if kpi.startswith("mse"):
-            columns[f"ratio_{kpi}"] = Column("ratio", decimals=2)
+        columns[f"ratio_{kpi}"] = Column("ratio", decimals=2)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def another_car(part: StudyArtefacts, name: str, caption: str) -> Table:
-    """RMSE(β) and what is left of the other figures, of every estimator on another car's test range."""
+def another_car(part: StudyArtefacts) -> pd.DataFrame:
+    """Errors of every estimator on another car's test range, best first.
+
+    Columns: title, median (of RMSE(β) over seeds [deg]), rmse, validation, nonlinear and largest (in words), n_seeds, train_seconds.
+    """
     known = metric_values(part)
     groups: dict[tuple[str, str], list[int]] = {}
     titles = {}
@@ -206,7 +253,11 @@ def another_car(part: StudyArtefacts, name: str, caption: str) -> Table:
                 "train_seconds": float(np.median(values(TEST, "train_seconds"))),
             }
         )
-    frame = pd.DataFrame(rows).sort_values("median", kind="stable", ignore_index=True)
+    return pd.DataFrame(rows).sort_values("median", kind="stable", ignore_index=True)
+
+
+def another_car_table(part: StudyArtefacts, name: str, caption: str) -> Table:
+    """`another_car` as it is shown."""
     columns = {
         "title": Column("estimator"),
         "rmse": Column("RMSE(β), test [deg]"),
@@ -216,7 +267,7 @@ def another_car(part: StudyArtefacts, name: str, caption: str) -> Table:
         "n_seeds": Column("seeds", decimals=0),
         "train_seconds": Column("fit [s]", digits=2),
     }
-    return Table(name, caption, frame, columns)
+    return Table(name, caption, another_car(part), columns)
 
 
 def budget(parts: Mapping[str, tuple[str, StudyArtefacts, Runs]], name: str, caption: str) -> Table:
@@ -249,6 +300,7 @@ def budget(parts: Mapping[str, tuple[str, StudyArtefacts, Runs]], name: str, cap
         "epochs": Column("epochs of each seed, best in brackets"),
         "identification": Column("of a training: the filter's identification [s]", decimals=0),
         "seconds": Column("training of a seed [s]", decimals=0),
+        "all_seconds": Column("of all seeds [s]", decimals=0),
         "lost": Column("lost sequences and skipped steps", decimals=0),
         "n_parameters": Column("parameters", decimals=0),
         "step_milliseconds": Column("online step [ms]", decimals=2),
@@ -270,33 +322,51 @@ def _epochs(runs: Sequence[Run]) -> str:
 
 
 def given_as_found(full: Runs, limited: Runs) -> str:
-    """Whether what the limited part was given is what the full one found, in the seed that validation chooses.
+    """Whether the limited part's filters are those that the full part found, in the seed that validation chooses.
+
+    Stiffness, friction and levels count by their relative difference, the reductions as they are.
 
     Raises:
-        DataError: a candidate of the limited part has no counterpart.
+        DataError: no filter of the limited part has a counterpart.
     """
-    worst, words = 0.0, []
-    for candidate in (paper.MODEL, paper.SMOOTH):
-        if candidate not in full or candidate not in limited:
+    worst, where, words = 0.0, "", []
+    for candidate, source in ((paper.MODEL,) * 2, (paper.SMOOTH,) * 2, (paper.DEEP, paper.MODEL), (paper.CNN, paper.SMOOTH)):
+        if candidate not in limited or source not in full:
             continue
-        best = min(full[candidate], key=lambda run: run.model.fit_metrics()["best_validation_loss"])
-        found, given = (load_model(run.model.model_folder) for run in (best, limited[candidate][0]))
-        assert isinstance(found, DugoffUkf)
-        assert isinstance(given, DugoffUkf)
-        pairs = [(found.tyres[place], given.tyres[place]) for place in range(len(TYRES)) if not TYRES[place].startswith("reduction")]
-        pairs += [(found.levels[level], given.levels[level]) for level in found.level_names]
-        worst = max(worst, *(abs(b / a - 1.0) for a, b in pairs))
-        words.append(f"{candidate}, seed {best.model.seed}")
+        best = chosen(full[source])
+        found = filter_of(load_model(best.model.model_folder))
+        for run in limited[candidate]:
+            given = filter_of(load_model(run.model.model_folder))
+            assert found is not None and given is not None  # noqa: PT018 - both are filters by their names
+            pairs = {name: (found.tyres[place], given.tyres[place]) for place, name in enumerate(TYRES)}
+            pairs |= {level: (found.levels[level], given.levels[level]) for level in found.level_names}
+            for name, (there, here) in pairs.items():
+                difference = abs(here - there) if name.startswith("reduction") else abs(here / there - 1.0)
+                if difference > worst:
+                    worst, where = difference, f"{name} of {candidate}"
+        words.append(f"{candidate}: {source}, seed {best.model.seed}")
     if not words:
         raise DataError("the limited part has no filter of the full one to compare")
-    return (
-        f"Filters of the limited part have the tyres and levels of noise that the full part found ({'; '.join(words)}), given in the "
-        f"pipeline to four digits or more; the largest difference is {significant(100.0 * worst, 2)} %."
-    )
+    shown = f"the largest difference is {significant(100.0 * worst, 2)} %{f' ({where})' if where else ''}"
+    if worst > SAME:
+        return f"**Filters of the limited part are not those that the full part finds now** ({'; '.join(words)}): {shown}. Write them anew."
+    return f"Filters of the limited part are those that the full part found ({'; '.join(words)}), rounded: {shown}."
 
 
 def process_levels(run: Run) -> FloatArray:
-    """Deviations of a step's process noise of a filter that has constant ones, (2,) [m/s, rad/s]."""
-    fitted = load_model(run.model.model_folder)
-    assert isinstance(fitted, DugoffUkf)
-    return np.array([fitted.levels["process_vy"], fitted.levels["process_yaw_rate"]])
+    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s].
+
+    Raises:
+        DataError: the run has no filter.
+    """
+    of_filter = filter_of(load_model(run.model.model_folder))
+    if of_filter is None:
+        raise DataError(f"'{run.candidate}' has no filter, and so no process noise")
+    return np.array([of_filter.levels[level] for level in PROCESS])
+
+
+def frictions(runs: Runs, candidate: str) -> str:
+    """Identified frictions of the first seed: ``1.17 / 1.15``, front and rear."""
+    of_filter = filter_of(load_model(runs[candidate][0].model.model_folder))
+    assert of_filter is not None
+    return " / ".join(fixed(of_filter.tyres[TYRES.index(f"friction_{axle}")], 2) for axle in ("front", "rear"))

@@ -143,10 +143,8 @@ def inner_life(
         legend_above(figure, grid[0, 0], columns=3)
     caption = (
         f"{what} (Figure {number} of the paper), `{span.recording}`: (a) sideslip angle of filter and network, (b) and (d) deviations of "
-        "the "
-        "process noise of a step, (c) deviation of the network's angle as the filter takes it for a measurement. DE-UKF's process noise "
-        "is "
-        f"constant. Data: {data}."
+        "the process noise of a step, (c) deviation of the network's angle as the filter takes it for a measurement. DE-UKF's process "
+        f"noise is constant. Data: {data}."
     )
     return Figure(name, caption, figure)
 
@@ -195,11 +193,11 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
         grid[2].set_xlabel("time [s]")
         for axes in grid:
             axes.margins(x=0.0)
-        legend_above(figure, grid[0], grid[1], columns=8)
+        legend_above(figure, grid[0], grid[1], columns=6)
     caption = (
-        f"Part of a lap (Figure 10 of the paper), the {LAP_SECONDS:g} s of `{span.recording}` with the largest mean |ay|: sideslip angle, "
-        f"accelerations (full and dashed: lateral and longitudinal), and the deviation of the networks' angle as filters take it. "
-        f"{_squares(runs, parts)} Data: {data}."
+        f"Part of a lap (Figure 10 of the paper), the {fixed(window[1] - window[0], 0)} s of `{span.recording}` with the largest mean "
+        "|ay|: sideslip angle, accelerations (full and dashed: lateral and longitudinal), and the deviation of the networks' angle as "
+        f"filters take it. {_squares(runs, parts)} Data: {data}."
     )
     return Figure("figure_10", caption, figure)
 
