@@ -289,12 +289,12 @@ def of_levels(**levels: float) -> dict[str, list[Run]]:
 def test_statements_say_what_came_out_whichever_way() -> None:
     as_paper = reasons.statements("full", of_levels(model=0.53, smooth=0.5, data=0.4, deep=0.4, cnn=0.34))
     assert "Here lowest of the four is CNN-UKF." in as_paper[0]
-    assert "paper: DE-UKF is level with Data-driven; here: is level with" in as_paper[1]
+    assert "there DE-UKF is level with Data-driven, here is level with" in as_paper[1]
     assert "Here in 1 of 1 (J-turn)" in as_paper[3]
     turned = reasons.statements("full", of_levels(model=0.2, smooth=0.1, data=0.4, deep=0.3, cnn=0.5))
-    assert "paper: CNN-UKF is 25 % below DE-UKF; here: is 178 % above). Here lowest of the four is Model-based." in turned[0]
+    assert "there CNN-UKF is 25 % below DE-UKF, here is 178 % above). Here lowest of the four is Model-based." in turned[0]
     assert "Here last of the four is CNN-UKF." in turned[2]
-    assert "paper: Data-driven is 29 % above Model-based" in reasons.statements("limited", of_levels(m=1.0, s=1.0, d=2.0, e=1.0, c=1.0))[0]
+    assert "there Data-driven is 29 % above Model-based" in reasons.statements("limited", of_levels(m=1.0, s=1.0, d=2.0, e=1.0, c=1.0))[0]
 
 
 def test_ratios_of_causal_preprocessing_are_of_the_same_seed() -> None:

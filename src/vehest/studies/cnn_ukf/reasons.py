@@ -60,19 +60,19 @@ def statements(name: str, runs: Runs) -> list[str]:
 
     def pair(first: str, second: str) -> str:
         there, here = (_beside(of[first], of[second]) for of in (known, ours))
-        return f"paper: {first} {there} {second}; here: {here}"
+        return f"there {first} {there} {second}, here {here}"
 
     if name == "full":
         lines = [
-            f"CNN-UKF lowest on MSE_nl ({pair(paper.CNN, paper.DEEP)}). Here lowest of the four is {order[0]}.",
-            f"DE-UKF and the data-driven method level ({pair(paper.DEEP, paper.DATA)}).",
-            f"The model last ({pair(paper.MODEL, paper.DATA)}). Here last of the four is {order[-1]}.",
+            f"Paper: CNN-UKF lowest on MSE_nl ({pair(paper.CNN, paper.DEEP)}). Here lowest of the four is {order[0]}.",
+            f"Paper: DE-UKF and the data-driven method level ({pair(paper.DEEP, paper.DATA)}).",
+            f"Paper: the model last ({pair(paper.MODEL, paper.DATA)}). Here last of the four is {order[-1]}.",
             _best_groups(runs),
         ]
     else:
         lines = [
-            f"The data-driven method last ({pair(paper.DATA, paper.MODEL)}). Here last of the four is {order[-1]}.",
-            f"The hybrids a hair below the model, which the paper calls not significant ({pair(paper.DEEP, paper.MODEL)}; "
+            f"Paper: the data-driven method last ({pair(paper.DATA, paper.MODEL)}). Here last of the four is {order[-1]}.",
+            f"Paper: the hybrids a hair below the model, which the paper calls not significant ({pair(paper.DEEP, paper.MODEL)}; "
             f"{pair(paper.CNN, paper.MODEL)}).",
         ]
     if paper.SMOOTH in ours:
@@ -93,7 +93,7 @@ def _end_to_end(runs: Sequence[Run]) -> str:
             best.append(np.degrees(np.degrees(history[history["phase"] == history["phase"].max()]["validation_loss"].min())))
     here = f"Here it lowers the filter's MSE on the validation manoeuvres in {lowered} of {len(runs)} seeds"
     found = f"kept are networks with {_range(kept)} deg², the best after an epoch of it have {_range(best)} deg²"
-    return f"End-to-end training lowers the error. {here}; {found}."
+    return f"Paper: end-to-end training lowers the error. {here}; {found}."
 
 
 def _range(values: Sequence[float]) -> str:
@@ -111,7 +111,7 @@ def _best_groups(runs: Runs) -> str:
     ]
     named = f" ({listed(best)})" if best else ""
     here = f"Here in {len(best)} of {len(groups)}{named}, by the median of seeds of MSE_nl."
-    return f"CNN-UKF best in five of seven groups of manoeuvres. {here}"
+    return f"Paper: CNN-UKF best in five of seven groups of manoeuvres. {here}"
 
 
 def _beside(value: float, other: float) -> str:
