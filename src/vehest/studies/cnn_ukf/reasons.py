@@ -77,8 +77,7 @@ def statements(name: str, runs: Runs) -> list[str]:
         ]
     if paper.SMOOTH in ours:
         lines.append(f"Not in the paper: CNN-UKF {_beside(ours[paper.CNN], ours[paper.SMOOTH])} its own filter without the network.")
-    if name == "full":
-        lines.append(_end_to_end(runs[paper.CNN]))
+    lines.append(_end_to_end(runs[paper.CNN]))
     return [*lines, "All of medians of seeds; which differences are more than chance, the tables of differences say."]
 
 
