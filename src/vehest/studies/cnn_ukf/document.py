@@ -157,8 +157,8 @@ def _how_it_was_made(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefac
         f"Command: `{artefacts.command}`, with Optuna installed",
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; estimators may start up to {protocol.warm_up_seconds:g} s before "
         f"a {protocol.piece}, of which the first {protocol.skip_seconds:g} s are not scored, for anyone.{protocol.start_in_words}",
-        f"Preprocessing, as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz on measurements and reference; "
-        "both look ahead. KPIs are against the low-passed reference, whatever the estimator saw.",
+        f"Preprocessing of the full and the limited set, as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz "
+        "on measurements and reference; both look ahead. KPIs are against the low-passed reference, whatever the estimator saw.",
         "KPIs: MSE over all samples; MSE_nl over those with |ay| ≥ 4 m/s²; ME and ME_nl are the largest absolute error of each manoeuvre, "
         "averaged over manoeuvres.",
         "Ours: the median over seeds, and in brackets the lowest and the highest seed. Figures that show one seed show the one with the "
@@ -218,7 +218,8 @@ def _set(name: str, artefacts: PartsArtefacts, runs: Runs, prepared: Prepared, d
         f"What hybrids' networks say, and what their filters make of it, {title.lower()}: medians of seeds, lowest and highest. σ_DD: "
         f"deviation of the network's angle as the filter takes it, median over samples. Data: {kind}."
     )
-    blocks += [tables.networks_alone(runs, prepared, f"networks_{name}", caption)]
+    networks = tables.networks_alone(runs, prepared, f"networks_{name}", caption)
+    blocks += [networks, *([tables.trust_in_words(networks.frame)] if len(networks.frame) else [])]
     blocks += _traces(name, part, picked, prepared, kind)
     consistent = (
         f"What the paper does not report, {title.lower()}: MSE against the reference as it was measured, share of vy's errors within one "

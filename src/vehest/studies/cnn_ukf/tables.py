@@ -134,6 +134,20 @@ def networks_alone(runs: Runs, prepared: Prepared, name: str, caption: str) -> T
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
+def trust_in_words(networks: pd.DataFrame) -> str:
+    """How far networks are off where the car is non-linear, and how far filters take them to be off.
+
+    Args:
+        networks: of `networks_alone`.
+    """
+    shown = [
+        f"{row['candidate']}'s networks err by {fixed(math.sqrt(row['median_mse_nonlinear']), 2)}° (rms) and are taken to err by "
+        f"{fixed(row['median_nonlinear_sigma'], 2)}°"
+        for row in networks.to_dict("records")
+    ]
+    return f"From 4 m/s² on, {'; '.join(shown)}. Filters count each sample's error as if it had nothing to do with the one before."
+
+
 def _training_error(run: Run, prepared: Prepared) -> float:
     """Mean squared error of what the network says of the manoeuvres it was trained on [deg²]."""
     drives = prepared.learnt()
