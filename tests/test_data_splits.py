@@ -159,7 +159,7 @@ def test_every_split_that_is_shipped_is_one(file: Path) -> None:
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
         names = open_source(about).ids() if about["source"] == "simulated" else ["some"]
         speed = np.full(200, 20.0)
-        ten_seconds = {"ay": np.full(200, 3.0), "vx": speed, "vx_ref": speed, "yaw_rate": np.full(200, 0.15)}
+        ten_seconds = {"ay": np.full(200, 3.0), "vx": speed, "vx_ref": speed, "yaw_rate": np.full(200, 0.15), "sideslip_ref": np.zeros(200)}
         return {name: Recording(name, "car", 20.0, 0.0, ten_seconds).select for name in names}
 
     config = yaml.safe_load(file.read_text(encoding="utf-8"))
