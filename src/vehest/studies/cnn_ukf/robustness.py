@@ -89,7 +89,7 @@ def figure_14(table: pd.DataFrame, data: str) -> Figure:
             axes.set_ylim(bottom=0.0)
         legend_above(figure, panels[0], columns=5)
     caption = (
-        "Errors of the test where both axles' cornering stiffnesses in the filters are off by 10 % (Figure 14 of the paper): medians of "
+        "Errors of the test where cornering stiffnesses of the axles in the filters are off by 10 % (Figure 14 of the paper): medians of "
         f"seeds, bands from the lowest to the highest. Nothing is trained again. Data: {data}."
     )
     return Figure("figure_14", caption, figure)

@@ -59,9 +59,7 @@ def words_of(run: Run, drives: Sequence[Recording]) -> list[Word]:
     return [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
 
 
-def compared(
-    runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str, window: tuple[float, float] | None = None
-) -> Figure:
+def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
     """Reference and all estimates of one manoeuvre.
 
     Args:
@@ -71,9 +69,8 @@ def compared(
         number: of the paper's figure.
         what: title of it.
         data: real or simulated.
-        window: times that are drawn [s]; all if None.
     """
-    parts = {candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()}
+    parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.9)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
