@@ -11,8 +11,11 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
+FUZZ ?= 3000
+KILLS ?= 100
+SEED ?= 0
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn
+.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -48,6 +51,12 @@ lint: $(INSTALLED)
 
 test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for the real recordings
 	$(BIN)/python -m pytest -m slow
+
+kills: $(INSTALLED) ## kill the quickstart 100 times (KILLS=100, SEED=0), every run after it must end in the same numbers; half an hour
+	$(BIN)/python tests/kills/kills.py --kills $(KILLS) --seed $(SEED)
+
+fuzz: $(INSTALLED) ## try 3,000 malformed inputs on the command line, a row each in results/reliability/fuzz.csv (FUZZ=3000, SEED=0; ten minutes)
+	PYTHONPATH=tests:tests/sources $(BIN)/python -m fuzz --inputs $(FUZZ) --seed $(SEED) --jobs $(JOBS) --out results/reliability/fuzz.csv
 
 ui: $(INSTALLED) ## look at all runs in MLflow
 	$(BIN)/mlflow ui --backend-store-uri "sqlite:///$$(realpath "$${VEHEST_OUTPUT:-outputs}")/mlflow.db"

@@ -62,7 +62,7 @@ def drives(seconds: float) -> list[Any]:
 def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
     """A network before its training, and its training through the filter."""
     from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
-    from vehest.estimators.sample_network import learnt_samples
+    from vehest.estimators.networks.sample_network import learnt_samples
 
     tyres = {f"{name}_{axle}": value for axle in ("front", "rear") for name, value in TYRES.items()}
     estimator = CnnUkf.from_config({"tyres": tyres, "noise": LEVELS, "dropout": dropout})
@@ -78,7 +78,7 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
 def plain(estimator: Any, training: Any, batch: Any) -> Any:
     """The loss as one would write it down: layers of torch, then a filter that loops over samples."""
     from vehest.estimators.cnn_ukf import START
-    from vehest.estimators.network_ukf import LEAST_VARIANCE
+    from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
 
     parameters = dict(estimator.network.named_parameters())
     hidden = batch.inputs
@@ -139,8 +139,7 @@ def stepped(loss: Callable[[], Any], network: Any) -> tuple[float, list[Any]]:
 def through_the_filter(recordings: list[Any]) -> list[dict[str, Any]]:
     """One step by both ways, and an epoch."""
     from vehest.training.context import FitContext
-    from vehest.training.sequences import Phase, train_phases
-    from vehest.training.settings import PhaseSettings
+    from vehest.training.sequences import Phase, PhaseSettings, train_phases
 
     estimator, training = end_to_end(recordings[: len(DRIVES)], 0.0)
     firsts = 300 + 200 * torch.arange(BATCH)
@@ -182,7 +181,7 @@ def through_the_filter(recordings: list[Any]) -> list[dict[str, Any]]:
 def ensemble(recordings: list[Any]) -> dict[str, Any]:
     """Steps of twenty networks together, one after another, and one after another in plain PyTorch."""
     from vehest.estimators.kernels.sample_network import gaussian_likelihood
-    from vehest.estimators.sample_network import INPUTS, SampleNetwork, learnt_samples
+    from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork, learnt_samples
     from vehest.training.samples import Draw
 
     raw = learnt_samples(recordings, INPUTS["full"], "benchmark")

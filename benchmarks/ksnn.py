@@ -54,7 +54,7 @@ def together(config: dict[str, Any]) -> Figures:
     from vehest.estimators.base import FitData
     from vehest.estimators.ksnn import Ksnn
     from vehest.training.context import FitContext
-    from vehest.training.settings import SupervisedSettings
+    from vehest.training.supervised import SupervisedSettings
 
     torch.set_num_threads(THREADS)
     train, validation = drives()

@@ -33,8 +33,8 @@ def plant_runs() -> tuple[float, float, float]:
     import numpy as np
     from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-    from vehest.simulation.parameters import library_parameters, vehicle_from_configuration
-    from vehest.simulation.plant import MultiBodyPlant
+    from vehest.simulation.plant.multi_body import MultiBodyPlant
+    from vehest.simulation.plant.parameters import library_parameters, vehicle_from_configuration
     from vehest.stages.config import compose_config
 
     config = compose_config("ingest", ["dataset=sim_small"])["dataset"]["vehicle"]

@@ -35,7 +35,7 @@ def one_epoch(structure: str, compiled: bool, members: int) -> tuple[float, floa
     from vehest.estimators.base import FitData
     from vehest.estimators.registry import estimator_class
     from vehest.training.context import FitContext
-    from vehest.training.settings import SupervisedSettings
+    from vehest.training.supervised import SupervisedSettings
 
     torch.set_num_threads(1)
     generator = np.random.default_rng(0)

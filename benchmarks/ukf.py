@@ -104,8 +104,7 @@ def pretrain(file: str) -> None:
     import torch
 
     from vehest.training.context import FitContext
-    from vehest.training.sequences import train_phases
-    from vehest.training.settings import PhaseSettings
+    from vehest.training.sequences import PhaseSettings, train_phases
     from vehest.training.through_filter import ThroughFilterSettings, Weights, one_step_phase
 
     torch.set_num_threads(1)

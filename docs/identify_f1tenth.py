@@ -2,7 +2,7 @@
 
     VEHEST_DATA=FOLDER python docs/identify_f1tenth.py
 
-conf/dataset/f1tenth_bag.yaml declares the constants, docs/sources/rosbag.md explains them, tests/test_sources_rosbag.py compares.
+conf/dataset/f1tenth_bag.yaml declares the constants, docs/sources/rosbag.md explains them, tests/sources/test_sources_rosbag.py compares.
 Of the declarations only names and layouts of topics are used here, so that nothing is confirmed by itself. Uncertainties are standard
 deviations over 200 resamples of the drive in blocks of half a second.
 """

@@ -42,11 +42,11 @@ def note_of(row: pd.Series, estimator: Estimator) -> str:
 
 def write(row: pd.Series, model: Path, target: Path = TARGET) -> None:
     """Copy a model with what the study says of it."""
-    estimator, trained = load_model(model), read_description(model)["about"]
+    estimator, trained = load_model(model), read_description(model).about
     about = {
-        "seed": trained["seed"],
-        "datasets": trained["datasets"],
-        "n_parameters": trained["n_parameters"],
+        "seed": trained.seed,
+        "datasets": list(trained.datasets),
+        "n_parameters": trained.n_parameters,
         "downsample": preparation_of(model),
         "study": "vehest run pipelines/sim_to_real.yaml",
         "step": str(row["part"]),

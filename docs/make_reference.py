@@ -101,10 +101,10 @@ def _manoeuvre(name: str, made: type[Any]) -> list[str]:
 
 def manoeuvres_page(root: Path) -> str:
     """Manoeuvres of the proving ground with their parameters, its courses, and its vehicles."""
-    from vehest.simulation import tracks
-    from vehest.simulation.course import course_by_name
-    from vehest.simulation.manoeuvres import MANOEUVRES
+    from vehest.simulation.driving.manoeuvres import MANOEUVRES
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
+    from vehest.simulation.road import tracks
+    from vehest.simulation.road.course import course_by_name
 
     parts = [
         "# Manoeuvres, courses and vehicles of the proving ground",
@@ -130,7 +130,7 @@ def manoeuvres_page(root: Path) -> str:
             ],
             right=3,
         ),
-        "Where their layouts come from: `vehest.simulation.tracks`.",
+        "Where their layouts come from: `vehest.simulation.road.tracks`.",
         "## Vehicles",
         "With the source of every value: [reference.md](reference.md#confvehicle).",
         _table(
@@ -162,7 +162,7 @@ def _sections(described: type) -> dict[str, str]:
 
 
 def _simulated_sensors() -> Iterable[str]:
-    from vehest.simulation.sensor_levels import PRESETS, REFERENCES, SensorLevels
+    from vehest.simulation.sensors.levels import PRESETS, REFERENCES, SensorLevels
 
     header = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
     references = (REFERENCES["gnss"], REFERENCES["optical"], REFERENCES["motion_capture"])
@@ -196,11 +196,12 @@ def _simulated_sensors() -> Iterable[str]:
     yield f"A race car of the sixties with good instruments, as in the Ferrari recording. {_mounting(PRESETS['race'].imu)}"
     yield _table(header, _sensor_rows(PRESETS["race"]))
     yield (
-        "Read off the recording by `read_off` of `vehest.simulation.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` and `steer` "
-        "(median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of `yaw_rate`, `ax` and "
-        "`ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is left below 0.5 Hz, of "
-        "the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a banked road is part of it). "
-        "How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are those of `default`."
+        "Read off the recording by `read_off` of `vehest.simulation.sensors.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` "
+        "and `steer` (median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of "
+        "`yaw_rate`, `ax` and `ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is "
+        "left below 0.5 Hz, of the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a "
+        "banked road is part of it). How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are "
+        "those of `default`."
     )
     yield "### `sensors: small_car`"
     vibration = PRESETS["small_car"].vibration
@@ -209,7 +210,7 @@ def _simulated_sensors() -> Iterable[str]:
     yield _table(header, _sensor_rows(PRESETS["small_car"]))
     yield (
         f"Its inertial unit shakes with the wheels: `vibration` adds white noise whose standard deviation is, per rad/s of the wheels' "
-        f"mean speed, {shaken}. These and what the comments in `vehest.simulation.sensor_levels` name are read off the recording that the "
+        f"mean speed, {shaken}. These and what the comments in `vehest.simulation.sensors.levels` name are read off the recording that the "
         "learned-dynamics UKF trains on; the rest is assumed."
     )
     yield "### `reference: gnss`, `reference: optical` and `reference: motion_capture`"
@@ -217,7 +218,7 @@ def _simulated_sensors() -> Iterable[str]:
         "Where `vx_ref`, `vy_ref`, `yaw_rate_ref` and `sideslip_ref` come from; `gnss` belongs to `default` and `race`, `motion_capture` "
         "to `small_car`. The sensor measures velocity where it sits, in axes turned by the error `heading` [rad], and moves it to the "
         "centre of gravity with its own yaw rate and a lever known to `lever_error`. The sources stand beside the numbers in "
-        "`vehest.simulation.sensor_levels`."
+        "`vehest.simulation.sensors.levels`."
     )
     yield _table(("reference", *header), [(f"`{r.kind}`", *row) for r in references for row in _sensor_rows(r)])
     rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in references]
@@ -226,7 +227,7 @@ def _simulated_sensors() -> Iterable[str]:
 
 def _sensor_rows(levels: Any) -> Iterable[tuple[str, ...]]:
     """A row for each sensor among the fields of a dataclass of levels."""
-    from vehest.simulation.sensor_levels import SensorLevel
+    from vehest.simulation.sensors.levels import SensorLevel
 
     for field in fields(levels):
         level = getattr(levels, field.name)
@@ -261,13 +262,25 @@ def with_leaderboard(readme: str, source: Path) -> str:
             row["title"],
             f"{float(row['n_parameters']):.0f}",
             f"{float(row['rmse_sideslip']):.3f}",
-            f"{float(row['rmse_sideslip_min']):.3f} … {float(row['rmse_sideslip_max']):.3f}" if int(row["n_seeds"]) > 1 else "–",
-            f"{float(row['rmse_vy']):.3f}",
+            row["interval"],
+            row["against_best"],
+            row["beats_zero"] or "–",
+            row["beats_static_map"] or "–",
             f"{float(row['fvu']):.3f}",
         )
         for row in rows
     ]
-    table = _table(("estimator", "parameters", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"), lines, right=5)
+    header = (
+        "estimator",
+        "parameters",
+        "RMSE(β) [deg]",
+        "95 % interval [deg]",
+        "to the lowest [deg]",
+        "beats v = 0",
+        "beats static map",
+        "FVU",
+    )
+    table = _table(header, lines, right=7)
     return _between(readme, BOARD_START, BOARD_END, table)
 
 

@@ -133,5 +133,6 @@ class Place:
         return code, lines[0]
 
     def files(self) -> set[str]:
-        """Every file in the output root."""
-        return {str(file) for file in (self.folder / "outputs").rglob("*") if file.is_file()}
+        """Every file in the output root but the locks, which stay where they are and are empty."""
+        outputs = self.folder / "outputs"
+        return {str(file) for file in outputs.rglob("*") if file.is_file() and outputs / "locks" not in file.parents}

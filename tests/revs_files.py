@@ -12,12 +12,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
-from numpy.typing import NDArray
 from scipy.io import savemat
 
+from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-
-FloatArray = NDArray[np.float64]
 
 CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
 PREAMBLE = (

@@ -6,7 +6,7 @@ import importlib.util
 import re
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ import yaml
 from scipy import signal
 
 import vehest
+from example_package import forget_examples, install_examples, write_laps
+from fuzz import case
+from vehest.alignment import checks
 from vehest.cli import app
-from vehest.data import checks
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
 from vehest.data.splits import split_from_config
 from vehest.data.transforms import TRANSFORMS, Resample
@@ -28,7 +30,7 @@ from vehest.evaluation.metrics import UNITS
 from vehest.sources.base import COMMON_KEYS, open_source, source_names
 from vehest.stages.config import compose_config, expand
 from vehest.stages.config_files import GROUPS, choices
-from vehest.stages.pipeline import KEYS, pipeline_configs, read_pipeline
+from vehest.stages.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
 from vehest.studies.artefacts import METRIC_COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -73,10 +75,12 @@ def test_generated_pages_are_up_to_date():
 
 def test_leaderboard_in_readme_follows_the_results(tmp_path):
     source = tmp_path / "leaderboard.csv"
-    columns = "title,n_parameters,rmse_sideslip,rmse_sideslip_min,rmse_sideslip_max,n_seeds,rmse_vy,fvu"
-    source.write_text(f'{columns}\n"KS-NN, small",12,0.12345,0.1,0.2,3,0.05,0.0123\nOther,2,0.5,,,1,0.1,0.2\n')
+    columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
+    rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
+    source.write_text(f"{columns}\n{rows}", encoding="utf-8")
     made = generator().with_leaderboard(page("README.md"), source)
-    assert "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | 0.050 | 0.012 |\n| Other | 2 | 0.500 | – | 0.100 | 0.200 |" in made
+    first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
+    assert f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |" in made
     assert made.count("<!-- end of leaderboard -->") == 1
 
 
@@ -136,7 +140,11 @@ def test_example_files_are_valid(workplace):
         assert pipeline_configs(read_pipeline(str(file)), [])
 
 
-def test_python_examples_run(workplace, drive):
+def test_python_examples_run(workplace, drive, monkeypatch, request):
+    monkeypatch.setattr(case, "GENERATORS", [])
+    request.addfinalizer(forget_examples)
+    install_examples(workplace / "site", monkeypatch)
+    write_laps()
     folder = workplace / "outputs" / "train" / "MODEL"
     folder.mkdir(parents=True)
     observer = estimator_class("luenberger").from_config({"rate_hz": 20})
@@ -148,7 +156,7 @@ def test_python_examples_run(workplace, drive):
     blocks = [block for file in PAGES for block in fences(file.read_text(encoding="utf-8"), "python")]
     assert len(blocks) >= 2
     for block in blocks:
-        exec(compile(block, "example", "exec"), {})
+        exec(compile(block, "example", "exec", dont_inherit=True), {"__name__": "example"})
     assert (workplace / "out.parquet").is_file()
 
 
@@ -238,14 +246,17 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
     given = taken_apart(line)
     if given is None:
         return
-    if given.command[0] in {"run", "report"}:
+    if given.command[0] == "report" and "--check" in line:
+        for name in (*given.arguments, *given.overrides):
+            assert PLACEHOLDER.search(name) or read_pipeline(name).publish
+    elif given.command[0] in {"run", "report"}:
         if not PLACEHOLDER.search(" ".join([*given.arguments, *given.overrides])):
             pipeline = read_pipeline(given.arguments[0])  # what composes without overrides is known from test_config
             assert not given.overrides or pipeline_configs(pipeline, given.overrides)
-        return
-    for root, overrides in overrides_of(given):
-        if not PLACEHOLDER.search(" ".join([root, *overrides])):
-            compose_config(root, overrides)
+    else:
+        for root, overrides in overrides_of(given):
+            if not PLACEHOLDER.search(" ".join([root, *overrides])):
+                compose_config(root, overrides)
 
 
 def test_make_targets_exist():
@@ -300,7 +311,7 @@ def test_pages_know_every_name():
     for name in {*estimator_names(), *UNITS}:
         assert f"`{name}`" in estimators, f"docs/estimators.md does not explain {name}"
     assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(estimators.split())
-    for name in {*KEYS, *GROUPS}:
+    for name in {*(field.name for kind in (PipelineFile, PartFile) for field in fields(kind)), *GROUPS}:
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 

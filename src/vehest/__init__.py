@@ -6,7 +6,18 @@ from typing import Any
 
 from vehest.version import __version__
 
-_API = ("Estimate", "Estimator", "Recording", "estimate", "load_model", "read_recording", "write_estimate")
+_API = (
+    "Estimate",
+    "Estimator",
+    "Recording",
+    "estimate",
+    "load_model",
+    "read_recording",
+    "save_model",
+    "score",
+    "train",
+    "write_estimate",
+)
 
 __all__ = ["__version__", *_API]
 

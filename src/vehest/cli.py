@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, VehestError
-from vehest.stages.completion import complete_override
-from vehest.stages.config_files import choices, is_simulated, pipeline_names, summary
+from vehest.data.errors import ConfigurationError, MissingError, VehestError, is_printable, printable
+from vehest.stages.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
 from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.stages.config import Config
-    from vehest.stages.sweep import SweepOutcome
+    from vehest.stages.finished import Finished
+    from vehest.stages.shown import Shown
     from vehest.stages.workshop import Workshop
 
 app = typer.Typer(
@@ -37,6 +39,8 @@ app = typer.Typer(
 data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
+ROOT_KEYS = ("root", "output", "seed", "rate_hz")
+LONGEST_LINE = 4_000
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
 
@@ -49,7 +53,11 @@ def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, 
     """Completion of a command's overrides."""
 
     def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
+        from vehest.stages.completion import complete_override
+
         given = [str(word) for word in context.params.get("overrides") or []]
+        if context.params.get("check"):
+            return [(name, "") for name in _complete_pipeline(incomplete)]
         own = str(context.params.get("command") or command)
         dataset = context.params.get("dataset")
         chosen = [f"dataset={dataset}"] if dataset else []
@@ -103,7 +111,7 @@ def _overrides(command: str) -> Any:
 @app.callback(invoke_without_command=True)
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False) -> None:
     if version:
-        typer.echo(f"vehest {__version__}")
+        _echo(f"vehest {__version__}")
         raise typer.Exit
 
 
@@ -228,6 +236,7 @@ def evaluate(
     from vehest.stages.estimate import find_model, preparation_of
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
     from vehest.stages.group import Evaluation
+    from vehest.stages.train import trained_rate
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
@@ -237,24 +246,21 @@ def evaluate(
             trained = read_artefact(find_model(model, workshop.output))
             if trained.stage != "train":
                 raise ConfigurationError(f"'{trained.folder}' holds no model but what the stage '{trained.stage}' made")
-            rate = float(trained.config["estimator"]["rate_hz"])
+            rate = trained_rate(trained)
             if not _names("downsample", overrides):
                 config["downsample"] = preparation_of(trained.folder)
         else:
             plan = _train_job(config, workshop).plan
             found, rate = find(plan), float(config["estimator"]["rate_hz"])
             if found is None:
-                from vehest.data.errors import MissingError
-
                 raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides or [])}' first")
             trained = found
         data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
         job = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
         artefact = workshop.ensure(job.plan, lambda folder: write_evaluation(job, folder))
         figures = test_figures(artefact)
-        if not artefact.skipped:
-            how = Evaluation(split, data, references, job.kinds, protocol, workshop.output)
-            workshop.log_evaluation(artefact, trained, how, figures)
+        how = Evaluation(split, data, references, job.kinds, protocol, workshop.output)
+        workshop.log_evaluation(artefact, trained, how)
     _say(as_json, {"folder": str(artefact.folder), "skipped": artefact.skipped, **figures})
 
 
@@ -286,6 +292,7 @@ def estimate(
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
+    from vehest.data.limits import limits_from_config, use_limits
     from vehest.estimators.model_files import load_model
     from vehest.stages.estimate import (
         PRETRAINED,
@@ -314,7 +321,8 @@ def estimate(
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
-    result = estimate_recording(fitted, read_table(file, overrides), downsample)
+    with use_limits(limits_from_config(config["limits"])):
+        result = estimate_recording(fitted, read_table(file, overrides), downsample)
     write_estimate_table(result, out)
     note = {"note": pretrained_note()} if name == PRETRAINED else {}
     _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **note})
@@ -344,15 +352,53 @@ def run(
 
 @app.command()
 def report(
-    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
+    pipeline: Annotated[
+        str | None,
+        typer.Argument(
+            help="A file in pipelines/, or its name; with --check studies or pipelines, or none for all.",
+            autocompletion=_complete_pipeline,
+            show_default=False,
+        ),
+    ] = None,
     overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="Draw nothing; say which results published in ./results, of all studies or of those named, are not those of today's code, "
+            "configuration and data.",
+        ),
+    ] = False,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Draw a study's tables, figures and page from what `vehest run` has made; trains nothing."""
+    """Draw a study's tables, figures and page from what `vehest run` has made; trains nothing.
+
+    `vehest report --check` needs neither models nor an output root. A line a study: up to date; stale, and what has changed; or not known.
+    Exit code 3 unless all are up to date.
+    """
+    if check:
+        _check_published([word for word in (pipeline, *(overrides or [])) if word is not None], as_json)
+        return
+    if pipeline is None:
+        raise ConfigurationError(f"say which pipeline, of: {', '.join(pipeline_names())}; or --check")
     _run_pipeline(pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=1, only_report=True)
+
+
+def _check_published(words: list[str], as_json: bool) -> None:
+    """Say of published studies whether they are those of today; exit code 3 unless all are."""
+    from vehest.stages.published_check import check_published
+
+    verdicts = check_published([word for word in words if _is_file_name(word)], [word for word in words if not _is_file_name(word)])
+    if as_json:
+        _echo(_json([asdict(verdict) for verdict in verdicts]), keep="\n")
+    else:
+        for verdict in verdicts:
+            _echo(verdict.in_words())
+    if any(verdict.state != "up to date" for verdict in verdicts):
+        raise typer.Exit(3)
 
 
 @app.command(epilog=_offered("split", "estimator", "training", "tracking"))
@@ -372,28 +418,32 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.stages.sweep import plan_sweep, run_sweep
+    from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
 
-    planned = plan_sweep(overrides or [], name)
+    words = tuple(overrides or [])
+    asked = Asked(("sweep", name or "", *words), words)
+    finished = None if force else recall(asked)
+    if finished is not None:
+        folder, _ = _repeat(finished, dry_run=dry_run, quiet=quiet)
+        _print_sweep(finished.record.shown, as_json, folder, skipped=True)
+        return
+    from vehest.stages.shown import shown_of_sweep
+    from vehest.stages.sweep import SweepOutcome, plan_sweep, run_sweep
+
+    planned = plan_sweep(words, name)
+
+    def whole_way(workshop: Workshop) -> tuple[Outcome, SweepOutcome]:
+        raw = stamps_of(workshop.datasets_of(planned.first))
+        swept = run_sweep(planned, workshop)
+        return workshop.outcome(swept.folder, shown_of_sweep(swept), None, planned.first["tracking"], raw), swept
+
     forced = {"train", "evaluate", "sweep"} if force else set()
     with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True) as workshop:
-        outcome = run_sweep(planned, workshop)
-    table = json.loads(outcome.summary.to_json(orient="records"))
-    if as_json:
-        chosen = next((row for row in table if row["chosen"]), None)
-        failed = [{"jobs": what, "message": reason} for what, reason in outcome.failures.items()]
-        shown = {
-            "folder": str(outcome.folder.folder),
-            "skipped": outcome.folder.skipped,
-            "chosen": chosen,
-            "summary": table,
-            "failed": failed,
-        }
-        typer.echo(_json(shown))
-    else:
-        _print_sweep(outcome)
-    if not dry_run:
-        outcome.raise_failures()
+        outcome, swept = whole_way(workshop)
+        _print_sweep(outcome.shown, as_json, outcome.report.folder, skipped=swept.folder.skipped)
+        if not dry_run:
+            swept.raise_failures()
+            remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
 
 
 @app.command("config")
@@ -408,7 +458,57 @@ def show_config(
     from vehest.stages.config import as_yaml
 
     config = _compose(command, overrides or [])
-    typer.echo(_json(config) if as_json else as_yaml(config).rstrip())
+    _echo(_json(config) if as_json else as_yaml(config).rstrip(), keep="\n")
+
+
+@app.command()
+def prune(
+    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed; remove nothing.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List what no present key names in the output root, ask, and remove it: `vehest prune output=FOLDER`.
+
+    That is what other code has made than today's, what is damaged or half-written, and what was made from something that is gone. Models
+    and recordings of today's code stay, whatever their settings, and so does everything that vehest has not made.
+    """
+    from vehest.stages.prune import remove_found, unnamed
+
+    config = _compose("estimate", overrides or [])
+    if as_json and not (yes or dry_run):
+        raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
+    found = unnamed(Path(str(config["output"])))
+    total = sum(one.size for one in found)
+    if not as_json:
+        if found:
+            rows = [[str(one.path), _size(one.size), _age(one.age), one.reason] for one in found]
+            _table(["no present key names", "size", "age", "since"], rows)
+        _echo(f"{len(found)} to remove, {_size(total)}" if found else "nothing to remove")
+    removed: list[str] = []
+    if found and not dry_run:
+        if not yes and not sys.stdin.isatty():
+            raise ConfigurationError("there is no terminal to ask at; add --yes to remove, or --dry-run")
+        if yes or typer.confirm("Remove them?"):
+            remove_found(found, lambda one: removed.append(str(one.path)))
+    if as_json:
+        listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
+        _echo(_json({"found": listed, "bytes": total, "removed": removed}), keep="\n")
+    elif removed:
+        _echo(f"{len(removed)} removed")
+
+
+def _size(size: int) -> str:
+    """Bytes as people read them."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
+def _age(seconds: float) -> str:
+    """A time span as people read it."""
+    for length, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 @app.command()
@@ -418,11 +518,11 @@ def doctor(as_json: AsJson = False) -> None:
 
     items = examine()
     if as_json:
-        typer.echo(_json([item.__dict__ for item in items]))
+        _echo(_json([item.__dict__ for item in items]), keep="\n")
     else:
         for item in items:
             mark = {"ok": "ok     ", "warning": "warning", "error": "error  "}[item.level]
-            typer.echo(f"{mark} {item.name}: {item.message}")
+            _echo(f"{mark} {item.name}: {item.message}")
     if any(item.level == "error" for item in items):
         raise typer.Exit(4)
 
@@ -434,13 +534,15 @@ def data_list(as_json: AsJson = False) -> None:
 
     rows = dataset_rows()
     if as_json:
-        typer.echo(_json(rows))
+        _echo(_json(rows), keep="\n")
     else:
         shown = ("dataset", "kind", "source", "here", "title")
         _table(["data set", *shown[1:]], [[row[key] for key in shown] for row in rows])
-        typer.echo("\nlicences and citations")
+        _echo("")
+        _echo("licences and citations")
         for row in rows:
-            typer.echo(f"{row['dataset']}: {row['licence']}\n  cite: {row['citation']}")
+            _echo(f"{row['dataset']}: {row['licence']}")
+            _echo(f"  cite: {row['citation']}")
 
 
 @data_app.command("channels")
@@ -449,7 +551,7 @@ def data_channels(as_json: AsJson = False) -> None:
     from vehest.data.channels import CHANNELS
 
     if as_json:
-        typer.echo(_json({name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}))
+        _echo(_json({name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}), keep="\n")
     else:
         _table(["channel", "unit", "meaning"], [[c.name, c.unit, c.meaning] for c in CHANNELS.values()])
 
@@ -465,10 +567,10 @@ def data_show(
 
     shown = describe(source, overrides or [])
     if as_json:
-        typer.echo(_json(shown))
+        _echo(_json(shown), keep="\n")
         return
     for recording in shown["recordings"]:
-        typer.echo(
+        _echo(
             f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
             f"{recording['start']:.6g} s to {recording['end']:.6g} s, {recording['samples']} samples"
         )
@@ -487,13 +589,13 @@ def data_check(
 
     findings = check(source, overrides or [])
     if as_json:
-        typer.echo(_json(findings))
+        _echo(_json(findings), keep="\n")
     else:
         for row in findings:
             channel = f" {row['channel']}:" if row["channel"] else ""
-            typer.echo(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
+            _echo(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
         if not findings:
-            typer.echo("nothing found")
+            _echo("nothing found")
     if any(row["level"] == "error" for row in findings):
         raise typer.Exit(3)
 
@@ -529,7 +631,7 @@ def data_align(
 
     Prints what was found with its uncertainty, and the transforms that would correct it. Applies nothing.
     """
-    from vehest.data.alignment import AlignmentSettings
+    from vehest.alignment.settings import AlignmentSettings
     from vehest.stages.align import (
         PARAMETER_HEADER,
         RESIDUAL_HEADER,
@@ -550,110 +652,193 @@ def data_align(
     if out is not None:
         write_alignment(found, out)
     if as_json:
-        typer.echo(_json({**as_plain(found), "out": None if out is None else str(out)}))
+        _echo(_json({**as_plain(found), "out": None if out is None else str(out)}), keep="\n")
         return
-    typer.echo(f"{found.recording_id}: {found.kind}, {found.duration:.6g} s at {found.rate_hz:g} Hz; nothing is applied")
+    _echo(f"{found.recording_id}: {found.kind}, {found.duration:.6g} s at {found.rate_hz:g} Hz; nothing is applied")
     _table([*PARAMETER_HEADER], parameter_rows(found))
     if found.residuals:
-        typer.echo("")
+        _echo("")
         _table([*RESIDUAL_HEADER], residual_rows(found))
     for note in found.notes:
-        typer.echo(f"note: {note}")
-    typer.echo(f"to correct it: '{override_of(found)}'")
+        _echo(f"note: {note}")
+    _echo(f"to correct it: '{override_of(found)}'")
     if out is not None:
-        typer.echo(f"written: {out}")
+        _echo(f"written: {out}")
 
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
     from vehest.stages.signals import Stopped
 
+    _open_streams()
     try:
-        app()
-    except VehestError as error:
-        _fail(str(error), error.exit_code)
+        code = app(prog_name="vehest", standalone_mode=False)
+    except _USAGE_ERROR as error:
+        _fail_usage(error)
+    except (_OutputClosed, BrokenPipeError):
+        _silence(sys.stdout)
+        sys.exit(141)
     except Stopped as stopped:
         _fail(f"stopped by {stopped}; what was finished is kept, the same command goes on", stopped.exit_code)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         _fail("stopped", 130)
-    except BrokenPipeError:
-        sys.stderr.close()
-        sys.exit(141)
-    except OSError as error:
-        from vehest.data.files import writing_error
-
-        if error.filename is None:
-            raise
-        wrapped = writing_error(Path(error.filename), error)
-        _fail(str(wrapped), wrapped.exit_code)
     except Exception as error:
-        if os.environ.get("VEHEST_DEBUG"):
-            raise
-        _fail(f"this is a defect of vehest ({type(error).__name__}: {error}); VEHEST_DEBUG=1 shows where", 1)
+        _fail_with(error)
+    if code == 130:
+        _fail("stopped", 130)
+    sys.exit(code if isinstance(code, int) else 0)
 
 
-def _fail(message: str, exit_code: int) -> None:
-    typer.echo(f"error: {' '.join(message.split())}", err=True)
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
+"""What Typer raises for options, arguments and commands that it does not know; newer ones carry their own copy of Click."""
+
+
+class _OutputClosed(Exception):
+    """Nobody reads standard output any more."""
+
+
+def _open_streams() -> None:
+    """Give streams that were closed at the start a null device, and let every stream show any character, as an escape if need be."""
+    for name in ("stdin", "stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process lives)
+        elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _silence(stream: Any) -> None:
+    """Let what a broken stream still holds go nowhere, so that leaving does not complain about it."""
+    with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def _fail_usage(error: Any) -> None:
+    context = error.ctx
+    if type(error).__name__ == "NoArgsIsHelpError":  # the help stands on the screen
+        sys.exit(error.exit_code)
+    words = error.format_message().strip().rstrip(".").replace(". Did you mean", "; did you mean")
+    key = str(getattr(error, "option_name", "")).lstrip("-").partition("=")[0]
+    if key in GROUPS or key in ROOT_KEYS or "." in key:
+        hint = f"what belongs to the configuration is written without dashes: {key}=…"
+    else:
+        hint = f"'{context.command_path if context else 'vehest'} --help' says what there is"
+    _fail(f"{words[:1].lower()}{words[1:]}{'' if words.endswith('?') else ';'} {hint}", error.exit_code)
+
+
+def _fail_with(error: Exception) -> None:
+    from vehest.stages.failures import failure_of
+
+    failure = failure_of(error)
+    if failure.exit_code != 1:
+        _fail(failure.message, failure.exit_code)
+    if os.environ.get("VEHEST_DEBUG"):
+        raise error
+    _fail(f"this is a defect of vehest ({failure.message}); VEHEST_DEBUG=1 shows where", 1)
+
+
+def _fail(message: str, exit_code: int) -> NoReturn:
+    line = printable(" ".join(message.split()))
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        _silence(sys.stdout)
+    _complain(f"error: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + '…'}")
     sys.exit(exit_code)
+
+
+def _complain(text: str) -> None:
+    """Print on standard error, if anybody reads it."""
+    try:
+        typer.echo(text, err=True)
+    except OSError:
+        _silence(sys.stderr)
+
+
+def _echo(text: str, keep: str = "") -> None:
+    """Print a line on standard output, control characters as escapes except for those to ``keep``; the one way there.
+
+    Raises:
+        MissingError: its disk is full.
+        _OutputClosed: nobody reads it any more.
+    """
+    try:
+        typer.echo(printable(text, keep))
+    except BrokenPipeError:
+        raise _OutputClosed from None
+    except OSError as error:
+        _silence(sys.stdout)
+        raise MissingError(f"cannot write to standard output ({error.strerror})") from error
 
 
 def _run_pipeline(
     name: str, overrides: list[str], *, dry_run: bool, force: bool, as_json: bool, quiet: bool, jobs: int | None, only_report: bool
 ) -> None:
-    from vehest.stages.pipeline import content_overrides, pipeline_configs, read_pipeline, run_pipeline
+    from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
+
+    asked = Asked(("run", name, *overrides), tuple(overrides), name)
+    finished = None if force else recall(asked)
+    if finished is not None:
+        folder, published = _repeat(finished, dry_run=dry_run, quiet=quiet)
+        _print_shown(finished.record.shown, as_json, folder, {"published": str(published) if published else None})
+        return
+    from vehest.stages.pipeline import content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
+    from vehest.stages.shown import shown_of_pipeline
 
     pipeline = read_pipeline(name)
     configs = pipeline_configs(pipeline, overrides)
-    forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
-    with _workshop(next(iter(configs.values()))[0], force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+    first = next(iter(configs.values()))[0]
+
+    def whole_way(workshop: Workshop) -> tuple[Outcome, Path | None]:
+        raw = stamps_of(datasets_of(pipeline, configs, workshop))
         outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
-    page = outcome.report.folder / "report.html"
+        shown = shown_of_pipeline(pipeline.title, outcome)
+        tracking = first.get("tracking", {})
+        return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome.published
+
+    forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
+    with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+        outcome, published = whole_way(workshop)
+        _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(published) if published else None})
+        if not dry_run:
+            remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
+
+
+def _repeat(finished: Finished, *, dry_run: bool, quiet: bool) -> tuple[Path, Path | None]:
+    """Say what the whole way would say of a finished study, publish it where its copy is not there; returns its report and that copy."""
+    from vehest.stages.console import Messages
+    from vehest.stages.publishing import publish_study
+
+    messages = Messages(quiet=quiet)
+    messages.again(finished.record.said)
+    published = None if dry_run else publish_study(finished.record.publication, finished.report, messages)
+    return finished.report.folder, published
+
+
+def _print_sweep(shown: Shown, as_json: bool, folder: Path, *, skipped: bool) -> None:
+    """Print a sweep's table, or all as one JSON object."""
     if as_json:
-        shown = ("leaderboard", outcome.leaderboard) if outcome.overview is None else ("overview", outcome.overview)
-        published = str(outcome.published) if outcome.published else None
-        typer.echo(_json({"report": str(page), "published": published, shown[0]: json.loads(shown[1].to_json(orient="records"))}))
+        _echo(_json({"folder": str(folder), "skipped": skipped, **json.loads(shown.figures)}), keep="\n")
+    else:
+        _print_shown(shown, as_json, folder, {})
+
+
+def _print_shown(shown: Shown, as_json: bool, folder: Path, further: dict[str, Any]) -> None:
+    """Print a study's tables and where its report is, or all as one JSON object."""
+    page = folder / shown.page
+    if as_json:
+        _echo(_json({"report": str(page), **further, **json.loads(shown.figures)}), keep="\n")
         return
-    if outcome.overview is not None:
-        _table([*outcome.overview.columns], [[_cell(value) for value in row] for row in outcome.overview.itertuples(index=False)])
-        typer.echo(f"report: {page}")
-        if outcome.published is not None:
-            typer.echo(f"published: {outcome.published}")
-        return
-    for test_set, rows in outcome.leaderboard.groupby("test_set", sort=False):
-        given = " (estimates start at the reference state)" if (rows["start"] == "reference").any() else ""
-        typer.echo(f"\n{pipeline.title}: test set '{test_set}'{given}")
-        _table(
-            ["estimator", "parameters", "seeds", "seed", "RMSE(β) [deg]", "over seeds [deg]", "RMSE(v) [m/s]", "FVU"],
-            [
-                [
-                    str(row["title"]),
-                    f"{row['n_parameters']:.0f}",
-                    str(row["n_seeds"]),
-                    str(row["seed"]),
-                    f"{row['rmse_sideslip']:.3f}",
-                    f"{row['rmse_sideslip_min']:.3f} … {row['rmse_sideslip_max']:.3f}" if row["n_seeds"] > 1 else "–",
-                    f"{row['rmse_vy']:.3f}",
-                    f"{row['fvu']:.3f}",
-                ]
-                for row in rows.to_dict("records")
-            ],
-        )
-    typer.echo(f"report: {page}")
-    if outcome.published is not None:
-        typer.echo(f"published: {outcome.published}")
-
-
-def _print_sweep(outcome: SweepOutcome) -> None:
-    """One row a combination: settings, seeds, mean and half interval on validation and tests."""
-    from vehest.studies.sweep import table_of
-
-    header, rows = table_of(outcome.artefacts, outcome.summary)
-    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(outcome.artefacts.kinds.values()))
-    typer.echo(f"\n{outcome.artefacts.name}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data")
-    _table(header, rows)
-    if outcome.summary["chosen"].any():
-        typer.echo("* lowest mean on the validation range; tests choose nothing")
-    typer.echo(f"report: {outcome.folder.folder / 'report.md'}")
+    for table in shown.tables:
+        if table.title:
+            _echo("")
+            _echo(table.title)
+        _table([*table.header], [[*row] for row in table.rows])
+    if shown.note:
+        _echo(shown.note)
+    _echo(f"report: {page}")
+    if further.get("published"):
+        _echo(f"published: {further['published']}")
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
@@ -679,18 +864,17 @@ def _workshop(
     config: Config, *, force: set[str], dry_run: bool, quiet: bool, jobs: int | None = None, track: bool = False
 ) -> Iterator[Workshop]:
     """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
+    from vehest.data.limits import limits_from_config, use_limits
     from vehest.stages.console import Messages
     from vehest.stages.launcher import default_jobs
     from vehest.stages.signals import StopSignals
     from vehest.stages.tracking import Tracker
     from vehest.stages.workshop import NotThereYet, Workshop
 
-    if not isinstance(config["output"], str) or not config["output"]:
-        raise ConfigurationError(f"output must name a folder, not {config['output']!r}")
     messages, stop, output = Messages(quiet=quiet), StopSignals(), Path(config["output"])
-    tracker = Tracker(config["tracking"], output, messages.warn) if track else None
+    tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if track else None
     workshop = Workshop(output, messages, stop, jobs or default_jobs(), frozenset(force), dry_run, tracker)
-    with stop.installed():
+    with use_limits(limits_from_config(config["limits"])), stop.installed():
         try:
             yield workshop
         except NotThereYet:
@@ -700,7 +884,7 @@ def _workshop(
 def _raise_failure(failures: list[tuple[str, Any]]) -> None:
     for _, failure in failures:
         if failure.detail:
-            typer.echo(failure.detail, err=True)
+            _complain(printable(failure.detail, keep="\n"))
         error = VehestError(failure.message)
         error.exit_code = failure.exit_code
         raise error
@@ -715,10 +899,10 @@ def _positive(value: Any, name: str) -> float:
 def _say(as_json: bool, outcome: dict[str, Any]) -> None:
     """Print an outcome: one JSON object, or a line a figure."""
     if as_json:
-        typer.echo(_json(outcome))
+        _echo(_json(outcome), keep="\n")
         return
     for key, value in outcome.items():
-        typer.echo(f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}")
+        _echo(f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}")
 
 
 def _counted(names: list[str]) -> str:
@@ -728,7 +912,7 @@ def _counted(names: list[str]) -> str:
 
 
 def _json(outcome: Any) -> str:
-    """An outcome as JSON; what is not a finite number becomes null."""
+    """An outcome as JSON; what is not a finite number becomes null, a character that is not to be shown its escape in JSON."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):
@@ -737,27 +921,26 @@ def _json(outcome: Any) -> str:
             return [plain(inner) for inner in value]
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
-    return json.dumps(plain(outcome), indent=1, ensure_ascii=False, allow_nan=False)
-
-
-def _cell(value: Any) -> str:
-    """A value of a table, numbers with four significant digits."""
-    if isinstance(value, float):
-        return f"{value:.4g}" if math.isfinite(value) else "–"
-    return str(value)
+    encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
+    text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
+    return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)
 
 
 def _table(header: list[str], rows: list[list[str]]) -> None:
     """Print a table on standard output, as wide as it needs to be where there is no terminal."""
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(*(escape(name) for name in header), box=None, header_style="bold", pad_edge=False)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for name in header:
+        table.add_column(Text(printable(name)))
     for row in rows:
-        table.add_row(*(escape(cell) for cell in row))
-    console.print(table)
+        table.add_row(*(Text(printable(cell)) for cell in row))
+    with console.capture() as captured:
+        console.print(table)
+    _echo(captured.get().removesuffix("\n"), keep="\n\x1b")  # cells hold no escapes any more, styles do
 
 
 if __name__ == "__main__":

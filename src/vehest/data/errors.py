@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 
 class VehestError(Exception):
     """Base of all errors caused by input or environment rather than by a defect of vehest.
@@ -35,3 +37,20 @@ class JobsFailedError(VehestError):
     """Some jobs of a sweep failed; the others were finished and kept."""
 
     exit_code = 5
+
+
+def printable(text: str, keep: str = "") -> str:
+    """Text from a file as it can be shown: control characters, and bytes that are no UTF-8, as escapes.
+
+    Args:
+        text: anything.
+        keep: control characters that stay, for example line breaks.
+    """
+    return "".join(
+        character if is_printable(character) or character in keep else character.encode("unicode_escape").decode() for character in text
+    )
+
+
+def is_printable(character: str) -> bool:
+    """Whether a character shows as itself: none that controls a terminal, changes the direction of writing, or has no meaning."""
+    return unicodedata.category(character) not in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray, clock_tolerance
+from vehest.data.recording import clock_tolerance
 
 Mode = Literal["causal", "offline"]
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import shutil
+import stat
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +16,12 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError, VehestError
 
 ASIDE_PREFIX = ".writing-"
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_NO_ROOM_WORDS = {
+    **{os.strerror(number): number for number in sorted(NO_ROOM)},
+    "os error 28": errno.ENOSPC,
+    "database or disk is full": errno.ENOSPC,
+}
 
 
 @contextmanager
@@ -27,7 +35,7 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
     Raises:
         MissingError: the disk is full or the folder cannot be written to.
     """
-    aside = path.with_name(_aside_name(path.name))
+    aside = aside_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield aside
@@ -40,17 +48,86 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
         else:
             os.replace(aside, path)
     except OSError as error:
-        raise writing_error(path, error) from error
+        raise writing_error(_target(path, aside, error), error) from error
+    except VehestError:
+        raise
+    except Exception as error:
+        full = no_room(error)
+        if full is None:
+            raise
+        raise writing_error(path, full) from error
     finally:
         with suppress(OSError):  # nothing was written where the folder itself cannot be
             remove(aside)
 
 
+def regular_file(path: Path) -> Path:
+    """A file that can be read to its end: no folder, pipe or device.
+
+    Raises:
+        MissingError: there is nothing.
+        DataError: it is something else, or cannot be looked at.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise MissingError(f"there is no file '{path}'") from None
+    except (OSError, ValueError) as error:  # a name may be too long, or hold a null character
+        raise DataError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    if not stat.S_ISREG(mode):
+        kinds = {
+            stat.S_IFDIR: "a folder",
+            stat.S_IFIFO: "a pipe",
+            stat.S_IFCHR: "a device",
+            stat.S_IFBLK: "a device",
+            stat.S_IFSOCK: "a socket",
+        }
+        raise DataError(f"'{path}' is {kinds.get(stat.S_IFMT(mode), 'something else')}, not a file")
+    return path
+
+
+def file_name(name: str, ending: str = "") -> str:
+    """A name from anywhere as a file's name: one component of a path, the same for the same name, another for another.
+
+    Letters, digits, ``_``, ``-``, ``+``, ``=`` and ``.`` stay; a name that holds anything else, begins with a dot or is long gets what is
+    left of it and the start of its hash.
+    """
+    kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
+    if kept != name or not name or len(kept.encode()) > 120:
+        digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+        short = kept.encode()[:100].decode("utf-8", "ignore")
+        return f"{short}~{digest}{ending}"
+    return f"{kept}{ending}"
+
+
+def no_room(error: BaseException) -> OSError | None:
+    """The full disk behind an error of a library that has its own kind of error for it; None where it is something else."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in NO_ROOM:
+            return cause
+        if not isinstance(cause, VehestError):
+            number = next((number for words, number in _NO_ROOM_WORDS.items() if words in str(cause)), None)
+            if number is not None:
+                return OSError(number, os.strerror(number))
+        cause = cause.__cause__ or cause.__context__
+    return None
+
+
 def writing_error(path: Path, error: OSError) -> VehestError:
     """The one-line error for a failure to write to ``path``."""
-    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
-        return MissingError(f"no room left to write '{path}' ({os.strerror(error.errno)}); free some space and run again")
+    path, full = _as_finished(path), no_room(error)
+    if full is not None:
+        return MissingError(f"no room left to write '{path}' ({full.strerror}); free some space and run again")
     return MissingError(f"cannot write '{path}': {error.strerror or error}; check the folder and its permissions")
+
+
+def as_os_error(error: Exception) -> OSError:
+    """The failed write that safetensors reports in prose, with the number of its error."""
+    text = str(error)
+    marker = "os error "
+    number = int(text.split(marker)[1].split(")")[0]) if marker in text else errno.EIO
+    return OSError(number, text)
 
 
 def remove(path: Path) -> None:
@@ -63,10 +140,20 @@ def remove(path: Path) -> None:
 
 def remove_leftovers(folder: Path) -> int:
     """Remove what killed writers left in ``folder``; what a living process is writing stays. Returns how many."""
-    leftovers = [path for path in folder.glob(f"{ASIDE_PREFIX}*") if not _is_alive(_writer(path))] if folder.is_dir() else []
+    leftovers = [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)] if folder.is_dir() else []
     for leftover in leftovers:
         remove(leftover)
     return len(leftovers)
+
+
+def is_left_over(path: Path) -> bool:
+    """Whether the process that was writing ``path``, by its name a file or folder aside, is gone."""
+    return path.name.startswith(ASIDE_PREFIX) and not _is_alive(_writer(path))
+
+
+def aside_of(path: Path) -> Path:
+    """A free place beside ``path`` for what this process writes or takes away; what is left there is removed later."""
+    return path.with_name(_aside_name(path.name))
 
 
 def sha256_of(path: Path) -> str:
@@ -80,6 +167,19 @@ def sha256_of(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
+
+
+def _target(path: Path, aside: Path, error: OSError) -> Path:
+    """What could not be written: the file that the error names, unless it is a part of what is written aside."""
+    named = error.filename
+    if not isinstance(named, str) or Path(named).is_relative_to(aside) or ASIDE_PREFIX in named:
+        return path
+    return Path(named)
+
+
+def _as_finished(path: Path) -> Path:
+    """A path as it will be called once what is written aside is in its place."""
+    return Path(*(re.sub(rf"^{re.escape(ASIDE_PREFIX)}\d+-[0-9a-f]{{8}}-", "", part) for part in path.parts))
 
 
 def _aside_name(name: str) -> str:

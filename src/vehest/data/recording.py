@@ -8,13 +8,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 
 Kind = Literal["real", "simulated"]
-FloatArray = NDArray[np.float64]
+
+LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e9
+"""Between which a sampling rate lies [Hz]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +51,9 @@ class Recording:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise DataError(f"recording '{self.id}': the sampling rate must be positive, not {self.rate_hz}")
+        if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
+            where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
+            raise DataError(f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz")
         if not math.isfinite(self.start_time):
             raise DataError(f"recording '{self.id}': the start time must be finite, not {self.start_time}")
         if self.kind not in ("real", "simulated"):

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
 
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
+from vehest.data.schema import validated
 from vehest.data.stretches import Condition, stretches_where
 
 VALIDATION = "validation"
+TRAINING = "training"
 
 Catalogue = Callable[[str], Mapping[str, Callable[[Iterable[str]], Recording]]]
 """Of the name of a data set: its recordings as ingested, by id, each as a function that reads the named channels."""
@@ -115,9 +117,9 @@ class Split:
         check_name(self.name, "split")
         for name, spans in self.tests.items():
             check_name(name, f"split '{self.name}': test set")
-            if name == VALIDATION:
+            if name in (VALIDATION, TRAINING):
                 raise ConfigurationError(
-                    f"split '{self.name}': a test set cannot be called '{VALIDATION}'; seeds are chosen on the validation range"
+                    f"split '{self.name}': a test set cannot be called '{name}'; that is what the {name} range is called in metrics"
                 )
             if not spans:
                 raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
@@ -147,6 +149,53 @@ class Split:
         return self.train + self.validation + tests
 
 
+@dataclass(frozen=True)
+class BoundsFile:
+    """Bounds of a channel's magnitude in its unit; what is None is not said."""
+
+    at_least: float | None = None
+    at_most: float | None = None
+
+
+@dataclass(frozen=True)
+class KeepFile:
+    """A condition: channel -> bounds of its magnitude, and how long it must hold at least [s]."""
+
+    magnitude: dict[str, BoundsFile]
+    at_least_seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class RangeFile:
+    """One range as conf/split/*.yaml names it: a recording, or a pattern of several; from start to stop [s]."""
+
+    dataset: str | None = None
+    recording: str | None = None
+    recordings: str | None = None
+    start: float = -math.inf
+    stop: float = math.inf
+    keep: KeepFile | None = None
+
+
+@dataclass(frozen=True)
+class SplitFile:
+    """What conf/split/*.yaml says."""
+
+    name: str = "unnamed"
+    title: str | None = None
+    dataset: str | None = None
+    train: tuple[RangeFile, ...] | None = None
+    validation: tuple[RangeFile, ...] | None = None
+    tests: dict[str, tuple[RangeFile, ...]] | None = None
+
+
+def _read(config: Any) -> SplitFile:
+    name = config.get("name") if isinstance(config, Mapping) else None
+    where = f"split '{name}'" if isinstance(name, str) else ""
+    plain = dict(config) if isinstance(config, Mapping) else config
+    return validated(SplitFile, plain, where, error=ConfigurationError, group="split")
+
+
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
     """Build a split from plain values, as conf/split/*.yaml holds them.
 
@@ -159,28 +208,38 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
             none meets; or either of them without a catalogue.
         DataError: a recording lacks a channel that a condition looks at.
     """
-    name = str(config.get("name", "unnamed"))
-    unknown = set(config) - {"name", "title", "dataset", "train", "validation", "tests"}
-    if unknown:
-        raise ConfigurationError(f"split '{name}': unknown key '{sorted(unknown)[0]}'")
-    tests = config.get("tests") or {}
-    if not isinstance(tests, Mapping):
-        raise ConfigurationError(f"split '{name}': 'tests' must map a name to a list of ranges")
-    ranges = _Ranges(name, config.get("dataset"), catalogue)
+    told = _read(config)
+    ranges = _Ranges(told.name, told.dataset, catalogue)
     return Split(
-        name=name,
-        train=ranges.spans("train", config.get("train") or []),
-        validation=ranges.spans(VALIDATION, config.get("validation") or []),
-        tests={str(test): ranges.spans(str(test), entries) for test, entries in tests.items()},
+        name=told.name,
+        train=ranges.spans("train", told.train or ()),
+        validation=ranges.spans(VALIDATION, told.validation or ()),
+        tests={test: ranges.spans(test, entries) for test, entries in (told.tests or {}).items()},
         kept=ranges.kept,
     )
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets that a split's plain values draw on, sorted; `split_from_config` says what is wrong with the values."""
-    roles = [config.get("train"), config.get("validation"), *dict(config.get("tests") or {}).values()]
-    entries = [entry for entries in roles for entry in entries or [] if isinstance(entry, Mapping)]
-    return sorted({str(entry.get("dataset", config.get("dataset"))) for entry in entries})
+    """Names of the data sets that a split's plain values draw on, sorted.
+
+    Raises:
+        ConfigurationError: as `split_from_config`, where a range names none.
+    """
+    told = _read(config)
+    entries = [*(told.train or ()), *(told.validation or ()), *(entry for entries in (told.tests or {}).values() for entry in entries)]
+    return sorted({_dataset_of(entry, told.dataset, told.name) for entry in entries})
+
+
+def _dataset_of(entry: RangeFile, default: str | None, split: str) -> str:
+    dataset = entry.dataset or default
+    if dataset is None or (entry.recording is None) == (entry.recordings is None):
+        needed = "each range needs a recording and a dataset (or recordings, a pattern)"
+        raise ConfigurationError(f"split '{split}': {needed}, not {_shown(entry)}")
+    return dataset
+
+
+def _shown(entry: RangeFile) -> dict[str, Any]:
+    return {key: value for key, value in asdict(entry).items() if value not in (None, -math.inf, math.inf)}
 
 
 class _Ranges:
@@ -192,44 +251,28 @@ class _Ranges:
         catalogue: the recordings.
     """
 
-    def __init__(self, split: str, dataset: Any, catalogue: Catalogue | None) -> None:
+    def __init__(self, split: str, dataset: str | None, catalogue: Catalogue | None) -> None:
         self._split, self._dataset, self._catalogue = split, dataset, catalogue
         self._known: dict[str, Mapping[str, Callable[[Iterable[str]], Recording]]] = {}
         self.kept: dict[str, Kept] = {}
 
-    def spans(self, role: str, entries: Any) -> tuple[Span, ...]:
+    def spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
         """The spans of one role."""
-        if not isinstance(entries, Sequence) or isinstance(entries, str):
-            raise ConfigurationError(f"split '{self._split}': ranges come as a list of recording, start and stop, not {entries}")
         spans: list[Span] = []
         for entry in entries:
             whole = self._named(entry)
-            if entry.get("keep") is None:
+            if entry.keep is None:
                 spans += whole
             else:
-                condition = _condition(entry["keep"], f"split '{self._split}': keep of {role}")
+                condition = _condition(entry.keep, f"split '{self._split}': keep of {role}")
                 spans += self._cut(role, whole, condition)
         return tuple(spans)
 
-    def _named(self, entry: Any) -> list[Span]:
+    def _named(self, entry: RangeFile) -> list[Span]:
         """Spans of one entry, before any condition."""
-        if not isinstance(entry, Mapping):
-            raise ConfigurationError(f"split '{self._split}': a range is {{recording, start, stop}}, not {entry}")
-        unknown = set(entry) - {"dataset", "recording", "recordings", "start", "stop", "keep"}
-        if unknown:
-            raise ConfigurationError(f"split '{self._split}': unknown key '{sorted(unknown)[0]}' in {dict(entry)}")
-        dataset = entry.get("dataset", self._dataset)
-        if dataset is None or ("recording" in entry) == ("recordings" in entry):
-            raise ConfigurationError(
-                f"split '{self._split}': each range needs a recording and a dataset (or recordings, a pattern), not {dict(entry)}"
-            )
-        try:
-            start = float(entry.get("start", -math.inf))
-            stop = float(entry.get("stop", math.inf))
-        except (TypeError, ValueError):
-            raise ConfigurationError(f"split '{self._split}': start and stop of {dict(entry)} must be numbers [s]") from None
-        names = [str(entry["recording"])] if "recording" in entry else self._matching(str(dataset), str(entry["recordings"]))
-        return [Span(str(dataset), name, start, stop) for name in names]
+        dataset = _dataset_of(entry, self._dataset, self._split)
+        names = [entry.recording] if entry.recording is not None else self._matching(dataset, str(entry.recordings))
+        return [Span(dataset, name, entry.start, entry.stop) for name in names]
 
     def _matching(self, dataset: str, pattern: str) -> list[str]:
         recordings = self._recordings(dataset)
@@ -271,32 +314,19 @@ class _Ranges:
         return spans
 
 
-def _condition(values: Any, where: str) -> Condition:
-    """A condition from ``magnitude``, a mapping from channels to at_least and at_most, and ``at_least_seconds``."""
-    if not isinstance(values, Mapping) or set(values) - {"magnitude", "at_least_seconds"} or not values.get("magnitude"):
-        raise ConfigurationError(f"{where} is {{magnitude: {{channel: {{at_least, at_most}}}}, at_least_seconds}}, not {values}")
-    if not isinstance(values["magnitude"], Mapping):
-        raise ConfigurationError(f"{where}: magnitude maps channels to {{at_least, at_most}}, not {values['magnitude']}")
+def _condition(keep: KeepFile, where: str) -> Condition:
+    if not keep.magnitude:
+        raise ConfigurationError(f"{where}: magnitude maps channels to {{at_least, at_most}}, and names none")
     bounds: dict[str, tuple[float, float]] = {}
-    for channel, limits in values["magnitude"].items():
+    for channel, limits in keep.magnitude.items():
         if channel not in CHANNELS:
             raise ConfigurationError(f"{where}: there is no channel '{channel}'; see 'vehest data channels'")
-        if not isinstance(limits, Mapping) or not limits or set(limits) - {"at_least", "at_most"}:
-            raise ConfigurationError(f"{where}: '{channel}' needs at_least, at_most or both, not {limits}")
-        at_least, at_most = (_number(limits.get(key, default), f"{where}: {key} of '{channel}'") for key, default in _BOUNDS)
+        if limits.at_least is None and limits.at_most is None:
+            raise ConfigurationError(f"{where}: '{channel}' needs at_least, at_most or both")
+        at_least, at_most = (limits.at_least or 0.0), (math.inf if limits.at_most is None else limits.at_most)
         if not 0.0 <= at_least <= at_most:
             raise ConfigurationError(f"{where}: no magnitude of '{channel}' lies between {at_least:g} and {at_most:g}")
-        bounds[str(channel)] = (at_least, at_most)
-    seconds = _number(values.get("at_least_seconds", 0.0), f"{where}: at_least_seconds")
-    if not 0.0 <= seconds < math.inf:
-        raise ConfigurationError(f"{where}: at_least_seconds must be zero or positive, not {seconds:g}")
-    return Condition(bounds, seconds)
-
-
-_BOUNDS = (("at_least", 0.0), ("at_most", math.inf))
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-        raise ConfigurationError(f"{where} must be a number, not {value}")
-    return float(value)
+        bounds[channel] = (at_least, at_most)
+    if keep.at_least_seconds < 0.0:
+        raise ConfigurationError(f"{where}: at_least_seconds must be zero or positive, not {keep.at_least_seconds:g}")
+    return Condition(bounds, keep.at_least_seconds)

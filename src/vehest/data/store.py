@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from vehest.data.errors import DataError, MissingError
-from vehest.data.estimate import Estimate
+from vehest.data.estimate import Estimate, Mode
 from vehest.data.files import writing_error, written_aside
-from vehest.data.recording import Recording
+from vehest.data.parquet import parquet_file, read_numbers
+from vehest.data.recording import Kind, Recording
+from vehest.data.schema import check_format, validated
+from vehest.data.text_files import parse_json
 
 _METADATA_KEY = b"vehest"
 _FORMAT = 1
@@ -26,6 +30,39 @@ _LAYOUT: dict[str, Any] = {
     "write_statistics": False,
     "write_page_checksum": True,  # a flipped bit decompresses to other numbers without complaint
 }
+
+
+@dataclass(frozen=True)
+class RecordingDescription:
+    """What the file of a recording says beside its table; see `Recording`."""
+
+    format: int
+    content: Literal["recording"]
+    id: str
+    vehicle: str
+    rate_hz: float
+    start_time: float
+    kind: Kind = "real"
+    gappy: frozenset[str] = frozenset()
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class EstimateDescription:
+    """What the file of an estimate says beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
+
+    format: int
+    content: Literal["estimate"]
+    recording_id: str
+    estimator: str
+    rate_hz: float
+    start_time: float
+    mode: Mode = "causal"
+    n_states: int | None = None
+    covariance_of: tuple[str, ...] = ("vy", "yaw_rate")  # of files from before rows had names
+
+
+_Description = TypeVar("_Description", RecordingDescription, EstimateDescription)
 
 
 def write_recording(recording: Recording, path: Path) -> None:
@@ -55,25 +92,34 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
         MissingError: there is no such file.
         DataError: the file is damaged, not a recording, or lacks a channel.
     """
-    columns, description = _read(path, "recording", None if channels is None else list(channels))
-    return Recording(
-        id=description["id"],
-        vehicle=description["vehicle"],
-        rate_hz=description["rate_hz"],
-        start_time=description["start_time"],
-        channels=columns,
-        kind=description["kind"],
-        gappy=frozenset(description["gappy"]) & frozenset(columns),
-        provenance=description["provenance"],
-    )
+    columns, described = _read(path, RecordingDescription, None if channels is None else list(channels))
+    try:
+        return Recording(
+            id=described.id,
+            vehicle=described.vehicle,
+            rate_hz=described.rate_hz,
+            start_time=described.start_time,
+            channels=columns,
+            kind=described.kind,
+            gappy=described.gappy & frozenset(columns),
+            provenance=described.provenance,
+        )
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
 
 
 def is_stored_recording(path: Path) -> bool:
-    """Whether ``path`` is a Parquet file that vehest wrote as a recording."""
+    """Whether ``path`` is a Parquet file that vehest wrote as a recording.
+
+    Raises:
+        DataError: it is one, and what it says about itself is damaged.
+    """
     try:
-        return bool(_description(pq.read_schema(path)).get("content") == "recording")
-    except (OSError, pa.ArrowException, ValueError):
+        with parquet_file(path) as file:
+            schema = file.schema_arrow
+    except (DataError, MissingError):
         return False
+    return _description(schema, path).get("content") == "recording"
 
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
@@ -107,24 +153,37 @@ def read_estimate(path: Path) -> Estimate:
         MissingError: there is no such file.
         DataError: the file is damaged or not an estimate.
     """
-    columns, description = _read(path, "estimate", None)
-    columns.pop("time")
-    n_states = description.get("n_states")
-    covariance, covariance_of = None, ()
-    if n_states is not None:
-        entries = [columns.pop(f"{_COVARIANCE}_{row}_{column}") for row, column in np.ndindex(n_states, n_states)]
-        covariance = np.stack(entries, axis=1).reshape(-1, n_states, n_states)
-        covariance_of = tuple(description.get("covariance_of", ("vy", "yaw_rate")))  # of files from before rows had names
-    return Estimate(
-        recording_id=description["recording_id"],
-        estimator=description["estimator"],
-        rate_hz=description["rate_hz"],
-        start_time=description["start_time"],
-        channels=columns,
-        mode=description["mode"],
-        covariance=covariance,
-        covariance_of=covariance_of,
-    )
+    columns, described = _read(path, EstimateDescription, None)
+    if columns.pop("time", None) is None:
+        raise DataError(f"'{path}' has no column 'time'; make it again")
+    covariance = None
+    if described.n_states is not None:
+        covariance = _covariance(columns, described.n_states, path)
+    try:
+        return Estimate(
+            recording_id=described.recording_id,
+            estimator=described.estimator,
+            rate_hz=described.rate_hz,
+            start_time=described.start_time,
+            channels=columns,
+            mode=described.mode,
+            covariance=covariance,
+            covariance_of=() if covariance is None else described.covariance_of,
+        )
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+
+
+def _covariance(columns: dict[str, Any], n_states: int, path: Path) -> Any:
+    """Take the entries of the covariance out of the columns; shape (T, n, n)."""
+    here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
+    if n_states < 1 or n_states**2 != here:
+        raise DataError(f"'{path}': n_states is {n_states}, and there are {here} columns of the covariance; make it again")
+    names = [f"{_COVARIANCE}_{row}_{column}" for row, column in np.ndindex(n_states, n_states)]
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise DataError(f"'{path}' has no column '{missing[0]}'; make it again")
+    return np.stack([columns.pop(name) for name in names], axis=1).reshape(-1, n_states, n_states)
 
 
 def _write(path: Path, columns: Mapping[str, Any], description: Mapping[str, Any]) -> None:
@@ -134,39 +193,48 @@ def _write(path: Path, columns: Mapping[str, Any], description: Mapping[str, Any
         raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({_first_line(error)})") from None
     arrays = {name: pa.array(np.asarray(values, dtype=np.float64)) for name, values in columns.items()}
     table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: described})
-    with written_aside(path) as aside:
+    with written_aside(path) as aside, open(aside, "wb") as stream:  # pyarrow itself takes no names that are not UTF-8
         try:
-            pq.write_table(table, aside, **_LAYOUT)
+            pq.write_table(table, stream, **_LAYOUT)
         except pa.ArrowException as error:
             raise writing_error(path, OSError(str(error))) from error
 
 
-def _read(path: Path, content: str, names: list[str] | None) -> tuple[dict[str, Any], dict[str, Any]]:
-    if not path.is_file():
-        raise MissingError(f"there is no file '{path}'")
-    if path.stat().st_size == 0:
-        raise DataError(f"'{path}' is empty; make it again")
+def _read(path: Path, kind: type[_Description], names: list[str] | None) -> tuple[dict[str, Any], _Description]:
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            description = _description(file.schema_arrow)
-            if description.get("content") != content:
-                article = "an" if content == "estimate" else "a"
-                raise DataError(f"'{path}' is a Parquet file, but not {article} {content} that vehest wrote")
-            if description["format"] > _FORMAT:
-                raise DataError(f"'{path}' was written by a newer vehest (format {description['format']}); update vehest")
+        with parquet_file(path) as file:
+            described = _described(file.schema_arrow, path, kind)
+            _check_columns(file.schema_arrow, path)
             missing = [name for name in names or [] if name not in file.schema_arrow.names]
             if missing:
                 have = ", ".join(file.schema_arrow.names)
                 raise DataError(f"'{path}' has no channel '{missing[0]}' (it has {have})")
-            table = file.read(columns=names)
-    except (OSError, pa.ArrowException, ValueError, KeyError) as error:
+            return dict(read_numbers(path, file, file.schema_arrow.names if names is None else names)), described
+    except (ValueError, KeyError) as error:
         raise DataError(f"'{path}' is truncated or damaged ({_first_line(error)}); make it again") from error
-    return {name: table.column(name).to_numpy() for name in table.column_names}, description
 
 
-def _description(schema: Any) -> dict[str, Any]:
+def _described(schema: Any, path: Path, kind: type[_Description]) -> _Description:
+    content = "recording" if kind is RecordingDescription else "estimate"
+    found = _description(schema, path)
+    if found.get("content") != content:
+        article = "an" if content == "estimate" else "a"
+        raise DataError(f"'{path}' is a Parquet file, but not {article} {content} that vehest wrote")
+    check_format(found.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, found, f"'{path}'")
+
+
+def _check_columns(schema: Any, path: Path) -> None:
+    for name, column in zip(schema.names, schema.types, strict=True):
+        if schema.names.count(name) > 1:
+            raise DataError(f"'{path}' has {schema.names.count(name)} columns called '{name}'; make it again")
+        if column != pa.float64():
+            raise DataError(f"'{path}': column '{name}' is of type {column}, not double; make it again")
+
+
+def _description(schema: Any, path: Path) -> dict[str, Any]:
     """What vehest wrote beside the table; empty for a table of someone else's."""
-    described = json.loads((schema.metadata or {}).get(_METADATA_KEY, b"{}"))
+    described = parse_json((schema.metadata or {}).get(_METADATA_KEY, b"{}"), f"'{path}': the description beside the table")
     return described if isinstance(described, dict) else {}
 
 

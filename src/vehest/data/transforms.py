@@ -12,11 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.limits import check_limit
+from vehest.data.recording import Recording
+from vehest.data.schema import validated
 
 Mode = Literal["causal", "offline"]
+
+LONGEST_DIRECT = 8192
+"""Taps up to which a filter is summed sample by sample; longer ones through their spectra."""
+VALUES_AT_ONCE = 1 << 20
+"""Samples that are compared at a time, windows included."""
 
 
 class Transform(Protocol):
@@ -69,9 +77,14 @@ class Resample:
         """Resample every channel.
 
         Raises:
-            DataError: the ratio is not one of small whole numbers, or a gappy channel would need filtering.
+            DataError: the ratio is not one of small whole numbers, a gappy channel would need filtering, or the outcome or the filter
+                would be longer than the limits.
             ConfigurationError: decimation by a ratio that is not whole.
         """
+        expected = len(recording) * (self.rate_hz / recording.rate_hz)
+        what = f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
+        check_limit("samples", expected, what)
+        check_limit("values", expected * len(recording.channels), f"{what} in each of {len(recording.channels)} channels")
         up, down = self.ratio(recording)
         if up == down:
             return recording
@@ -89,6 +102,9 @@ class Resample:
                     f"recording '{recording.id}': channel '{sorted(recording.gappy)[0]}' has gaps and cannot be filtered; "
                     f"use method=decimate or leave the channel out"
                 )
+            reach = self.zero_crossings * max(up, down)
+            ratio = f"resampling by {up}/{down}, from {recording.rate_hz:g} to {self.rate_hz:g} Hz"
+            check_limit("filter_samples", 2 * reach + 1, f"recording '{recording.id}': {ratio}, needs a filter of {2 * reach + 1} samples")
             taps = self._taps(up, down)
             channels = {name: _resampled(samples, up, down, taps)[:n_out] for name, samples in recording.channels.items()}
         return replace(recording, rate_hz=float(self.rate_hz), channels=channels)
@@ -165,7 +181,8 @@ class LowPass:
         """Filter the channels.
 
         Raises:
-            ConfigurationError: the cut-off is not below the Nyquist frequency.
+            ConfigurationError: the cut-off is not below the Nyquist frequency, or so low, or the reach so long, that the filter is longer
+                than the limit.
             DataError: a channel is missing or has gaps.
         """
         sections = self._sections(recording.rate_hz, f"recording '{recording.id}': ")
@@ -193,6 +210,9 @@ class LowPass:
     def _sections(self, rate_hz: float, where: str) -> FloatArray:
         if not 0 < self.cutoff_hz < rate_hz / 2:
             raise ConfigurationError(f"{where}low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
+        length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
+        what = f"{where}a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
+        check_limit("filter_samples", length, what, ConfigurationError)
         return np.asarray(signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -200,7 +220,8 @@ class LowPass:
         half = max(1, round(self.reach * rate_hz))
         taps = signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
         kind: dict[str, Any] = {"mode": "reflect", "reflect_type": "odd"} if len(samples) > 1 else {"mode": "edge"}
-        return np.convolve(np.pad(samples, half, **kind), taps, mode="valid")
+        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else signal.oaconvolve
+        return convolve(np.pad(samples, half, **kind), taps, mode="valid")
 
 
 class LowPassStepper:
@@ -260,16 +281,26 @@ class RemoveOutliers:
         """Clean the channels.
 
         Raises:
+            ConfigurationError: the windows hold more samples than the limits allow.
             DataError: a channel is missing or has gaps.
         """
+        width = 2 * self.half_window + 1
+        what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
+        check_limit("filter_samples", width, what, ConfigurationError)
+        check_limit("values", width * len(recording), f"{what} compares {width * len(recording)} values a channel", ConfigurationError)
+        at_once = max(VALUES_AT_ONCE // width, 1)
 
         def apply(samples: FloatArray) -> FloatArray:
             padded = np.pad(samples, self.half_window, mode="reflect" if len(samples) > 1 else "edge")
-            neighbours = np.lib.stride_tricks.sliding_window_view(padded, 2 * self.half_window + 1)
-            median = np.median(neighbours, axis=1)
-            deviation = 1.4826 * np.median(np.abs(neighbours - median[:, None]), axis=1)
-            spike = np.abs(samples - median) > self.threshold * deviation + 1e-12
-            return np.where(spike, median, samples)
+            cleaned = np.empty(len(samples))
+            for begin in range(0, len(samples), at_once):
+                inside = samples[begin : begin + at_once]
+                neighbours = np.lib.stride_tricks.sliding_window_view(padded[begin : begin + len(inside) + width - 1], width)
+                median = np.median(neighbours, axis=1)
+                deviation = 1.4826 * np.median(np.abs(neighbours - median[:, None]), axis=1)
+                spike = np.abs(inside - median) > self.threshold * deviation + 1e-12
+                cleaned[begin : begin + len(inside)] = np.where(spike, median, inside)
+            return cleaned
 
         return _with_changed(recording, self.channels, apply)
 
@@ -383,6 +414,8 @@ class DelayCorrection:
             DataError: a channel is missing or has gaps, or the recording is too short.
         """
         position = self.delay * recording.rate_hz
+        if not abs(position) < len(recording):
+            raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s")
         whole = round(position)
         fraction = position - whole
         if abs(fraction) < 1e-9:
@@ -546,7 +579,7 @@ class SpeedFromWheels:
         if not np.isfinite(speeds).any():
             raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
         step = 1.0 / recording.rate_hz
-        most, patience = self.most_acceleration * step, round(self.hold_seconds * recording.rate_hz)
+        most, patience = self.most_acceleration * step, round(min(self.hold_seconds * recording.rate_hz, len(recording)))
         number = counts.sum(0)
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
         ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
@@ -562,6 +595,8 @@ class SpeedFromWheels:
             else:
                 now += min(max(wanted - now, -most), most)
             vx[k] = now
+        if not np.isfinite(vx).any():
+            raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
         vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
         return replace(recording, channels={**recording.channels, "vx": vx}, gappy=recording.gappy - {"vx"})
 
@@ -588,6 +623,27 @@ TRANSFORMS: dict[str, type] = {
 }
 
 
+@dataclass(frozen=True)
+class Preparation:
+    """How recordings are brought to an estimator's rate, as ``downsample`` of a configuration or of a model says it.
+
+    Args:
+        method: of `Resample`.
+        transforms: applied before, at the native rate, each by its ``name`` and its arguments.
+    """
+
+    method: Literal["polyphase", "decimate"] = "polyphase"
+    transforms: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        for entry in self.transforms:
+            transform_from_config(entry)
+
+    def as_plain(self) -> dict[str, Any]:
+        """As files hold it."""
+        return {"method": self.method, "transforms": [dict(entry) for entry in self.transforms]}
+
+
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
     """Build a transform from plain values: its ``name`` and its arguments.
 
@@ -596,16 +652,13 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
     """
     if not isinstance(config, Mapping):
         raise ConfigurationError(f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}")
-    arguments = {key: tuple(value) if isinstance(value, list) else value for key, value in config.items() if key != "name"}
+    arguments = {str(key): value for key, value in config.items() if key != "name"}
     if isinstance(arguments.get("channels"), str):
-        arguments["channels"] = (arguments["channels"],)
+        arguments["channels"] = [arguments["channels"]]
     name = config.get("name")
-    if name not in TRANSFORMS:
+    if not isinstance(name, str) or name not in TRANSFORMS:
         raise ConfigurationError(f"transform '{name}' is not one of: {', '.join(TRANSFORMS)}")
-    try:
-        transform: Transform = TRANSFORMS[name](**arguments)
-    except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"transform '{name}': {error}") from None
+    transform: Transform = validated(TRANSFORMS[name], arguments, f"transform '{name}'", error=ConfigurationError)
     return transform
 
 

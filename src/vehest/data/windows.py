@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.limits import check_limit
+from vehest.data.recording import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,10 @@ def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target:
     """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1).
 
     Raises:
-        DataError: no recording is long enough, or a gappy channel has gaps: a network cannot read "not measured".
+        DataError: no recording is long enough, a window is longer than the limit, or a gappy channel has gaps: a network cannot read
+            "not measured".
     """
+    check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
     series, targets, starts, offset = [], [], [], 0
     for recording in recordings:
         for name in (*channels, target):

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
+from vehest.data.schema import settings_from_config
 from vehest.training.context import FitContext
-from vehest.training.settings import settings_from_config
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class Estimator(ABC):
         settings_type: dataclass of its settings.
         training_type: dataclass of the settings of its fit.
         skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
+        open_weights: weights that may stay NaN, because each recording tells them.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
@@ -92,6 +94,7 @@ class Estimator(ABC):
     settings_type: ClassVar[type[EstimatorSettings]]
     training_type: ClassVar[type]
     skippable: ClassVar[tuple[str, ...]] = ()
+    open_weights: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
 
     def __init__(self, settings: EstimatorSettings) -> None:

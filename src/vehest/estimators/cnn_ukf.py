@@ -10,17 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
+from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
+from vehest.estimators.networks.sample_network import SampleNetwork, believed, learnt_samples
 from vehest.estimators.phase_records import record_of_phases
-from vehest.estimators.sample_network import SampleNetwork, believed, learnt_samples, reference_sideslip
+from vehest.estimators.references import reference_sideslip
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
-from vehest.training.sequences import Phase, train_phases
-from vehest.training.settings import IdentificationSettings, PhaseSettings
+from vehest.training.sequences import Phase, PhaseSettings, train_phases
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained

@@ -14,19 +14,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
-from vehest.estimators.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
-from vehest.estimators.sample_network import reference_sideslip
-from vehest.estimators.single_track import checked_sample, require_positive
-from vehest.estimators.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
+from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
+from vehest.estimators.filtering.single_track import checked_sample, require_positive
+from vehest.estimators.filtering.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
+from vehest.estimators.references import reference_sideslip
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
-from vehest.training.settings import IdentificationSettings
 from vehest.vehicle.dugoff import BMW_545I, TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
 Inputs = Literal["full", "imu"]

@@ -9,18 +9,19 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word
+from vehest.estimators.networks.sample_network import SampleNetwork, believed, learnt_samples
 from vehest.estimators.phase_records import record_of_phases
-from vehest.estimators.sample_network import SampleNetwork, believed, learnt_samples
 from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import SampleSettings, sample_phase
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
-from vehest.training.sequences import train_phases
-from vehest.training.settings import IdentificationSettings, PhaseSettings
+from vehest.training.sequences import PhaseSettings, train_phases
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""

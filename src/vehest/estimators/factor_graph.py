@@ -12,11 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
-from vehest.estimators.single_track import SampledModel, SingleTrackEstimator, SingleTrackSettings, checked_sample, require_positive
+from vehest.estimators.filtering.single_track import (
+    SampledModel,
+    SingleTrackEstimator,
+    SingleTrackSettings,
+    checked_sample,
+    require_positive,
+)
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 

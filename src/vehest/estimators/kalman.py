@@ -10,11 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.single_track import SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
+from vehest.estimators.filtering.single_track import SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
@@ -86,6 +87,7 @@ class KalmanFilter(SingleTrackEstimator):
 
     name = "kalman"
     title = "Kalman filter"
+    open_weights = LEVELS
     settings_type = KalmanSettings
     settings: KalmanSettings
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.estimators.windowed import WindowedEstimator, WindowedSettings
+from vehest.estimators.networks.windowed import WindowedEstimator, WindowedSettings
 
 GAMMA_START = 0.98
 GAMMA_SPREAD = 0.01

@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
-from vehest.estimators.car_filter import CarFilter
+from vehest.estimators.filtering.car_filter import CarFilter
 from vehest.estimators.phase_records import record_of_phases
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.unscented_scan import UnscentedStepper
@@ -23,7 +24,7 @@ from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
 from vehest.vehicle.dynamics import STATES, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar
-from vehest.vehicle.planar import F1TENTH_START, GRAVITY, Chassis
+from vehest.vehicle.planar import F1TENTH_START, Chassis
 
 DYNAMICS = ("pacejka", "residual", "neural", "tyre_network", "friction_tyre_network")
 SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}

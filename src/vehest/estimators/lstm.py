@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vehest.estimators.recurrent import RecurrentEstimator, RecurrentNetwork, RecurrentSettings
+from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork, RecurrentSettings
 
 
 class LstmNetwork(RecurrentNetwork):

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
 from vehest.training.context import FitContext
-from vehest.training.search import nelder_mead_over_grid
-from vehest.training.settings import DirectSearchSettings
+from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
 
 GAIN_BOX = (0.0, 50.0)
 GAIN_STARTS = (3.0, 20.0)

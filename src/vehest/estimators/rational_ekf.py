@@ -14,19 +14,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
-from vehest.estimators.tyre_fit import fit_tyres
+from vehest.estimators.filtering.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
+from vehest.estimators.filtering.tyre_fit import fit_tyres
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import cubature_rule
 from vehest.training.context import FitContext
+from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
-from vehest.training.settings import NoiseTuningSettings
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")

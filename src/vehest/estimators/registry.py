@@ -7,7 +7,6 @@ another package in the group ``vehest.estimators``.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import pkgutil
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -53,7 +52,7 @@ def estimator_class(name: str) -> type[Estimator]:
 
 
 def _own_class(name: str) -> type[Estimator] | None:
-    if not name.isidentifier() or importlib.util.find_spec(f"{package.__name__}.{name}") is None:
+    if name not in {module.name for module in pkgutil.iter_modules(package.__path__)}:
         return None
     found: type[Estimator] | None = getattr(importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None)
     return found

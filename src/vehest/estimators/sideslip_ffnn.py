@@ -12,8 +12,8 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, required
 from vehest.estimators.kernels.sample_network import squared_error
+from vehest.estimators.networks.sample_network import SampleNetwork, SampleNetworkSettings, believed, learnt_samples, network_with_weights
 from vehest.estimators.phase_records import record_of_phases
-from vehest.estimators.sample_network import SampleNetwork, SampleNetworkSettings, believed, learnt_samples, network_with_weights
 from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings, sample_phase
 from vehest.training.sequences import train_phases

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork, VelocityNetworkSettings
+from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork, VelocityNetworkSettings
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 
 COVERAGE = {1: 0.6827, 2: 0.9545}
 """Number of standard deviations -> fraction of Gaussian errors within them."""

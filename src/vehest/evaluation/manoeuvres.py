@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import NONLINEAR_AY, Scored
 

@@ -8,9 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.consistency import coverage, normalised_error_squared, normalised_innovation_squared
 

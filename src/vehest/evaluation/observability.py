@@ -21,7 +21,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-FloatArray = NDArray[np.float64]
+from vehest.constants import FloatArray
+
 StateFunction = Callable[[Tensor, Tensor], Tensor]
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
 
 CONFIDENCE = 0.95
 DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
@@ -19,19 +19,28 @@ DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
 @dataclass(frozen=True)
 class Interval:
-    """A difference, first - second, and how well it is known.
+    """A figure, or a difference first - second, and how well it is known.
 
     Args:
-        value: the difference; negative where the first has the lower loss.
+        value: the figure; of a difference, negative where the first has the lower loss.
         low: lower end of the 95 % interval.
         high: its upper end.
         p_value: two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out.
+        error: standard error.
+        dof: degrees of freedom of Student's t.
     """
 
     value: float
     low: float
     high: float
     p_value: float
+    error: float = 0.0
+    dof: float = np.inf
+
+    def at(self, confidence: float) -> tuple[float, float]:
+        """Both ends at another confidence than 95 %."""
+        half = float(stats.t.ppf(0.5 + confidence / 2.0, self.dof)) * self.error
+        return self.value - half, self.value + half
 
 
 @dataclass(frozen=True)
@@ -41,12 +50,15 @@ class Difference:
     Args:
         mean: of their mean losses over all seeds and samples.
         median: of the medians over seeds of their mean losses over samples.
+        root: of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a
+            loss is negative.
         n_blocks: blocks that were resampled.
         dof: degrees of freedom of Student's t behind both intervals.
     """
 
     mean: Interval
     median: Interval
+    root: Interval
     n_blocks: int
     dof: float
 
@@ -99,16 +111,100 @@ def paired_difference(
             f"there are {len(starts)} blocks to resample, at least two are needed; give more sequences or a shorter block_seconds"
         )
     sizes = np.diff([*starts, len(sequence)]).astype(np.float64)
-    sums = [np.add.reduceat(losses, starts, axis=1) for losses in (first, second)]
-    means = [losses.mean(axis=1) for losses in (first, second)]
+    return difference_of_blocks(
+        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples, seed=seed
+    )
+
+
+def difference_of_blocks(
+    first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000, seed: int = 0
+) -> Difference:
+    """Compare two estimators on the same blocks, as `paired_difference` says.
+
+    Args:
+        first: sum of the losses of each seed over each block, shape (S, B).
+        second: shape (S', B).
+        sizes: samples in each block, shape (B,).
+        n_resamples: how many.
+        seed: of the resampling.
+
+    Raises:
+        DataError: there are fewer than two blocks.
+    """
+    if len(sizes) < 2:
+        raise DataError(f"there are {len(sizes)} blocks to resample, at least two are needed")
+    sums = [first, second]
+    means = [own.sum(axis=1) / sizes.sum() for own in sums]
     dof = _degrees_of_freedom(sums, sizes, means)
-    drawn_means, drawn_medians = _resampled(sums, sizes, n_resamples, np.random.default_rng(seed))
+    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(seed))
+    with np.errstate(invalid="ignore"):
+        root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
     return Difference(
-        mean=_interval(float(means[0].mean() - means[1].mean()), drawn_means, dof),
-        median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn_medians, dof),
-        n_blocks=len(starts),
+        mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
+        median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
+        root=_interval(root, drawn[2], dof),
+        n_blocks=len(sizes),
         dof=dof,
     )
+
+
+def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000, seed: int = 0) -> Interval:
+    """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
+
+    Blocks and seeds are drawn as in `paired_difference`; the interval is symmetric on a logarithmic axis, on which the distribution of a
+    root of few blocks is less skewed.
+
+    Args:
+        sums: sum of the losses of each seed over each block, (S, B), none negative.
+        sizes: samples in each block, (B,).
+        n_resamples: how many.
+        seed: of the resampling.
+    """
+    value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
+    if not value > 0:
+        return Interval(value, value, value, 1.0)
+    nothing = np.zeros((1, len(sizes)))
+    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(seed))[2]
+    return _logarithmic(value, drawn, _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]))
+
+
+def unexplained_interval(
+    squared_error: FloatArray, error: FloatArray, squared: FloatArray, reference: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000
+) -> Interval:
+    """The fraction of variance unexplained with its interval, as `root_interval`; all arguments are sums over blocks, (B,).
+
+    Args:
+        squared_error: of (v̂ - v)².
+        error: of v̂ - v.
+        squared: of v².
+        reference: of v.
+        sizes: samples.
+        n_resamples: how many.
+    """
+    drawn = _counts(len(sizes), n_resamples, np.random.default_rng(0))
+
+    def fraction(counts: FloatArray) -> FloatArray:
+        n = counts @ sizes
+        part: FloatArray = counts @ squared_error / n - np.square(counts @ error / n)
+        return part / (counts @ squared / n - np.square(counts @ reference / n))
+
+    value = float(fraction(np.ones((1, len(sizes))))[0])
+    if not value > 0:
+        return Interval(value, value, value, 1.0)
+    return _logarithmic(value, fraction(drawn), len(sizes) - 1)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """p-values adjusted for their number: those below 0.05 hold together with an error of at most 5 %.
+
+    Source: Holm, Scandinavian Journal of Statistics 6 (2), 1979.
+    """
+    order = np.argsort(p_values, kind="stable")
+    adjusted, largest = [1.0] * len(p_values), 0.0
+    for rank, position in enumerate(order):
+        largest = max(largest, min((len(p_values) - rank) * p_values[position], 1.0))
+        adjusted[int(position)] = largest
+    return adjusted
 
 
 def sequence_labels(lengths: Sequence[int]) -> NDArray[np.int64]:
@@ -124,16 +220,20 @@ def _block_starts(sequence: NDArray[np.int64], block: int | None) -> NDArray[np.
     return np.concatenate(starts).astype(np.int64)
 
 
-def _resampled(
-    sums: Sequence[FloatArray], sizes: FloatArray, n_resamples: int, generator: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Differences of means and of medians over seeds of each resample, (n_resamples,) each."""
+def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:
+    """How often each block is drawn, (n, n_blocks): n_blocks - 1 draws with replacement."""
+    counts: FloatArray = generator.multinomial(n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n).astype(np.float64)
+    return counts
+
+
+def _resampled(sums: Sequence[FloatArray], sizes: FloatArray, n_resamples: int, generator: np.random.Generator) -> list[FloatArray]:
+    """Differences of means, of medians over seeds, and of roots of means of each resample, (n_resamples,) each."""
     n_blocks = len(sizes)
     at_once = max(DRAWN_AT_ONCE // n_blocks, 1)
-    of_means, of_medians = [], []
+    drawn_of: list[list[FloatArray]] = [[], [], []]
     for begin in range(0, n_resamples, at_once):
         n = min(at_once, n_resamples - begin)
-        counts = generator.multinomial(n_blocks - 1, np.full(n_blocks, 1.0 / n_blocks), size=n).astype(np.float64)
+        counts = _counts(n_blocks, n, generator)
         mean, median = [], []
         for own in sums:
             losses = counts @ own.T / (counts @ sizes)[:, None]
@@ -142,9 +242,11 @@ def _resampled(
             fewer = drawn[:, : max(n_seeds - 1, 1)]
             mean.append(fewer.mean(axis=1))
             median.append(np.median(drawn if n_seeds > 2 else fewer, axis=1))
-        of_means.append(mean[0] - mean[1])
-        of_medians.append(median[0] - median[1])
-    return np.concatenate(of_means), np.concatenate(of_medians)
+        drawn_of[0].append(mean[0] - mean[1])
+        drawn_of[1].append(median[0] - median[1])
+        with np.errstate(invalid="ignore"):
+            drawn_of[2].append(np.sqrt(mean[0]) - np.sqrt(mean[1]))
+    return [np.concatenate(parts) for parts in drawn_of]
 
 
 def _degrees_of_freedom(sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]) -> float:
@@ -161,4 +263,12 @@ def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
     error = float(np.std(drawn))
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, dof)) * error
     ratio = abs(value) / error if error > 0 else (np.inf if value else 0.0)
-    return Interval(value, value - half, value + half, 2.0 * float(stats.t.sf(ratio, dof)))
+    return Interval(value, value - half, value + half, 2.0 * float(stats.t.sf(ratio, dof)), error, dof)
+
+
+def _logarithmic(value: float, drawn: FloatArray, dof: float) -> Interval:
+    """Of a positive figure, symmetric on a logarithmic axis."""
+    finite = drawn[np.isfinite(drawn) & (drawn > 0)]
+    error = float(np.std(np.log(finite / value)))
+    factor = float(np.exp(stats.t.ppf(0.5 + CONFIDENCE / 2.0, dof) * error))
+    return Interval(value, value / factor, value * factor, np.nan, error * value, dof)

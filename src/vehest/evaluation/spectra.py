@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 
 SEGMENT_SECONDS = 25.6
 """Length of a segment [s]: 512 samples at 20 Hz, a line every 0.04 Hz."""

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-FloatArray = NDArray[np.float64]
 Array = TypeVar("Array", Tensor, NDArray[np.float64])
 """A tensor where gradients are wanted, a NumPy array in compiled filters."""
 

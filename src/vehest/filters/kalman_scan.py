@@ -7,7 +7,8 @@ import math
 import numba
 import numpy as np
 
-from vehest.filters.gaussian import Filtered, FloatArray, Gaussian
+from vehest.constants import FloatArray
+from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel, shapes_of
 
 

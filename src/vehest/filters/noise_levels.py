@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import signal
 
-from vehest.filters.gaussian import FloatArray
+from vehest.constants import FloatArray
 
 STOP_BAND_DB = 60.0
 

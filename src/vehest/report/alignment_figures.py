@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import signal
 
-from vehest.data.alignment import Alignment, Residual, Steering
-from vehest.data.alignment_imu import Correlation
-from vehest.data.recording import FloatArray
+from vehest.alignment.align import Alignment, Residual, Steering
+from vehest.alignment.imu import Correlation
+from vehest.constants import FloatArray
 from vehest.report.figures import decimated
 from vehest.report.style import (
     DOUBLE_COLUMN,

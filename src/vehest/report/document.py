@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from vehest.data.errors import printable
 from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ PNG_COLOURS = 256
 _PATH = re.compile(r'\bd="[^"]*"')
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
+_UNWANTED = {"html_inline", "html_block", "image"}
+_SCRIPTED = re.compile(r"(?!https?:|mailto:)[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 
@@ -133,7 +136,9 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bo
         write_document(document, folder, page=page, name=name)
 
 
-def write_document(document: Document, folder: Path, *, page: bool = True, name: str = "report") -> None:
+def write_document(
+    document: Document, folder: Path, *, page: bool = True, name: str = "report", on_page: Sequence[str | Table] = ()
+) -> None:
     """Write ``report.md``, ``tables/*.csv``, ``figures/*.png`` and ``*.svg``, and ``report.html`` where ``page`` is set.
 
     The same document gives the same bytes.
@@ -143,6 +148,10 @@ def write_document(document: Document, folder: Path, *, page: bool = True, name:
         folder: an existing folder.
         page: whether to write the self-contained page too.
         name: of both files, without ending.
+        on_page: text and tables that the page alone ends with, and no other file holds.
+
+    Raises:
+        ValueError: a table of ``on_page`` has the name of another.
     """
     numbers = _numbers(document)
     images: dict[str, bytes] = {}
@@ -158,7 +167,23 @@ def write_document(document: Document, folder: Path, *, page: bool = True, name:
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
     _write_text(folder / f"{name}.md", _markdown(document, numbers))
     if page:
-        _write_text(folder / f"{name}.html", _page(document, numbers, images))
+        whole = Document(document.title, [*document.blocks, *on_page], document.data)
+        _write_text(folder / f"{name}.html", _page(whole, _numbers(whole), images))
+
+
+def as_text(name: str) -> str:
+    """A name or title from a file as Markdown that shows it as it is, on one line: nothing in it is a link, markup or HTML."""
+    line = printable(" ".join(name.split()))
+    line = re.sub(r"[\\`*\[\]]", r"\\\g<0>", line)
+    line = re.sub(r"(?<![^\W_])_|_(?![^\W_])", r"\_", line)
+    return re.sub(r"&(?=#?\w+;)", "&amp;", line).replace("<", "&lt;")
+
+
+def as_code(text: str) -> str:
+    """Text as a Markdown code span that it cannot end."""
+    line = printable(" ".join(text.split()))
+    fence = "`" * (max((len(run) for run in re.findall("`+", line)), default=0) + 1)
+    return f"{fence} {line} {fence}" if "`" in line else f"`{line}`"
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
@@ -176,7 +201,7 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
         columns.append(_number_cells(values.tolist(), column) if is_number else [_text_cell(value) for value in values.tolist()])
-    return [column.header for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
+    return [printable(column.header) for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
 
 
 def _number_cells(values: list[Any], column: Column) -> list[str]:
@@ -190,7 +215,7 @@ def _number_cells(values: list[Any], column: Column) -> list[str]:
 
 
 def _text_cell(value: Any) -> str:
-    return MISSING if value is None or value != value else str(value)
+    return MISSING if value is None or value != value else printable(str(value))
 
 
 def _numbers(document: Document) -> dict[int, str]:
@@ -246,24 +271,24 @@ def _for_both_schemes(svg: bytes) -> bytes:
 
 def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     (folder / "tables").mkdir(exist_ok=True)
-    frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8")
+    frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _write_text(path: Path, text: str) -> None:
-    path.write_bytes(text.encode("utf-8"))
+    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
-    parts = [f"# {document.title}"]
+    parts = [f"# {as_text(document.title)}"]
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
-            parts.append(block.strip())
+            parts.append(_harmless(block.strip()))
         elif isinstance(block, Table):
-            parts.append(f"**{numbers[position]}.** {block.caption} ([CSV](tables/{block.name}.csv))")
+            parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([CSV](tables/{block.name}.csv))")
             parts.append(_pipe_table(block))
         else:
             parts.append(f"![{_spoken(block.caption)}](figures/{block.name}.png)")
-            parts.append(f"**{numbers[position]}.** {block.caption} ([SVG](figures/{block.name}.svg))")
+            parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([SVG](figures/{block.name}.svg))")
     return "\n\n".join(parts) + "\n"
 
 
@@ -274,7 +299,21 @@ def _pipe_table(table: Table) -> str:
 
 
 def _in_pipes(cell: str) -> str:
-    return cell.replace("|", "\\|").replace("<", "&lt;").replace("\n", " ")
+    line = printable(" ".join(cell.split()))
+    return line.replace("\\", "&#92;").replace("|", "\\|").replace("<", "&lt;").replace("](", "]\\(")
+
+
+def _harmless(text: str) -> str:
+    """Markdown without HTML, pictures, or links that lead anywhere but to pages and files; what it holds of them is shown as text."""
+    from markdown_it import MarkdownIt
+
+    text = printable(text, keep="\n\t")
+    parser = MarkdownIt("commonmark", {"html": True})
+    parser.validateLink = lambda url: True  # type: ignore[method-assign]
+    tokens = [token for outer in parser.parse(text) for token in (outer, *(outer.children or []))]
+    if not any(token.type in _UNWANTED or _SCRIPTED.match(str(token.attrGet("href") or "")) for token in tokens):
+        return text
+    return text.replace("\\[", "[").replace("<", "&lt;").replace("[", "&#91;")
 
 
 def _spoken(caption: str) -> str:
@@ -292,12 +331,12 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
-            blocks.append({"kind": "text", "html": Markup(_LINK_TO_PAGE.sub(r'href="\1.html"', markdown.render(block)))})
+            blocks.append({"kind": "text", "html": Markup(_LINK_TO_PAGE.sub(r'href="\1.html"', markdown.render(_harmless(block))))})
             continue
-        shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(block.caption))}
+        shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(_harmless(block.caption)))}
         if isinstance(block, Table):
             headers, rows, numeric = formatted(block)
-            csv = block.frame.to_csv(index=False, lineterminator="\n").encode()
+            csv = block.frame.to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
             blocks.append(
                 {"kind": "table", **shared, "headers": headers, "rows": rows, "numeric": numeric, "csv": _data_uri(csv, "text/csv")}
             )
@@ -314,7 +353,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         keep_trailing_newline=True,
     )
     return environment.get_template("page.html.j2").render(
-        title=document.title,
+        title=printable(document.title),
         blocks=blocks,
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),

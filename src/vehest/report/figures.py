@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, on_dark, paper_style, significant
 
 if TYPE_CHECKING:

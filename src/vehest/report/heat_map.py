@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure, paper_style
 
 if TYPE_CHECKING:

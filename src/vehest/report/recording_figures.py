@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, new_figure, paper_style
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 from vehest.report.figures import Learning, Traces, learning_curves, traces_figure
 from vehest.report.style import REFERENCE, line_of
 

@@ -8,25 +8,23 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.simulation.car import Car, car_of
-from vehest.simulation.compiled import LIBRARY, LIBRARY_VERSION
-from vehest.simulation.driver import DRIVER_RATE_HZ, Command, Observation
+from vehest.simulation.driving.car import Car, car_of
+from vehest.simulation.driving.driver import DRIVER_RATE_HZ, Command, Observation
+from vehest.simulation.driving.manoeuvre import SETTLING_TIME, Controller, Manoeuvre
 from vehest.simulation.errors import SimulationError
-from vehest.simulation.manoeuvre import SETTLING_TIME, Controller, Manoeuvre
-from vehest.simulation.motion import Motion
-from vehest.simulation.parameters import Vehicle
-from vehest.simulation.plant import MultiBodyPlant, PlantState, road_gravity
-from vehest.simulation.regimes import GRAVITY, STEER, VX, VY, YAW, YAW_RATE, X, Y
-from vehest.simulation.sensors import SensorLevels, described, measure
-from vehest.simulation.stability import StabilityControl, StabilityState
-from vehest.simulation.stability import stability_control as make_stability_control
-from vehest.simulation.surface import SURFACES, Surface
-
-FloatArray = NDArray[np.float64]
+from vehest.simulation.plant.compiled import LIBRARY, LIBRARY_VERSION
+from vehest.simulation.plant.motion import Motion
+from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState, road_gravity
+from vehest.simulation.plant.parameters import Vehicle
+from vehest.simulation.plant.regimes import STEER, VX, VY, YAW, YAW_RATE, X, Y
+from vehest.simulation.plant.stability import StabilityControl, StabilityState
+from vehest.simulation.plant.stability import stability_control as make_stability_control
+from vehest.simulation.road.surface import SURFACES, Surface
+from vehest.simulation.sensors.recording import SensorLevels, described, measure
 
 AFTER_STAND = 1.0
 """Recorded after the car has come to its stand [s]."""

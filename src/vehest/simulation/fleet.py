@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.parameters import REAR_TYRE, Vehicle, is_number, library_parameters, rear_tyre
-from vehest.simulation.planar_car import PlanarCar, scaled_car
-from vehest.simulation.sensor_levels import SensorLevel, SensorLevels
+from vehest.simulation.plant.parameters import REAR_TYRE, Vehicle, is_number, library_parameters, rear_tyre
+from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
+from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
 
 _STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
 

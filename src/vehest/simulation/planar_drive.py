@@ -10,14 +10,14 @@ import numpy as np
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.simulation.drive import Flags, Trip, as_json, whole_steps
-from vehest.simulation.driver import Observation
+from vehest.simulation.driving.driver import Observation
+from vehest.simulation.driving.freestyle import COMMAND_RATE_HZ, Freestyle
+from vehest.simulation.driving.manoeuvre import SETTLING_TIME
 from vehest.simulation.errors import SimulationError
-from vehest.simulation.freestyle import COMMAND_RATE_HZ, Freestyle
-from vehest.simulation.manoeuvre import SETTLING_TIME
-from vehest.simulation.planar_car import PlanarCar
-from vehest.simulation.planar_plant import STEER, VX, VY, YAW, YAW_RATE, PlanarPlant, X, Y
-from vehest.simulation.sensors import PRESETS, SensorLevels, described, measure
-from vehest.simulation.surface import SURFACES, Surface
+from vehest.simulation.plant.planar import STEER, VX, VY, YAW, YAW_RATE, PlanarPlant, X, Y
+from vehest.simulation.plant.planar_car import PlanarCar
+from vehest.simulation.road.surface import SURFACES, Surface
+from vehest.simulation.sensors.recording import PRESETS, SensorLevels, described, measure
 
 PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
 """Manoeuvres of the planar plant's cars by name."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import lzma
+import os
 import stat
 import struct
 import tempfile
@@ -11,16 +14,27 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PureWindowsPath
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from vehest.data.errors import DataError, MissingError
-from vehest.data.files import writing_error
+from vehest.data.files import regular_file, writing_error
+from vehest.data.limits import check_limit, check_unpacked, current_limits
 
 MOST_BYTES = 8 * 10**9
 MOST_FILES = 10_000
 BLOCK = 1 << 20
+LONGEST_NAME = 255  # bytes, of a file or a folder
 
-_UNSOUND = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
+_UNSOUND = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, RuntimeError, ValueError, OverflowError, MemoryError)
+
+
+class _Archive(io.FileIO):
+    """A file that is not read at once where that takes more than the limit; the list of an archive's entries is as long as it says."""
+
+    def read(self, size: int | None = -1, /) -> Any:
+        asked = os.fstat(self.fileno()).st_size - self.tell() if size is None or size < 0 else size
+        check_limit("text_bytes", asked, f"'{os.fsdecode(str(self.name))}' holds a list of entries of {asked} bytes")
+        return super().read(size)
 
 
 @contextmanager
@@ -28,7 +42,8 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
     """Yield a temporary folder with the contents of a zip archive; it is removed afterwards, whatever happens.
 
     Nothing is written before every entry has been looked at. Refused are names that climb out of the folder or are absolute,
-    symbolic links and special files, encrypted entries, two entries of one name, and more bytes or files than the limits.
+    symbolic links and special files, encrypted entries, two entries of one name, and more bytes or files than the limits. What an archive
+    says of its sizes is not believed: no entry is unpacked beyond what it says. Archives inside are files like any other.
 
     Args:
         file: the archive.
@@ -41,7 +56,7 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
     """
     with _temporary_folder(file) as folder:
         try:
-            with zipfile.ZipFile(file) as archive:
+            with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 targets = _targets(file, archive.infolist(), most_bytes, most_files)
                 left = most_bytes
                 for entry, parts in targets:
@@ -49,6 +64,8 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
         except _UNSOUND as error:
             raise DataError(f"'{file}' is not a sound zip archive ({_first_line(error)}); fetch it again") from None
         except OSError as error:
+            if error.errno == errno.EINVAL:  # an offset before the beginning
+                raise DataError(f"'{file}' is not a sound zip archive (an entry lies outside of it); fetch it again") from None
             raise MissingError(f"cannot read '{file}' ({error.strerror or error}); check the disk and its permissions") from None
         yield folder
 
@@ -73,6 +90,7 @@ def _targets(file: Path, entries: list[zipfile.ZipInfo], most_bytes: int, most_f
             f"'{file}' would unpack to {size / 1e9:.3g} GB, more than the limit of {most_bytes / 1e9:.3g} GB; "
             f"unpack it by hand if you trust it"
         )
+    check_unpacked(file, file.stat().st_size, size)
     targets: dict[tuple[str, ...], zipfile.ZipInfo] = {}
     for entry in entries:
         parts = _harmless_path(file, entry)
@@ -92,6 +110,8 @@ def _harmless_path(file: Path, entry: zipfile.ZipInfo) -> tuple[str, ...]:
     parts = tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", "."))
     if name.startswith(("/", "\\")) or PureWindowsPath(name).drive or ".." in parts or not parts or any(ord(c) < 32 for c in name):
         raise DataError(f"'{file}': entry {name!r} would be written outside of the folder it belongs in; do not trust this archive")
+    if len(parts) > current_limits().depth or any(len(part.encode("utf-8", "surrogateescape")) > LONGEST_NAME for part in parts):
+        raise DataError(f"'{file}': entry {name[:60]!r}… has too long a name, or lies in too many folders; pack it again")
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind == stat.S_IFLNK:
         raise DataError(f"'{file}': entry {name!r} is a symbolic link, which could lead anywhere; pack the file itself")

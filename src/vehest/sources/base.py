@@ -6,13 +6,16 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import vehest.sources as package
 from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
+from vehest.data.schema import validated
 from vehest.data.splits import check_name
 
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
@@ -27,17 +30,37 @@ def kind_of(dataset: Mapping[str, Any]) -> Kind:
     return "simulated" if SIMULATED in (dataset.get("source"), dataset.get("kind")) else "real"
 
 
+@dataclass(frozen=True)
+class CommonOptions:
+    """What every data set says; see docs/data.md."""
+
+    source: str
+    name: str = "unnamed"
+    title: str = ""
+    kind: Kind = "real"
+    vehicle: str | dict[str, Any] | None = None
+    licence: str = ""
+    citation: str = ""
+    accept: Annotated[tuple[str, ...], "a list of checks"] | None = None
+    download: Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None = None
+
+
 class Source(ABC):
     """Reads one data set.
 
     Args:
         dataset: its configuration, as conf/dataset/*.yaml holds it.
 
+    Attributes:
+        keys: options of its own.
+        options_type: dataclass of those options, which says of what type they are.
+
     Raises:
         ConfigurationError: a key that this source does not know, or one that is missing.
     """
 
     keys: ClassVar[frozenset[str]] = frozenset()
+    options_type: ClassVar[type | None] = None
     slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -51,13 +74,13 @@ class Source(ABC):
                 f"data set '{self.name}': source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {known}"
             )
 
-        if dataset.get("kind", "real") not in ("real", "simulated"):
-            raise ConfigurationError(f"data set '{self.name}': kind '{dataset['kind']}' is not one of: real, simulated")
+        told = {key: value for key, value in dataset.items() if key in COMMON_KEYS}
+        validated(CommonOptions, told, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
         if dataset.get("source") == SIMULATED and dataset.get("kind", "simulated") != "simulated":
             raise ConfigurationError(f"data set '{self.name}': what source '{SIMULATED}' makes is simulated; leave kind out")
-        accept = dataset.get("accept") or []
-        if isinstance(accept, str) or not isinstance(accept, Sequence):
-            raise ConfigurationError(f"data set '{self.name}': accept is a list of checks, such as [impossible], not {accept!r}")
+        if self.options_type is not None:
+            own = {key: value for key, value in dataset.items() if key in self.keys}
+            validated(self.options_type, own, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
 
     @property
     def kind(self) -> Kind:
@@ -167,9 +190,12 @@ def require_files(files: Sequence[Path], dataset: str) -> None:
 
     Raises:
         MissingError: one is not there or is empty.
+        DataError: one is a pipe, a device or a folder.
     """
     for file in files:
-        if not file.is_file():
-            raise MissingError(f"data set '{dataset}': there is no file '{file}'")
-        if file.stat().st_size == 0:
+        try:
+            size = regular_file(file).stat().st_size
+        except MissingError as error:
+            raise MissingError(f"data set '{dataset}': {error}") from None
+        if size == 0:
             raise MissingError(f"data set '{dataset}': file '{file}' is empty")

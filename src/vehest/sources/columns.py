@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from vehest.alignment.checks import checks_of_clock
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
-from vehest.data.checks import checks_of_clock
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import FloatArray
+from vehest.data.limits import check_limit
+from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
 
 ClockPolicy = Literal["strict", "interpolate"]
+ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
+ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
 
 MOST_DRIFT = 0.01  # of an interval, over a whole recording, that may come from the resolution of the stamps
+SHORTEST_INTERVAL = 1e-9  # s
+LONGEST_INTERVAL = 86_400.0  # s
+WORTH_A_LOOK = 64 * 2**20  # bytes of a channel on an even clock, from which on it may not be much longer than the file
 INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
 
 
@@ -35,7 +42,7 @@ class Column:
     column: str
     unit: str
     sign: int = 1
-    factor: float = 1.0
+    factor: Annotated[float, "a number other than 0"] = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
         """Values in SI units and ISO 8855 signs."""
@@ -70,14 +77,16 @@ def column_from_config(entry: Any, where: str) -> Column:
     Raises:
         ConfigurationError: it does not say column and unit, or says something else too.
     """
-    if not isinstance(entry, Mapping) or not {"column", "unit"} <= set(entry) or set(entry) - {"column", "unit", "sign", "factor"}:
-        raise ConfigurationError(f"{where} must say column, unit and, if need be, sign and factor, not {entry}")
-    if entry.get("sign", 1) not in (1, -1):
-        raise ConfigurationError(f"{where}: sign must be 1 or -1, not {entry['sign']}")
-    factor = entry.get("factor", 1.0)
-    if isinstance(factor, bool) or not isinstance(factor, int | float) or not math.isfinite(factor) or factor == 0:
-        raise ConfigurationError(f"{where}: factor must be a number other than 0, not {factor}")
-    return Column(str(entry["column"]), str(entry["unit"]), int(entry.get("sign", 1)), float(factor))
+    if not isinstance(entry, Mapping):
+        raise ConfigurationError(f"{where} must say column, unit and, if need be, sign and factor, not {str(entry)[:80]}")
+    name = entry.get("column")
+    named = {**entry, "column": str(name)} if type(name) is int else dict(entry)  # YAML reads a column called 3 as a number
+    column = validated(Column, named, where, error=ConfigurationError)
+    if column.sign not in (1, -1):
+        raise ConfigurationError(f"{where}: sign must be 1 or -1, not {column.sign}")
+    if column.factor == 0:
+        raise ConfigurationError(f"{where}: factor must be a number other than 0")
+    return column
 
 
 def time_column_from_config(entry: Any, dataset: str) -> Column:
@@ -132,16 +141,18 @@ class Clock:
         return aligned
 
 
-def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict") -> Clock:
+def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict", *, n_channels: int = 1) -> Clock:
     """The uniform clock behind a file's time stamps.
 
     Args:
         stamps: time stamps [s], shape (T,).
         where: file, for messages.
         policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them.
+        n_channels: how many are to be brought onto the clock.
 
     Raises:
-        DataError: stamps repeat or go backwards, or are not uniform and ``policy`` is strict.
+        DataError: stamps repeat or go backwards, are not uniform and ``policy`` is strict, lie less than a nanosecond or more than a day
+            apart, or a clock without their gaps would hold more samples than the limits allow.
     """
     for finding in checks_of_clock(stamps):
         if finding.level == "error" and (finding.check == "clock" or policy == "strict"):
@@ -150,12 +161,42 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
         if finding.check in {"jitter", "drift"} and policy == "strict":
             raise DataError(f"{where}: {finding.message}; set clock: interpolate to bring the samples to a uniform clock")
     elapsed = float(stamps[-1] - stamps[0])
+    _require_interval(stamps, where)
     if policy == "interpolate":
+        _require_length(stamps, 1.0 / float(np.median(np.diff(stamps))), n_channels, where)
         rate = plain_rate(1.0 / _interval(np.diff(stamps)), INTERPOLATED_TOLERANCE)
+        _require_length(stamps, rate, n_channels, where)
         return Clock(float(stamps[0]), rate, int(np.floor(elapsed * rate + 1e-3)) + 1, stamps)
     intervals = len(stamps) - 1
     rate = plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4))
     return Clock(float(stamps[0]), rate, len(stamps))
+
+
+def _require_interval(stamps: FloatArray, where: str) -> None:
+    """See that the time stamps lie as far apart as those of a recording can."""
+    interval = float(np.median(np.diff(stamps)))
+    if not SHORTEST_INTERVAL <= interval <= LONGEST_INTERVAL:
+        raise DataError(
+            f"{where}: the time stamps lie {interval:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); "
+            f"correct the unit of time, which is declared in conf/dataset"
+        )
+
+
+def _require_length(stamps: FloatArray, rate: float, n_channels: int, where: str) -> None:
+    """See that an even clock over the time stamps stays within the limits; where one gap makes it long, its stamps are named."""
+    steps = np.diff(stamps)
+    n_samples = math.floor(float(stamps[-1] - stamps[0]) * rate) + 1
+    longest = int(np.argmax(steps))
+    what = f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} time stamps would hold {n_samples} samples"
+    if steps[longest] * rate > 0.5 * n_samples:
+        what += (
+            f" (most of them in the gap of {steps[longest]:.6g} s between data rows {longest + 1} ({stamps[longest]:.12g} s) and "
+            f"{longest + 2} ({stamps[longest + 1]:.12g} s): remove the row with the stray stamp, or what lies on one side)"
+        )
+    check_limit("samples", n_samples, what)
+    check_limit("values", n_samples * n_channels, f"{what} of {n_channels} channels")
+    if 8 * n_samples > WORTH_A_LOOK:
+        check_limit("expansion", n_samples / len(stamps), f"{what}, {n_samples / len(stamps):.0f} times as many as there are rows")
 
 
 def _interval(steps: FloatArray) -> float:

@@ -20,6 +20,7 @@ from urllib.parse import quote, urlsplit
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import remove, remove_leftovers, sha256_of, writing_error, written_aside
+from vehest.data.text_files import read_text
 from vehest.sources.base import Source, existing_folder
 from vehest.sources.resuming import Patience, Progress, ResumingDownloader
 
@@ -230,8 +231,9 @@ def _read_checksums(file: Path) -> dict[str, str]:
     """
     import pooch
 
-    if not file.exists():
+    if not os.path.lexists(file):
         return {}
+    read_text(file)  # which is bounded, and refuses pipes
     registry = pooch.create(file.parent, "")
     try:
         registry.load_registry(file)

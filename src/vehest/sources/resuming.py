@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import MissingError
+from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.files import remove, sha256_of, written_aside
+from vehest.data.limits import check_limit
+from vehest.data.schema import validated
+from vehest.data.text_files import read_json
 from vehest.version import __version__
 
 CHUNK = 1 << 15  # bytes; at most this much is received twice after a break
@@ -36,6 +39,14 @@ class Patience:
     read: float = 60.0
     attempts: int = 5
     pause: Callable[[float], None] = time.sleep
+
+
+@dataclass(frozen=True)
+class _About:
+    """What a part that has arrived is a part of."""
+
+    url: str
+    validator: str
 
 
 class _Broken(Exception):
@@ -67,6 +78,7 @@ class ResumingDownloader:
 
         Raises:
             MissingError: the server does not have it or is out of reach; what has arrived is kept.
+            DataError: it is longer than the limit; nothing of it is kept.
             OSError: the disk is full or not writable.
         """
         most, failures = -1, 0
@@ -131,6 +143,7 @@ class ResumingDownloader:
             )
         chunks = response.iter_content(CHUNK)
         first = next(chunks, b"")
+        self._refuse_too_much(total or 0)
         if not have:
             self._begin(url, response, first)
         self._append(first, chunks, total)
@@ -143,12 +156,21 @@ class ResumingDownloader:
     def _append(self, first: bytes, chunks: Iterator[bytes], total: int | None) -> None:
         with open(self.part, "ab", buffering=0) as stream:  # unbuffered: what has arrived survives a kill
             while first:
+                self._refuse_too_much(stream.tell() + len(first))
                 while first:
                     first = first[stream.write(first) :]
                 if self.progress is not None:
                     self.progress(self.name, stream.tell(), total)
                 first = next(chunks, b"")
             os.fsync(stream.fileno())
+
+    def _refuse_too_much(self, size: int) -> None:
+        """Stop where a file is longer than it may be, and keep nothing of it."""
+        try:
+            check_limit("unpacked_bytes", size, f"what is sent as '{self.name}' has {size} bytes or more")
+        except DataError:
+            self._drop()
+            raise
 
     def _begin(self, url: str, response: Any, first: bytes) -> None:
         """Start over: forget an earlier part, remember which version of the file this one is of."""
@@ -173,10 +195,10 @@ class ResumingDownloader:
     def _about(self, url: str) -> dict[str, str]:
         """Which version of the file the part is of; empty where that is not known."""
         try:
-            about = json.loads(self.about.read_text(encoding="utf-8"))
-            return {"validator": str(about["validator"])} if about["url"] == url else {}
-        except (OSError, ValueError, KeyError, TypeError):
+            about = validated(_About, read_json(self.about), f"'{self.about}'")
+        except VehestError:
             return {}
+        return {"validator": about.validator} if about.url == url and about.validator.isprintable() else {}
 
     def _kept(self, url: str) -> str:
         kept = self._size() if self._about(url) else 0
@@ -210,12 +232,12 @@ def _is_other(validator: str, headers: Mapping[str, str]) -> bool:
 
 def _range(text: str) -> tuple[int | None, int | None]:
     """First byte and length of the whole, of a Content-Range."""
-    found = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", text.strip())
+    found = re.fullmatch(r"bytes ([0-9]{1,18})-[0-9]{1,18}/([0-9]{1,18}|\*)", text.strip())
     return (int(found[1]), _whole_number(found[2])) if found else (None, None)
 
 
 def _whole_number(text: str | None) -> int | None:
-    return int(text) if text is not None and text.strip().isdigit() else None
+    return int(text) if text is not None and re.fullmatch(r"[0-9]{1,18}", text.strip()) else None
 
 
 _TOLD = (r"\[Errno -?\d+\] ([^'\")]+)", r"(\d+ bytes read, \d+ more expected)", r"([Rr]ead timed out)", r"([Rr]emote end closed [a-z ]+)")

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
+from vehest.data.schema import validated
+from vehest.data.splits import check_name
 from vehest.sources.base import Source
-
-OPTIONS_OF_A_DRIVE = frozenset({"id", "count", "seed", "vehicle", "manoeuvre", "surface", "stability_control"})
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,38 @@ class Drive:
     stability_control: bool
 
 
+Seed = Annotated[int, "a whole number, zero or positive"]
+SurfaceFile = Annotated[str | dict[str, Any], "one of dry, wet, patchy, or a mapping such as {friction: 0.6}"]
+
+
+@dataclass(frozen=True)
+class DriveFile:
+    """One of ``drives`` as a data set names it, or ``count`` of them; what is None is the data set's own."""
+
+    id: str | int
+    manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
+    count: Annotated[int, "a whole number of drives"] | None = None
+    seed: Seed | None = None
+    vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
+    surface: SurfaceFile | None = None
+    stability_control: bool | None = None
+
+
+@dataclass(frozen=True)
+class SimulatedOptions:
+    """Options of the source, by type; what is None is not said."""
+
+    vehicles: dict[str, Any] | None = None
+    drives: tuple[DriveFile, ...] | None = None
+    seed: Seed = 0
+    rate_hz: Annotated[float, "a number between 1 and 1000"] = 100.0
+    sensors: str | dict[str, Any] | None = None
+    surface: SurfaceFile | None = None
+    stability_control: bool = False
+    vary: Annotated[list[dict[str, Any]], "a list of {parameters, factor}"] | None = None
+    vary_sensors: dict[str, Any] | None = None
+
+
 class SimulatedSource(Source):
     """Simulated drives, a recording each.
 
@@ -46,18 +79,19 @@ class SimulatedSource(Source):
     ``vary_sensors``.
     """
 
+    options_type = SimulatedOptions
     keys = frozenset({"vehicles", "drives", "seed", "rate_hz", "sensors", "surface", "stability_control", "vary", "vary_sensors"})
     slow = True
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         from vehest.simulation.fleet import SensorVariation, variations_from_config
-        from vehest.simulation.sensors import sensor_levels_from_config
-        from vehest.simulation.surface import surface_from_config
+        from vehest.simulation.road.surface import surface_from_config
+        from vehest.simulation.sensors.recording import sensor_levels_from_config
 
         super().__init__(dataset)
         self.seed = _whole_number(dataset.get("seed", 0), f"data set '{self.name}': seed")
         rate = dataset.get("rate_hz", 100.0)
-        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1.0 <= rate <= 1000.0:
+        if not 1.0 <= rate <= 1000.0:
             raise ConfigurationError(f"data set '{self.name}': rate_hz must be a number between 1 and 1000, not {rate!r}")
         self.rate_hz = float(rate)
         self.vehicles = self._vehicles()
@@ -68,8 +102,11 @@ class SimulatedSource(Source):
                 _simulator_of(vehicle, self.variations, 0)
             self.sensors = sensor_levels_from_config(dataset.get("sensors"))
             self.sensor_variation = SensorVariation.from_config(dataset.get("vary_sensors") or {})
-            for drive in self.drives.values():
-                _manoeuvre_of(drive)
+            for drive_id, drive in self.drives.items():
+                longest = _manoeuvre_of(drive).longest
+                n_samples = longest * self.rate_hz
+                what = f"drive '{drive_id}' may last {longest:g} s, {n_samples:.6g} samples at {self.rate_hz:g} Hz"
+                check_limit("samples", n_samples, what, ConfigurationError)
                 surface_from_config(drive.surface)
         except ConfigurationError as error:
             raise ConfigurationError(f"data set '{self.name}': {error}") from None
@@ -86,7 +123,7 @@ class SimulatedSource(Source):
 
     def read(self, recording_id: str) -> Recording:
         """Simulate one drive."""
-        from vehest.simulation.surface import surface_from_config
+        from vehest.simulation.road.surface import surface_from_config
 
         if recording_id not in self.drives:
             raise MissingError(f"data set '{self.name}' has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)")
@@ -113,47 +150,49 @@ class SimulatedSource(Source):
 
     def _drives(self) -> dict[str, Drive]:
         drives: dict[str, Drive] = {}
-        entries = self.dataset.get("drives") or []
-        if isinstance(entries, str) or not isinstance(entries, Sequence):
-            raise ConfigurationError(f"data set '{self.name}': drives is a list of mappings with an id and a manoeuvre, not {entries!r}")
-        for entry in entries:
-            if not isinstance(entry, Mapping) or not {"id", "manoeuvre"} <= set(entry) or set(entry) - OPTIONS_OF_A_DRIVE:
-                known = ", ".join(sorted(OPTIONS_OF_A_DRIVE - {"id", "manoeuvre"}))
-                raise ConfigurationError(f"data set '{self.name}': a drive has an id, a manoeuvre and, if need be, {known}; not {entry}")
-            where = f"data set '{self.name}': drive '{entry['id']}'"
-            if not isinstance(entry["id"], str | int) or isinstance(entry["id"], bool) or not 0 < len(str(entry["id"])) <= 100:
+        options = validated(
+            SimulatedOptions,
+            {key: value for key, value in self.dataset.items() if key in self.keys},
+            f"data set '{self.name}'",
+            error=ConfigurationError,
+            group="dataset",
+        )
+        for entry in options.drives or ():
+            where = f"data set '{self.name}': drive '{entry.id}'"
+            if not 0 < len(str(entry.id)) <= 100:
                 raise ConfigurationError(f"{where}: an id is a name of 1 to 100 characters")
-            if not isinstance(entry["manoeuvre"], Mapping):
-                raise ConfigurationError(f"{where}: manoeuvre is a mapping with a name, such as {{name: laps}}, not {entry['manoeuvre']}")
-            for drive_id in _ids_of(entry, where):
+            check_name(str(entry.id), f"{where}: id")
+            for drive_id in _ids_of(entry, where, len(drives)):
                 if drive_id in drives:
                     raise ConfigurationError(f"data set '{self.name}': two drives are called '{drive_id}', names must differ")
                 drives[drive_id] = Drive(
                     seed=self._seed_of(entry, drive_id, where),
                     vehicle=self._vehicle_of(entry, where),
-                    manoeuvre=dict(entry["manoeuvre"]),
-                    surface=entry.get("surface", self.dataset.get("surface")),
-                    stability_control=_switch(entry.get("stability_control", self.dataset.get("stability_control", False)), where),
+                    manoeuvre=entry.manoeuvre,
+                    surface=options.surface if entry.surface is None else entry.surface,
+                    stability_control=options.stability_control if entry.stability_control is None else entry.stability_control,
                 )
         return drives
 
-    def _seed_of(self, entry: Mapping[str, Any], drive_id: str, where: str) -> int:
+    def _seed_of(self, entry: DriveFile, drive_id: str, where: str) -> int:
         """The drive's own seed, or one that follows from the data set's and the drive's name, whatever other drives there are."""
-        if "seed" in entry:
-            if "count" in entry:
+        if entry.seed is not None:
+            if entry.count is not None:
                 raise ConfigurationError(f"{where}: give seed for a single drive, or count, not both")
-            return _whole_number(entry["seed"], f"{where}: seed")
+            return _whole_number(entry.seed, f"{where}: seed")
         return int(np.random.SeedSequence([self.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0])
 
-    def _vehicle_of(self, entry: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-        name = entry.get("vehicle", next(iter(self.vehicles)) if len(self.vehicles) == 1 else None)
-        if not isinstance(name, str | int) or str(name) not in self.vehicles:
+    def _vehicle_of(self, entry: DriveFile, where: str) -> Mapping[str, Any]:
+        name = entry.vehicle
+        if name is None and len(self.vehicles) == 1:
+            name = next(iter(self.vehicles))
+        if name is None or str(name) not in self.vehicles:
             raise ConfigurationError(f"{where}: vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
         return self.vehicles[str(name)]
 
 
 def _is_planar(vehicle: Mapping[str, Any]) -> bool:
-    from vehest.simulation.planar_car import PLANAR
+    from vehest.simulation.plant.planar_car import PLANAR
 
     return vehicle.get("plant") == PLANAR
 
@@ -162,9 +201,9 @@ def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: i
     """What simulates drives of a vehicle, varied as the seed of a drive draws it."""
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
-    from vehest.simulation.parameters import vehicle_from_configuration
-    from vehest.simulation.planar_car import planar_car_from_configuration
     from vehest.simulation.planar_drive import simulate_planar_drive
+    from vehest.simulation.plant.parameters import vehicle_from_configuration
+    from vehest.simulation.plant.planar_car import planar_car_from_configuration
 
     if _is_planar(vehicle):
         return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
@@ -173,7 +212,7 @@ def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: i
 
 def _manoeuvre_of(drive: Drive) -> Any:
     """The manoeuvre, among those of the vehicle's plant."""
-    from vehest.simulation.manoeuvres import manoeuvre_from_config, one_of
+    from vehest.simulation.driving.manoeuvres import manoeuvre_from_config, one_of
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
 
     planar = _is_planar(drive.vehicle)
@@ -182,24 +221,19 @@ def _manoeuvre_of(drive: Drive) -> Any:
     return one_of(drive.manoeuvre, PLANAR_MANOEUVRES) if planar else manoeuvre_from_config(drive.manoeuvre)
 
 
-def _ids_of(entry: Mapping[str, Any], where: str) -> list[str]:
-    if "count" not in entry:
-        return [str(entry["id"])]
-    count = entry["count"]
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise ConfigurationError(f"{where}: count must be a whole number of drives, not {count}")
-    return [f"{entry['id']}_{position:03d}" for position in range(1, count + 1)]
+def _ids_of(entry: DriveFile, where: str, n_before: int) -> list[str]:
+    if entry.count is None:
+        return [str(entry.id)]
+    if entry.count < 0:
+        raise ConfigurationError(f"{where}: count must be a whole number of drives, not {entry.count}")
+    n_drives = n_before + entry.count
+    check_limit("jobs", n_drives, f"{where}: the data set would have {n_drives} drives", ConfigurationError)
+    return [f"{entry.id}_{position:03d}" for position in range(1, entry.count + 1)]
 
 
-def _whole_number(value: Any, where: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+def _whole_number(value: int, where: str) -> int:
+    if value < 0:
         raise ConfigurationError(f"{where} must be a whole number, zero or positive, not {value}")
-    return value
-
-
-def _switch(value: Any, where: str) -> bool:
-    if not isinstance(value, bool):
-        raise ConfigurationError(f"{where}: stability_control must be true or false, not {value}")
     return value
 
 

@@ -2,24 +2,58 @@
 
 from __future__ import annotations
 
-import codecs
-import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as compute
 import pyarrow.csv as pc
-import pyarrow.parquet as pq
 
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
-from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
+from vehest.data.limits import check_limit
+from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
+from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
+from vehest.data.text_files import first_line
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import Clock, Column, columns_from_config, identity_columns, time_column_from_config, uniform_clock
+from vehest.sources.columns import (
+    ChannelMap,
+    ChannelNames,
+    Clock,
+    ClockPolicy,
+    Column,
+    columns_from_config,
+    identity_columns,
+    time_column_from_config,
+    uniform_clock,
+)
+from vehest.sources.text_tables import check_header, check_size, table_stream
+
+MOST_SKIPPED_ROWS = 10_000
+
+
+@dataclass(frozen=True)
+class TabularOptions:
+    """Options of the source, by type; what is None is not said."""
+
+    path: str | None = None
+    files: str = "*.csv"
+    runs: str | int | None = None
+    time: dict[str, Any] | None = None
+    rate_hz: float | None = None
+    clock: ClockPolicy = "strict"
+    channels: ChannelMap | None = None
+    gappy: ChannelNames | None = None
+    delimiter: str = ","
+    decimal: str = "."
+    encoding: str = "utf8"
+    skip_rows: int = 0
 
 
 class TabularSource(Source):
@@ -29,6 +63,7 @@ class TabularSource(Source):
     ``delimiter``, ``decimal``, ``encoding``, ``skip_rows``.
     """
 
+    options_type = TabularOptions
     keys = frozenset(
         {"path", "files", "runs", "time", "rate_hz", "clock", "channels", "gappy", "delimiter", "decimal", "encoding", "skip_rows"}
     )
@@ -39,12 +74,10 @@ class TabularSource(Source):
         self.columns = None if declared is None else columns_from_config(declared, self.name)
         time = dataset.get("time")
         self.time = None if time is None else time_column_from_config(time, self.name)
-        if dataset.get("clock", "strict") not in ("strict", "interpolate"):
-            raise ConfigurationError(f"data set '{self.name}': clock '{dataset['clock']}' is not one of: strict, interpolate")
         rate = dataset.get("rate_hz")
         if self.time is None and rate is None:
             raise ConfigurationError(f"data set '{self.name}': without a time column, rate_hz must be given")
-        if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+        if rate is not None and not rate > 0:
             raise ConfigurationError(f"data set '{self.name}': rate_hz must be a positive number, not {rate}")
         self.runs = None if dataset.get("runs") is None else str(dataset["runs"])
         self.gappy = self._gappy_channels(dataset.get("gappy") or [])
@@ -104,8 +137,7 @@ class TabularSource(Source):
                 raise DataError(
                     f"'{file}' has no column '{name}' (it has {_listed(names)}); correct the map in conf/dataset/{self.name}.yaml"
                 )
-        table = _read_columns(file, list(dict.fromkeys(wanted)), self.dataset)
-        values = {name: _numbers(table, name, file) for name in table.column_names}
+        values = _read_columns(file, list(dict.fromkeys(wanted)), self.dataset)
         if run is not None:
             rows = self._runs_of(file)[run]
             values = {name: samples[rows] for name, samples in values.items()}
@@ -117,7 +149,8 @@ class TabularSource(Source):
             raise DataError(f"'{file}' has a header and no rows")
         if self.time is not None:
             where = f"'{file}'" if run is None else f"'{file}', run {run}"
-            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.dataset.get("clock", "strict"))
+            stamps = self.time.to_si(values[self.time.column], "s")
+            clock = uniform_clock(stamps, where, self.dataset.get("clock", "strict"), n_channels=len(columns))
         else:
             clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
         channels = {
@@ -139,8 +172,6 @@ class TabularSource(Source):
             raise DataError(f"'{file}': {error}") from None
 
     def _gappy_channels(self, names: Any) -> frozenset[str]:
-        if isinstance(names, str):
-            raise ConfigurationError(f"data set '{self.name}': gappy is a list of channels, for example [{names}], not '{names}'")
         for name in names:
             if name not in (CHANNELS if self.columns is None else self.columns):
                 raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
@@ -165,7 +196,7 @@ class TabularSource(Source):
             raise DataError(
                 f"'{file}' has no column '{column}' that counts its runs (it has {_listed(names)}); correct runs in the data set"
             )
-        numbers = _numbers(_read_columns(file, [column], self.dataset), column, file)
+        numbers = _read_columns(file, [column], self.dataset)[column]
         if not len(numbers):
             raise DataError(f"'{file}' has a header and no rows")
         odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
@@ -185,16 +216,16 @@ class TabularSource(Source):
 def _require_options(dataset: Mapping[str, Any], name: str) -> None:
     for option, default in (("delimiter", ","), ("decimal", ".")):
         value = dataset.get(option, default)
-        if not isinstance(value, str) or len(value) != 1:
+        if len(value) != 1:
             raise ConfigurationError(f"data set '{name}': {option} must be one character, not '{value}'")
     encoding = str(dataset.get("encoding", "utf8"))
     try:
-        codecs.lookup(encoding)
-    except LookupError:
+        "0,1".encode(encoding).decode(encoding)  # which codecs that are none of text refuse
+    except (LookupError, ValueError):
         raise ConfigurationError(f"data set '{name}': encoding '{encoding}' is not known; use for example utf8 or latin-1") from None
     skip_rows = dataset.get("skip_rows", 0)
-    if not isinstance(skip_rows, int) or skip_rows < 0:
-        raise ConfigurationError(f"data set '{name}': skip_rows must be a whole number of lines, not {skip_rows}")
+    if not 0 <= skip_rows <= MOST_SKIPPED_ROWS:
+        raise ConfigurationError(f"data set '{name}': skip_rows must be a whole number of lines up to {MOST_SKIPPED_ROWS}, not {skip_rows}")
     pattern = str(dataset.get("files", "*.csv"))
     if not pattern or Path(pattern).is_absolute():
         raise ConfigurationError(f"data set '{name}': files must be a pattern inside path, such as '*.csv', not '{pattern}'")
@@ -209,32 +240,45 @@ def _is_parquet(file: Path) -> bool:
 
 
 def _column_names(file: Path, dataset: Mapping[str, Any]) -> list[str]:
+    if _is_parquet(file):
+        with parquet_file(file) as table:
+            names = list(table.schema_arrow.names)
+        check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
+        return names
+    check_size(file, 1)
+    check_header(file, str(dataset.get("delimiter", ",")), str(dataset.get("encoding", "utf8")), int(dataset.get("skip_rows", 0)))
     try:
-        if _is_parquet(file):
-            return list(pq.read_schema(file).names)
-        with pc.open_csv(file, read_options=_read_options(dataset, threads=False), parse_options=_parse_options(dataset)) as reader:
+        with (
+            table_stream(file) as stream,
+            pc.open_csv(stream, read_options=_read_options(dataset, threads=False), parse_options=_parse_options(dataset)) as reader,
+        ):
             return list(reader.schema.names)
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+    except DAMAGE as error:
         raise _unreadable(file, error) from None
 
 
-def _read_columns(file: Path, names: list[str], dataset: Mapping[str, Any]) -> pa.Table:
+def _read_columns(file: Path, names: list[str], dataset: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """Columns of numbers, (T,) each."""
+    if _is_parquet(file):
+        with parquet_file(file) as table:
+            return read_numbers(file, table, names)
+    check_size(file, len(names))
     try:
-        return pq.read_table(file, columns=names) if _is_parquet(file) else _read_csv(file, names, dataset, pa.float64())
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
-        if not _is_parquet(file):
-            _point_at_text(file, names, dataset)
+        with table_stream(file) as stream:
+            table = pc.read_csv(stream, _read_options(dataset), _parse_options(dataset), _convert_options(dataset, names, pa.float64()))
+        return {name: table.column(name).to_numpy() for name in names}
+    except DAMAGE as error:
+        _point_at_text(file, names, dataset)
         raise _unreadable(file, error) from None
 
 
-def _read_csv(file: Path, names: list[str], dataset: Mapping[str, Any], kind: pa.DataType, *, threads: bool = True) -> pa.Table:
-    convert = pc.ConvertOptions(
+def _convert_options(dataset: Mapping[str, Any], names: list[str], kind: pa.DataType) -> pc.ConvertOptions:
+    return pc.ConvertOptions(
         include_columns=names,
         column_types=dict.fromkeys(names, kind),
         decimal_point=str(dataset.get("decimal", ".")),
         strings_can_be_null=True,
     )
-    return pc.read_csv(file, _read_options(dataset, threads=threads), _parse_options(dataset), convert)
 
 
 def _read_options(dataset: Mapping[str, Any], *, threads: bool = True) -> pc.ReadOptions:
@@ -251,33 +295,43 @@ def _point_at_text(file: Path, names: list[str], dataset: Mapping[str, Any]) -> 
     Raises:
         DataError: where it is, or in which row the file cannot be read at all.
     """
+    before = 0
     try:
-        table = _read_csv(file, names, dataset, pa.string(), threads=False)  # on one thread, errors name their row
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        with (
+            table_stream(file) as stream,
+            pc.open_csv(
+                stream, _read_options(dataset, threads=False), _parse_options(dataset), _convert_options(dataset, names, pa.string())
+            ) as reader,
+        ):  # on one thread, errors name their row
+            for batch in reader:
+                _point_at_text_in(batch, before, file, str(dataset.get("decimal", ".")))
+                before += batch.num_rows
+    except DAMAGE as error:
         raise _unreadable(file, error) from None
-    for name in names:
-        for row, text in enumerate(table.column(name).to_pylist(), start=1):
+
+
+def _point_at_text_in(batch: pa.RecordBatch, before: int, file: Path, decimal: str) -> None:
+    for name in batch.schema.names:
+        try:
+            plain = compute.replace_substring(compute.utf8_trim_whitespace(batch.column(name)), decimal, ".")
+            compute.cast(plain, pa.float64())
+            continue  # all of them numbers
+        except pa.ArrowException:
+            pass
+        for row, text in enumerate(batch.column(name).to_pylist(), start=before + 1):
             try:
-                float((text or "nan").replace(str(dataset.get("decimal", ".")), ".").replace("_", "?"))
+                float((text or "nan").replace(decimal, ".").replace("_", "?"))
             except ValueError:
-                raise DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {row}; numbers are needed") from None
-
-
-def _numbers(table: pa.Table, name: str, file: Path) -> FloatArray:
-    column = table.column(name)
-    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise DataError(f"'{file}': column '{name}' is of type {column.type}; numbers are needed")
-    return column.cast(pa.float64(), safe=False).to_numpy().astype(np.float64)  # nanoseconds of unix time exceed 2^53
+                shown = printable(text if len(text) <= 40 else f"{text[:40]}…")
+                raise DataError(f"'{file}': column '{name}' holds the text '{shown}' in data row {row}; numbers are needed") from None
 
 
 def _unreadable(file: Path, error: Exception) -> DataError:
-    return DataError(
-        f"'{file}' cannot be read as a table ({str(error).splitlines()[0][:160]}); is it truncated, or of another format or encoding?"
-    )
+    return DataError(f"'{file}' cannot be read as a table ({first_line(error)}); is it truncated, or of another format or encoding?")
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+    return ", ".join(printable(name[:60]) for name in names[:12]) + (", …" if len(names) > 12 else "")
 
 
 SOURCE = TabularSource

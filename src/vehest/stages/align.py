@@ -11,15 +11,18 @@ from typing import Any
 
 import yaml
 
-from vehest.data.alignment import READ_AS, UNITS, Alignment, AlignmentSettings, Parameter, align
-from vehest.data.checks import checks_of_recording
+from vehest.alignment.align import READ_AS, UNITS, Alignment, Parameter, align
+from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.settings import AlignmentSettings
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
+from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.tabular import TabularSource
-from vehest.stages.config import compose_config
+from vehest.stages.config import Config
 from vehest.stages.config_files import choices
+from vehest.stages.inspect_data import config_of
 
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "alignment.svg")
 PARAMETER_HEADER = ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit")
@@ -50,7 +53,9 @@ def align_recording(source: str, overrides: Sequence[str], recording_id: str | N
     Raises:
         VehestError: there is no such recording, it cannot be read, or it cannot tell what is asked for.
     """
-    return align(_one_recording(source, overrides, recording_id), settings)
+    config = config_of(source, overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        return align(_one_recording(source, config, recording_id), settings)
 
 
 def parameter_rows(alignment: Alignment) -> list[list[str]]:
@@ -119,9 +124,9 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
     refuse_other_files(folder)
     contents = {f"alignment.{ending}": content for ending, content in figure_files(alignment_figure(alignment)).items()}
     contents |= {
-        "alignment.md": _report(alignment).encode("utf-8"),
-        "alignment.csv": _table(alignment).encode("utf-8"),
-        "alignment.yaml": _transforms(alignment).encode("utf-8"),
+        "alignment.md": _report(alignment).encode("utf-8", "backslashreplace"),
+        "alignment.csv": _table(alignment).encode("utf-8", "backslashreplace"),
+        "alignment.yaml": _transforms(alignment).encode("utf-8", "backslashreplace"),
     }
     with written_aside(folder, replace_folder=True) as aside:
         aside.mkdir()
@@ -142,9 +147,9 @@ def refuse_other_files(folder: Path) -> None:
         raise ConfigurationError(f"folder '{folder}' holds other files ('{others[0]}'); name a new one")
 
 
-def _one_recording(source: str, overrides: Sequence[str], recording_id: str | None) -> Recording:
+def _one_recording(source: str, config: Config, recording_id: str | None) -> Recording:
+    dataset = config["dataset"]
     if source in choices("dataset"):
-        dataset = compose_config("ingest", [f"dataset={source}", *overrides])["dataset"]
         origin = open_source(dataset)
         known = origin.ids()
         if recording_id is None and len(known) != 1:
@@ -152,11 +157,7 @@ def _one_recording(source: str, overrides: Sequence[str], recording_id: str | No
             raise ConfigurationError(f"data set '{source}' has {len(known)} recordings ({shown}); say which: --recording ID")
         recording = origin.read(recording_id if recording_id is not None else known[0])
     else:
-        file = Path(source)
-        if not file.exists():
-            raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
-        dataset = compose_config("estimate", overrides)["dataset"]
-        recording = TabularSource(dataset).read_file(file)
+        recording = TabularSource(dataset).read_file(Path(source))
         if recording_id not in (None, recording.id):
             raise ConfigurationError(f"'{source}' holds the recording '{recording.id}', not '{recording_id}'")
     accepted = set(dataset.get("accept") or [])
@@ -169,9 +170,11 @@ def _one_recording(source: str, overrides: Sequence[str], recording_id: str | No
 
 
 def _report(alignment: Alignment) -> str:
+    from vehest.report.document import as_text
+
     settings = alignment.settings
     parts = [
-        f"# Alignment of {alignment.recording_id}",
+        f"# Alignment of {as_text(alignment.recording_id)}",
         f"Estimated from a {alignment.kind} recording of {alignment.duration:.6g} s at {alignment.rate_hz:g} Hz: "
         f"{', '.join(settings.estimate)}. Both sides are low-passed at {settings.cutoff_hz:g} Hz. Nothing has been applied.",
         _markdown_table(PARAMETER_HEADER, parameter_rows(alignment)),

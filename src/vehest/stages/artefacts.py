@@ -18,14 +18,19 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 from vehest.data.errors import DataError, MissingError
-from vehest.data.files import remove_leftovers, sha256_of, written_aside
+from vehest.data.files import file_name, remove_leftovers, sha256_of, written_aside
+from vehest.data.schema import check_format, validated
+from vehest.data.text_files import read_json
+from vehest.stages.locks import Lock, Waiting, held
 from vehest.version import __version__
 
 MANIFEST = "manifest.json"
+TIMINGS = "timings.csv"  # what a stage took; no part of its content, since it is never the same twice
+FORMAT = 1
 Status = Literal["complete", "interrupted"]
 
 
@@ -58,12 +63,21 @@ class StagePlan:
     @property
     def folder(self) -> Path:
         """Where the artefact belongs."""
-        return self.output / self.stage / f"{self.label}-{self.key[:12]}"
+        return self.output / file_name(self.stage) / self._folder_name
+
+    @property
+    def lock(self) -> Lock:
+        """What a process holds while it makes the artefact."""
+        return Lock(self.output, self.stage, self.folder.name)
 
     @property
     def checkpoint_folder(self) -> Path:
         """Where an unfinished run of this stage keeps its state."""
-        return self.output / "checkpoints" / f"{self.label}-{self.key[:12]}"
+        return self.output / "checkpoints" / self._folder_name
+
+    @property
+    def _folder_name(self) -> str:
+        return file_name(self.label, f"-{self.key[:12]}")
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,7 @@ class Artefact:
         inputs: input name -> digest.
         provenance: time, seconds, versions, machine.
         skipped: whether it was there already.
+        code: version of the code that made it.
     """
 
     folder: Path
@@ -93,11 +108,50 @@ class Artefact:
     inputs: Mapping[str, str]
     provenance: Mapping[str, Any] = field(default_factory=dict)
     skipped: bool = False
+    code: str = ""
 
     @property
     def digest(self) -> str:
-        """Hash of the content, for the stages that build on it."""
-        return hashlib.sha256(json.dumps(dict(self.outputs), sort_keys=True).encode()).hexdigest()
+        """Hash of the content, times aside, for the stages that build on it."""
+        content = {name: digest for name, digest in self.outputs.items() if name != TIMINGS}
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Output:
+    """A file of an artefact: digest and length of its bytes."""
+
+    sha256: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What manifest.json says; see `Artefact`, and docs/cli.md.
+
+    Args:
+        stage: name of the stage that wrote it.
+        label: what the artefact is made from, for people.
+        key: hash of what determines the content.
+        status: ``complete``, or ``interrupted``.
+        config: configuration of the stage.
+        inputs: input name -> digest.
+        outputs: file, relative to the folder -> what it is.
+        provenance: circumstances.
+        code: version of the stage's code.
+        format: version of this layout; 0 where none is stated, which is otherwise the same as 1.
+    """
+
+    stage: str
+    label: str
+    key: str
+    status: Status
+    config: dict[str, Any]
+    inputs: dict[str, str]
+    outputs: dict[str, Output]
+    provenance: dict[str, Any]
+    code: str = ""
+    format: int = 0
 
 
 def find(plan: StagePlan) -> Artefact | None:
@@ -119,28 +173,48 @@ def read_artefact(folder: Path) -> Artefact:
         DataError: the manifest is damaged, or a file it names is gone or has another size.
     """
     path = folder / MANIFEST
-    if not path.is_file():
-        raise MissingError(f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it")
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        files = manifest["outputs"]
-        for name, entry in files.items():
-            if not (folder / name).is_file() or (folder / name).stat().st_size != entry["bytes"]:
-                raise DataError(f"'{folder / name}' is gone or truncated; run the stage '{manifest['stage']}' again")
-        return Artefact(
-            folder=folder,
-            stage=manifest["stage"],
-            label=manifest["label"],
-            key=manifest["key"],
-            status=manifest["status"],
-            outputs={name: entry["sha256"] for name, entry in files.items()},
-            config=manifest["config"],
-            inputs=manifest["inputs"],
-            provenance=manifest["provenance"],
-            skipped=True,
+        content = read_json(path)
+    except MissingError:
+        raise MissingError(f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it") from None
+    if not isinstance(content, dict):
+        raise DataError(f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again")
+    check_format(content.get("format", 0), FORMAT, f"'{path}'", oldest=0)
+    manifest = validated(Manifest, content, f"'{path}'")
+    for name, entry in manifest.outputs.items():
+        _check_output(folder, name, entry, manifest.stage)
+    return Artefact(
+        folder=folder,
+        stage=manifest.stage,
+        label=manifest.label,
+        key=manifest.key,
+        status=manifest.status,
+        outputs={name: entry.sha256 for name, entry in manifest.outputs.items()},
+        config=manifest.config,
+        inputs=manifest.inputs,
+        provenance=manifest.provenance,
+        skipped=True,
+        code=manifest.code,
+    )
+
+
+def _check_output(folder: Path, name: str, entry: Output, stage: str) -> None:
+    """See that a file of a manifest is there, in its size, and lies in the folder itself.
+
+    Raises:
+        DataError: it does not.
+    """
+    parts = PurePosixPath(name).parts
+    longest = max((len(part.encode("utf-8", "surrogatepass")) for part in parts), default=256)
+    if longest > 255 or PurePosixPath(*parts).as_posix() != name or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
+        raise DataError(
+            f"'{folder / MANIFEST}': outputs names {name[:80]!r}, which is no file inside the folder; run the stage '{stage}' again"
         )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"'{path}' is damaged ({type(error).__name__}); remove the folder and run the stage again") from error
+    path = folder.joinpath(*parts)
+    if any(folder.joinpath(*parts[: n + 1]).is_symlink() for n in range(len(parts))):
+        raise DataError(f"'{path}' is a link; an artefact holds its files itself: run the stage '{stage}' again")
+    if not path.is_file() or path.stat().st_size != entry.bytes:
+        raise DataError(f"'{path}' is gone or truncated; run the stage '{stage}' again")
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
@@ -162,6 +236,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         files = sorted(file for file in aside.rglob("*") if file.is_file())
         outputs = {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files}
         manifest = {
+            "format": FORMAT,
             "stage": plan.stage,
             "label": plan.label,
             "key": plan.key,
@@ -175,6 +250,31 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
     made = read_artefact(plan.folder)
     return Artefact(**{**made.__dict__, "skipped": False})
+
+
+def ensured(
+    plan: StagePlan,
+    write: Callable[[Path], Status | None],
+    force: bool,
+    should_stop: Callable[[], bool],
+    say: Callable[[Waiting], None],
+) -> Artefact | None:
+    """Make an artefact, or take the one that another process is making; none if ``should_stop`` ended the waiting for it.
+
+    Args:
+        plan: what is made.
+        write: see `make`.
+        force: whether to make it although it is there.
+        should_stop: asked while another process makes it.
+        say: told what is waited for.
+
+    Raises:
+        VehestError: as `make` does.
+    """
+    with held(plan.lock, should_stop, say) as mine:
+        if not mine:
+            return None
+        return (None if force else find(plan)) or make(plan, write)
 
 
 def provenance(seconds: float) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from typing import Any
 from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
 from vehest.stages.config import Config
 from vehest.stages.evaluate import protocol_from_config
+from vehest.stages.failures import Failure
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished
-from vehest.stages.launcher import Failure
 from vehest.stages.train import TrainJob, new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
 

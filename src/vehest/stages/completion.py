@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from vehest.data.errors import VehestError
+from vehest.data.text_files import read_yaml
 from vehest.stages.config_files import GROUPS, choices, local_conf, packaged_conf, summary
 
 
@@ -105,6 +105,9 @@ def _yaml(name: str) -> dict[str, Any]:
     for folder in (local_conf(), packaged_conf()):
         file: Path | None = folder / name if folder else None
         if file is not None and file.is_file():
-            content = yaml.safe_load(file.read_text(encoding="utf-8"))
+            try:
+                content = read_yaml(file)
+            except VehestError:
+                return {}
             return content if isinstance(content, dict) else {}
     return {}

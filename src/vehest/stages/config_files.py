@@ -19,7 +19,7 @@ def packaged_pipelines() -> Path:
 
 def local_conf() -> Path | None:
     """./conf, which is searched first, if there is one and it is not the packaged folder itself."""
-    folder = Path.cwd() / "conf"
+    folder = Path("conf")
     if not folder.is_dir() or folder.resolve() == packaged_conf().resolve():
         return None
     return folder
@@ -36,7 +36,7 @@ def summary(group: str, choice: str) -> str:
     for folder in (local_conf(), packaged_conf()):
         file = folder / group / f"{choice}.yaml" if folder else None
         if file and file.is_file():
-            for line in file.read_text(encoding="utf-8").splitlines():
+            for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 if line.startswith("#") and "@package" not in line:
                     return line.lstrip("# ").rstrip()
                 if line and not line.startswith("#"):
@@ -49,7 +49,7 @@ def is_simulated(dataset: str) -> bool:
     for folder in (local_conf(), packaged_conf()):
         file = folder / "dataset" / f"{dataset}.yaml" if folder else None
         if file and file.is_file():
-            return "\nsource: simulated\n" in file.read_text(encoding="utf-8")
+            return "\nsource: simulated\n" in file.read_text(encoding="utf-8", errors="replace")
     return False
 
 
@@ -59,7 +59,7 @@ def find_pipeline(name: str) -> Path | None:
     if given.is_file():
         return given
     stem = given.name.removesuffix(".yaml")
-    for folder in (Path.cwd() / "pipelines", packaged_pipelines()):
+    for folder in (Path("pipelines"), packaged_pipelines()):
         file = folder / f"{stem}.yaml"
         if file.is_file():
             return file
@@ -68,7 +68,7 @@ def find_pipeline(name: str) -> Path | None:
 
 def pipeline_names() -> list[str]:
     """Names of the pipelines in ./pipelines and in the package."""
-    folders = (Path.cwd() / "pipelines", packaged_pipelines())
+    folders = (Path("pipelines"), packaged_pipelines())
     return sorted({file.stem for folder in folders for file in folder.glob("*.yaml")})
 
 

@@ -1,23 +1,40 @@
-"""What people see while stages run: a line an artefact and a progress bar, all on standard error."""
+"""What people see while stages run: a line an artefact and a progress bar, all on standard error.
+
+Names and other text come from files: their control characters are shown as escapes, and nothing in them is read as markup.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
+from vehest.data.errors import printable
 from vehest.training.context import Progress as FitProgress
 
 MARKS = {
-    "done": "[green]done   [/]",
-    "skip": "[dim]skipped[/]",
-    "plan": "[cyan]would  [/]",
-    "once": "[cyan]once   [/]",
-    "fail": "[red]failed [/]",
-    "stop": "[yellow]stopped[/]",
+    "done": ("done", "green"),
+    "skip": ("skipped", "dim"),
+    "plan": ("would", "cyan"),
+    "once": ("once", "cyan"),
+    "fail": ("failed", "red"),
+    "stop": ("stopped", "yellow"),
+    "wait": ("waiting", "cyan"),
 }
+"""Status -> its word and colour."""
+
+LINE_BREAK = "\n"
+
+
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise BrokenPipeError  # which rich would turn into an exit
+
+
+WARNING = "warn"
 
 
 class Messages:
@@ -25,30 +42,60 @@ class Messages:
 
     Args:
         quiet: say nothing but warnings.
+        silent: say nothing at all.
+
+    Attributes:
+        said: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is printed.
     """
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        self.console = Console(stderr=True, highlight=False, soft_wrap=True)
-        self.quiet = quiet
+    def __init__(self, *, quiet: bool = False, silent: bool = False) -> None:
+        self.console = _Console(stderr=True, highlight=False, soft_wrap=True, quiet=silent)
+        self.quiet = quiet or silent
+        self.said: list[tuple[str, str, str, str]] = []
+
+    def again(self, said: Sequence[tuple[str, str, str, str]]) -> None:
+        """Say lines and warnings that were said before."""
+        for status, stage, label, detail in said:
+            if status == WARNING:
+                self.warn(detail)
+            else:
+                self.line(status, stage, label, detail)
 
     def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
         """Say what became of one artefact."""
+        self.said.append((status, stage, label, detail))
         if not self.quiet:
-            text = f" [dim]{_escaped(detail)}[/]" if detail else ""
-            self.console.print(f"{MARKS[status]} {stage:<10} {_escaped(label)}{text}")
+            word, colour = MARKS[status]
+            shown = (f" {printable(detail)}" if detail else "", "dim")
+            self._print(Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown))
 
     def warn(self, text: str) -> None:
         """Say something that needs attention."""
-        self.console.print(f"[yellow]warning[/] {_escaped(text)}")
+        self.said.append((WARNING, "", "", text))
+        self._print(Text.assemble(("warning", "yellow"), f" {printable(text, keep=LINE_BREAK)}"))
+
+    def _print(self, text: Text) -> None:
+        with suppress(OSError):  # nobody reads it, or its disk is full: the work goes on
+            self.console.print(text)
+
+    @contextmanager
+    def off_record(self) -> Iterator[None]:
+        """Say in here what `said` is not to hold."""
+        before = self.said
+        self.said = []
+        try:
+            yield
+        finally:
+            self.said = before
 
     @contextmanager
     def bars(self) -> Iterator[Bars]:
         """Progress bars that vanish when all is done; nothing is drawn where there is no terminal."""
         columns = (
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
+            TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
         )
         with Progress(*columns, console=self.console, transient=True, disable=self.quiet or not self.console.is_terminal) as progress:
@@ -65,8 +112,8 @@ class Bars:
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar; it appears when it is first moved."""
         if name not in self._tasks:
-            self._tasks[name] = self._progress.add_task(name, total=total, note="")
-        self._progress.update(self._tasks[name], completed=done, total=total, note=note)
+            self._tasks[name] = self._progress.add_task(printable(name), total=total, note="")
+        self._progress.update(self._tasks[name], completed=done, total=total, note=printable(note))
 
     def fit(self, name: str, progress: FitProgress | None) -> None:
         """Move the bar of a training."""
@@ -80,7 +127,3 @@ class Bars:
         """Take a bar away."""
         if name in self._tasks:
             self._progress.remove_task(self._tasks.pop(name))
-
-
-def _escaped(text: str) -> str:
-    return text.replace("[", "\\[")

@@ -17,7 +17,6 @@ from vehest.stages.config_files import packaged_conf, packaged_pipelines
 
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),
-    "mdf": ("asammdf", "MDF files"),
     "factor-graph": ("gtsam", "factor graphs"),
     "tuning": ("optuna", "noise levels tuned by Optuna"),
 }
@@ -107,7 +106,10 @@ def _output() -> Item:
 
 
 def _disk() -> Item:
-    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    try:
+        free = shutil.disk_usage(".").free / 1e9
+    except OSError as error:
+        return Item("warning", "disk", f"the working folder cannot be looked at ({error.strerror}); change to another")
     level: Literal["ok", "warning"] = "ok" if free > 1.0 else "warning"
     return Item(level, "disk", f"{free:.1f} GB free here")
 

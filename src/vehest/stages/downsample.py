@@ -34,9 +34,14 @@ def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, An
         label=f"{ingested.label}-{rate_hz:g}hz",
         config=config,
         inputs=dict(ingested.outputs),
-        code=code_version(["vehest.data.transforms", "vehest.data.store"], own=[__name__]),
+        code=code_of_downsampling(),
         output=output,
     )
+
+
+def code_of_downsampling() -> str:
+    """Version of what a downsampling runs."""
+    return code_version(["vehest.data.transforms", "vehest.data.store"], own=[__name__])
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from vehest.alignment.checks import checks_of_recording
 from vehest.data.channels import REFERENCE_SUFFIX
-from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import written_aside
+from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.estimators.base import Estimator
@@ -40,8 +41,7 @@ def pretrained_note() -> str:
         MissingError: it is not installed.
         DataError: its description is damaged.
     """
-    about = read_description(pretrained_folder())["about"]
-    return " ".join(str(about["note"]).split())
+    return " ".join(read_description(pretrained_folder()).about.note.split())
 
 
 def find_model(name: str, output: Path) -> Path:
@@ -66,8 +66,13 @@ def find_model(name: str, output: Path) -> Path:
     return found[0]
 
 
-def read_table(path: Path, overrides: Sequence[str] = ()) -> Recording:
-    """Read a CSV or Parquet recording, as conf/estimate.yaml and overrides describe its columns.
+def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
+    """Read a CSV or Parquet recording, as conf/estimate.yaml and overrides describe its columns and limits.
+
+    Args:
+        path: the file.
+        overrides: of conf/estimate.yaml.
+        references: whether reference channels that the data set declares are read.
 
     Raises:
         MissingError: there is no such file.
@@ -75,10 +80,14 @@ def read_table(path: Path, overrides: Sequence[str] = ()) -> Recording:
         ConfigurationError: the data set named by the overrides is not a table.
     """
     config = compose_config("estimate", overrides)
-    dataset = config["dataset"]
+    with use_limits(limits_from_config(config["limits"])):
+        return _read_table(path, config["dataset"], references)
+
+
+def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Recording:
     if dataset.get("source") != "tabular":
         raise ConfigurationError(f"data set '{dataset.get('name')}' does not describe tables; use one with source: tabular")
-    if dataset.get("channels"):  # a new drive needs no reference channels, whatever the data set declares
+    if dataset.get("channels") and not references:  # a new drive needs no reference channels, whatever the data set declares
         measured = {name: entry for name, entry in dataset["channels"].items() if not name.endswith(REFERENCE_SUFFIX)}
         dataset = {**dataset, "channels": measured}
     recording = TabularSource(dataset).read_file(path)
@@ -138,8 +147,7 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
     """How a model's recordings were brought to its rate when it was trained; a new one must be prepared the same way."""
-    about = read_description(model_folder).get("about") or {}
-    return dict(about.get("downsample") or {"method": "polyphase", "transforms": []})
+    return read_description(model_folder).about.downsample.as_plain()
 
 
 def summary_of(estimate: Estimate) -> dict[str, Any]:

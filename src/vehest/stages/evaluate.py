@@ -10,23 +10,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.splits import VALIDATION, Span, Split
+from vehest.data.schema import settings_from_config
+from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import load_model, read_description
+from vehest.estimators.model_files import About, load_model, read_description
 from vehest.estimators.registry import estimator_module
+from vehest.evaluation.blocks import Segments, segments_of, write_segments
+from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, reference_state, score_all, sequences
-from vehest.stages.artefacts import Artefact, StagePlan
+from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.stages.code_version import code_version
-from vehest.stages.train import file_digest, read_fit_metrics, recording_file
+from vehest.stages.train import file_digest, learnt_spans, read_fit_metrics, recording_file
+from vehest.studies.artefacts import read_frame
 
 STAGE = "evaluate"
 METRICS = "metrics.csv"
+BLOCKS = "blocks.csv"
+TIMES = ("train_seconds", "step_seconds")
 TIMED_STEPS = 200
+FIT_FIGURES = ("n_parameters", "epochs", "train_seconds")
+TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
 COLUMNS = (
     "estimator",
@@ -43,6 +52,8 @@ COLUMNS = (
     "metric",
     "value",
     "unit",
+    "low",
+    "high",
 )
 
 
@@ -79,13 +90,7 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     Raises:
         ConfigurationError: a value that makes no sense.
     """
-    try:
-        numbers = {key: float(value) for key, value in config.items() if key != "initial_state" and value is not None}
-        protocol = Protocol(**numbers, initial_state=config.get("initial_state", False))
-    except (TypeError, ValueError):
-        raise ConfigurationError(f"evaluation: {dict(config)} must be numbers, initial_state true or false") from None
-    if not isinstance(protocol.initial_state, bool):
-        raise ConfigurationError(f"evaluation.initial_state must be true or false, not {protocol.initial_state}")
+    protocol = settings_from_config(Protocol, config, "evaluation")
     if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
         raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
     if protocol.sequence_seconds is not None:
@@ -118,7 +123,7 @@ def plan_evaluate(
         DataError: the split names a recording that the data set does not have.
         ConfigurationError: a test range was used for training.
     """
-    estimator = str(read_description(model.folder)["estimator"])
+    estimator = read_description(model.folder).estimator
     for name, spans in split.tests.items():
         for span in spans:
             for learnt in learnt_spans(model):
@@ -131,53 +136,108 @@ def plan_evaluate(
     for span in scored_spans(split):
         inputs[f"{span.dataset}/{span.recording}"] = file_digest(data[span.dataset], span)
         inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
+    for span in learnt_spans(model, "train"):
+        if span.dataset in references:
+            inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
     sets = {name: [str(span) for span in spans] for name, spans in test_sets(split).items()}
     plan = StagePlan(
         stage=STAGE,
         label=f"{model.label}-on-{split.name}",
         config={"sets": sets, "protocol": asdict(protocol), "kinds": dict(kinds), "split": split.name},
         inputs=inputs,
-        code=code_version([estimator_module(estimator), "vehest.evaluation.metrics", "vehest.estimators.model_files"], own=[__name__]),
+        code=code_of_evaluation(estimator_module(estimator)),
         output=output,
     )
     return EvaluateJob(plan, model, split, data, references, kinds, protocol)
 
 
+def code_of_evaluation(module: str) -> str:
+    """Version of what an evaluation runs.
+
+    Args:
+        module: that of the estimator.
+    """
+    return code_version([module, "vehest.evaluation.metrics", "vehest.estimators.model_files"], own=[__name__])
+
+
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
-    """Estimate and score every range; write estimates and metrics into ``folder``."""
+    """Estimate and score every range; write estimates, metrics and, in a file of their own, times into ``folder``."""
     estimator = load_model(job.model.folder)
-    about = read_description(job.model.folder)["about"]
-    seed = int(about["seed"])
+    about = read_description(job.model.folder).about
     fit = read_fit_metrics(job.model.folder)
+    if not set(FIT_FIGURES) <= set(fit):
+        raise DataError(f"'{job.model.folder}' does not say {', '.join(sorted(set(FIT_FIGURES) - set(fit)))} of its fit; train it again")
     rows: list[tuple[Any, ...]] = []
+    blocks: dict[str, Segments] = {}
     for name, spans in test_sets(job.split).items():
         pieces = sequences(spans, job.reference, job.protocol)
         estimates = _estimates(estimator, job, pieces)
         for position, estimate in enumerate(estimates):
             write_estimate(estimate, folder / name / f"{position}.parquet")
-        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.protocol))
+        scored = score_all(estimates.__getitem__, spans, job.reference, job.protocol)
+        blocks[name] = segments_of(scored, job.protocol.rate_hz)
+        figures = accuracy(scored)
         if job.protocol.sequence_seconds is not None:
             figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
-            figures |= {key: fit[key] for key in ("n_parameters", "epochs", "train_seconds")}
+            figures |= {key: fit[key] for key in FIT_FIGURES}
             if estimator.causal:
                 figures["step_seconds"] = _step_seconds(estimator, _measured(job, pieces[0]))
-        trained_on = "+".join(about["datasets"])
-        datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
-        kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
-        mode = "causal" if estimator.causal else "offline"
-        head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, "all", "nominal", job.protocol.rate_hz, mode, seed)
-        rows += [(*head, metric, repr(float(value)), UNITS[metric]) for metric, value in figures.items()]
-    with open(folder / METRICS, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(rows)
+        rows += _rows(estimator, about, job, name, spans, figures, figure_intervals(blocks[name]))
+    rows += _training_rows(estimator, about, job)
+    write_segments(folder / BLOCKS, blocks)
+    for file, timed in ((METRICS, False), (TIMINGS, True)):
+        with open(folder / file, "w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            writer.writerows(row for row in rows if (row[COLUMNS.index("metric")] in TIMES) is timed)
 
 
-def learnt_spans(model: Artefact) -> list[Span]:
-    """The ranges that a model was trained on and stopped on."""
-    entries = [*model.config["train"], *model.config["validation"]]
-    return [Span(entry["dataset"], entry["recording"], float(entry["start"]), float(entry["stop"])) for entry in entries]
+def _rows(
+    estimator: Estimator,
+    about: About,
+    job: EvaluateJob,
+    name: str,
+    spans: Sequence[Span],
+    figures: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]],
+) -> list[tuple[Any, ...]]:
+    """Rows of `COLUMNS` for one set of ranges."""
+    trained_on = "+".join(about.datasets)
+    datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
+    kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
+    mode = "causal" if estimator.causal else "offline"
+    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, "all", "nominal", job.protocol.rate_hz, mode)
+    rows = []
+    for metric, value in figures.items():
+        ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]
+        rows.append((*head, about.seed, metric, repr(float(value)), UNITS[metric], *ends))
+    return rows
+
+
+def _training_rows(estimator: Estimator, about: About, job: EvaluateJob) -> list[tuple[Any, ...]]:
+    """Errors on what the model learnt from; none where the reference has gaps there or nothing was learnt."""
+    spans = [span for span in learnt_spans(job.model, "train") if span.dataset in job.data]
+    try:
+        pieces = sequences(spans, job.reference, job.protocol) if spans else []
+        if not pieces:
+            return []
+        estimates = _estimates(estimator, job, pieces)
+        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.protocol))
+    except DataError:
+        return []
+    return _rows(estimator, about, job, TRAINING, spans, {name: figures[name] for name in TRAINING_METRICS}, {})
+
+
+def read_metrics(folder: Path) -> pd.DataFrame:
+    """Metrics and times of an evaluation, one row a figure, with `COLUMNS`.
+
+    Raises:
+        MissingError: they are not there.
+        DataError: they are damaged.
+    """
+    tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
+    return pd.concat([table for table in tables if len(table)], ignore_index=True)
 
 
 def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:

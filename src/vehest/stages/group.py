@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import torch
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
-from vehest.stages.artefacts import Artefact, Status, find, make
+from vehest.stages.artefacts import Artefact, Status, ensured, find, make
 from vehest.stages.evaluate import plan_evaluate, write_evaluation
+from vehest.stages.locks import Waiting, held, held_at_once
 from vehest.stages.train import TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
@@ -86,8 +88,18 @@ def is_finished(group: Group, member: Member) -> bool:
     return member.model is not None and (group.evaluation is None or member.evaluation is not None)
 
 
-def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
+def drop_finished_checkpoint(job: TrainJob) -> None:
+    """Remove the checkpoint of a model that is there, which a killed process left; not while somebody trains it."""
+    if job.plan.checkpoint_folder.exists():
+        with held_at_once(job.plan.lock) as free:
+            if free:
+                drop_checkpoint(job.plan.checkpoint_folder)
+
+
+def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
     """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+
+    What another process is making is taken from it once it is done; what nobody makes is made first.
 
     On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
     """
@@ -96,24 +108,47 @@ def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callab
         return _run_group(group, should_stop, on_progress)
 
 
-def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Member]:
+def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
     models = {member.job.plan.key: member.model for member in existing(group)}
-    if "train" in group.force:
-        for job in group.jobs:
-            drop_checkpoint(job.plan.checkpoint_folder)
-    for jobs in _together([job for job in group.jobs if models[job.plan.key] is None]):
-        if should_stop():
-            break
-        for artefact in _train(jobs, should_stop, on_progress):
-            models[artefact.key] = artefact
+    forced = "train" in group.force
+    waiting = [job for job in group.jobs if models[job.plan.key] is None]
+    while waiting and not should_stop():
+        with _held(waiting, should_stop, on_progress) as jobs:
+            missing = []
+            for job in jobs:
+                if forced:
+                    drop_checkpoint(job.plan.checkpoint_folder)
+                else:
+                    models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
+                if models[job.plan.key] is None:
+                    missing.append(job)
+            for together in _together(missing):
+                if should_stop():
+                    break
+                for artefact in _train(together, should_stop, on_progress):
+                    models[artefact.key] = artefact
+        waiting = [job for job in waiting if job not in jobs]
     members = []
     for job in group.jobs:
         model = models[job.plan.key]
         evaluation = None
         if model is not None and model.status == "complete" and group.evaluation is not None and not should_stop():
-            evaluation = _found_evaluation(group, model) or _evaluate(group.evaluation, model)
+            evaluation = _evaluated(group, model, should_stop, on_progress)
         members.append(Member(job, model, evaluation))
     return members
+
+
+@contextmanager
+def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Iterator[list[TrainJob]]:
+    """Hold the locks of those trainings that nobody is at; where somebody is at all of them, wait for the first.
+
+    Whoever waits holds no other training, so that two processes never wait for each other.
+    """
+    with ExitStack() as stack:
+        free = [job for job in jobs if stack.enter_context(held_at_once(job.plan.lock))]
+        if not free and stack.enter_context(held(jobs[0].plan.lock, should_stop, say)):
+            free = [jobs[0]]
+        yield free
 
 
 def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
@@ -124,7 +159,7 @@ def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
     return list(batches.values())
 
 
-def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> list[Artefact]:
+def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Artefact]:
     folders = [job.plan.checkpoint_folder for job in jobs]
     context = FitContext(checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress)
     artefacts = []
@@ -149,6 +184,11 @@ def _found_evaluation(group: Group, model: Artefact | None) -> Artefact | None:
     return find(plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output).plan)
 
 
-def _evaluate(e: Evaluation, model: Artefact) -> Artefact:
+def _evaluated(group: Group, model: Artefact, should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Artefact | None:
+    """The evaluation of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
+    e = group.evaluation
+    assert e is not None
     job = plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output)
-    return make(job.plan, lambda folder: write_evaluation(job, folder))
+    return _found_evaluation(group, model) or ensured(
+        job.plan, lambda folder: write_evaluation(job, folder), "evaluate" in group.force, should_stop, say
+    )

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vehest.data.checks import checks_of_recording
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.alignment.checks import checks_of_recording
+from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
@@ -18,12 +18,15 @@ from vehest.sources.base import Source, open_source, source_module
 from vehest.stages.artefacts import StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.config import Config, missing_keys
-from vehest.stages.launcher import Failure, Task, launch
+from vehest.stages.failures import Failure
+from vehest.stages.launcher import Task, launch
+from vehest.stages.locks import held_at_once
 from vehest.stages.signals import StopSignals
 from vehest.training.context import Progress
 
 STAGE = "ingest"
 PARTS_PREFIX = ".parts-"
+LONGEST_ID = 200  # bytes
 Report = Callable[[int, int, str], None]
 PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; says nothing about its samples
 
@@ -37,6 +40,7 @@ def plan_ingest(config: Config) -> StagePlan:
     Raises:
         MissingError: the raw files are not there.
         ConfigurationError: the data set's configuration makes no sense.
+        DataError: a recording's name cannot be a file's.
     """
     dataset: Mapping[str, Any] = config["dataset"]
     missing = missing_keys(dict(dataset))
@@ -45,15 +49,26 @@ def plan_ingest(config: Config) -> StagePlan:
     source = open_source(dataset)
     if not source.ids():
         raise ConfigurationError(f"data set '{source.name}' names no recordings")
+    for recording_id in source.ids():
+        recording_file(recording_id)
     inputs = {name: sha256_of(origin) if isinstance(origin, Path) else str(origin) for name, origin in source.inputs().items()}
     return StagePlan(
         stage=STAGE,
         label=source.name,
         config={key: value for key, value in dataset.items() if key not in PROSE},
         inputs=inputs,
-        code=code_version([source_module(dataset), "vehest.data.store", "vehest.data.checks"], own=[__name__]),
+        code=code_of_ingest(source_module(dataset)),
         output=Path(config["output"]),
     )
+
+
+def code_of_ingest(module: str) -> str:
+    """Version of what an ingest runs.
+
+    Args:
+        module: that of the source.
+    """
+    return code_version([module, "vehest.data.store", "vehest.alignment.checks"], own=[__name__])
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
@@ -90,7 +105,7 @@ def _make_side_by_side(
     parts = _parts_of(plan)
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
-    missing = [recording_id for recording_id in ids if not (parts / _file_name(recording_id)).is_file()]
+    missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
     tasks = [Task(recording_id, partial(_make_part, dict(dataset), recording_id, parts)) for recording_id in missing]
     made, failures = [recording_id for recording_id in ids if recording_id not in missing], []
     for end in launch(tasks, jobs, stop, lambda at, _: report(len(made), len(ids), tasks[at].name)):
@@ -107,15 +122,15 @@ def _make_side_by_side(
         error.exit_code = failures[0].exit_code
         raise error
     for recording_id in ids:
-        name = _file_name(recording_id)
-        # Another run of the same ingest may have finished meanwhile and taken the parts away; what it made is the same.
-        part = parts / name if (parts / name).is_file() else plan.folder / name
-        _link(part, folder / name)
+        _link(parts / recording_file(recording_id), folder / recording_file(recording_id))
 
 
 def drop_parts(plan: StagePlan) -> None:
-    """Remove what was kept for an ingest that is finished."""
-    remove(_parts_of(plan))
+    """Remove what was kept for an ingest that is finished, unless somebody makes it once more."""
+    if _parts_of(plan).exists():
+        with held_at_once(plan.lock) as free:
+            if free:
+                remove(_parts_of(plan))
 
 
 def _parts_of(plan: StagePlan) -> Path:
@@ -132,7 +147,6 @@ def _link(source: Path, target: Path) -> None:
 def _make_part(
     dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
 ) -> str:
-    parts.mkdir(parents=True, exist_ok=True)
     _make(open_source(dataset), recording_id, parts)
     return recording_id
 
@@ -140,7 +154,7 @@ def _make_part(
 def _make(source: Source, recording_id: str, folder: Path) -> None:
     recording = source.read(recording_id)
     refuse_unusable(recording, source)
-    write_recording(recording, folder / _file_name(recording_id))
+    write_recording(recording, folder / recording_file(recording_id))
 
 
 def refuse_unusable(recording: Recording, source: Source) -> None:
@@ -158,7 +172,16 @@ def refuse_unusable(recording: Recording, source: Source) -> None:
             )
 
 
-def _file_name(recording_id: str) -> str:
-    if not recording_id or recording_id.startswith(".") or any(character in recording_id for character in "/\\\0"):
-        raise DataError(f"a recording cannot be called '{recording_id}': its name is a file's name in the store")
+def recording_file(recording_id: str) -> str:
+    """The name of a recording's file in the store: the id itself, since splits and later stages find recordings by it.
+
+    Raises:
+        DataError: the id cannot be a file's name, or would lead elsewhere.
+    """
+    odd = any(character in "/\\" or ord(character) < 32 for character in recording_id)
+    if odd or not recording_id or recording_id.startswith(".") or len(os.fsencode(recording_id)) > LONGEST_ID:
+        raise DataError(
+            f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
+            f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
+        )
     return f"{recording_id}.parquet"

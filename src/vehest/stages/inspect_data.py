@@ -9,17 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from vehest.alignment.checks import checks_of_recording
 from vehest.data.channels import CHANNELS
-from vehest.data.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.sources.base import kind_of, open_source
 from vehest.sources.tabular import TabularSource
 from vehest.stages.artefacts import find
-from vehest.stages.config import compose_config
+from vehest.stages.config import Config, compose_config
 from vehest.stages.config_files import choices
-from vehest.stages.ingest import plan_ingest
+from vehest.stages.ingest import plan_ingest, recording_file
 
 
 def dataset_rows() -> list[dict[str, str]]:
@@ -47,76 +48,88 @@ def describe(source: str, overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
         VehestError: they cannot be read.
     """
-    recordings = []
-    for recording in _recordings(source, overrides):
-        if isinstance(recording, tuple):
-            raise recording[1]
-        channels = [
-            {
-                "name": name,
-                "unit": CHANNELS[name].unit,
-                "min": float(np.nanmin(samples)),
-                "mean": float(np.nanmean(samples)),
-                "max": float(np.nanmax(samples)),
-                "std": float(np.nanstd(samples)),
-            }
-            for name, samples in recording.channels.items()
-        ]
-        recordings.append(
-            {
-                "id": recording.id,
-                "vehicle": recording.vehicle,
-                "kind": recording.kind,
-                "rate_hz": recording.rate_hz,
-                "start": recording.start_time,
-                "end": recording.end_time,
-                "samples": len(recording),
-                "channels": channels,
-                "provenance": dict(recording.provenance),
-            }
-        )
-    return {"source": source, "recordings": recordings}
+    config = config_of(source, overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        return {"source": source, "recordings": [_described(recording) for recording in _recordings(source, config)]}
 
 
 def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
     """What the checks find, a row a finding; a recording that cannot be read is an error too."""
-    rows = []
-    for recording in _recordings(source, overrides):
-        if isinstance(recording, tuple):
-            name, error = recording
-            rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
-            continue
-        for finding in checks_of_recording(recording):
-            rows.append(
-                {
-                    "level": finding.level,
-                    "recording": recording.id,
-                    "check": finding.check,
-                    "channel": finding.channel,
-                    "message": finding.message,
-                }
-            )
-    return rows
+    config = config_of(source, overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        return [row for recording in _recordings(source, config) for row in _finding_rows(recording)]
 
 
-def _recordings(source: str, overrides: Sequence[str]) -> Iterator[Recording | tuple[str, VehestError]]:
+def config_of(source: str, overrides: Sequence[str]) -> Config:
+    """The configuration that reads a data set, or else a file.
+
+    Raises:
+        ConfigurationError: it is neither, or an override makes no sense.
+    """
+    if source in choices("dataset"):
+        return compose_config("ingest", [f"dataset={source}", *overrides])
+    if not os.path.lexists(source):  # which says no, too, where a name is too long or holds a null character
+        raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
+    return compose_config("estimate", overrides)
+
+
+def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]:
+    if isinstance(recording, tuple):
+        raise recording[1]
+    channels = [
+        {
+            "name": name,
+            "unit": CHANNELS[name].unit,
+            "min": float(np.nanmin(samples)),
+            "mean": float(np.nanmean(samples)),
+            "max": float(np.nanmax(samples)),
+            "std": float(np.nanstd(samples)),
+        }
+        for name, samples in recording.channels.items()
+    ]
+    return {
+        "id": recording.id,
+        "vehicle": recording.vehicle,
+        "kind": recording.kind,
+        "rate_hz": recording.rate_hz,
+        "start": recording.start_time,
+        "end": recording.end_time,
+        "samples": len(recording),
+        "channels": channels,
+        "provenance": dict(recording.provenance),
+    }
+
+
+def _finding_rows(recording: Recording | tuple[str, VehestError]) -> list[dict[str, str]]:
+    if isinstance(recording, tuple):
+        name, error = recording
+        return [{"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)}]
+    return [
+        {
+            "level": finding.level,
+            "recording": recording.id,
+            "check": finding.check,
+            "channel": finding.channel,
+            "message": finding.message,
+        }
+        for finding in checks_of_recording(recording)
+    ]
+
+
+def _recordings(source: str, config: Config) -> Iterator[Recording | tuple[str, VehestError]]:
     """Recordings one after another; one that cannot be read comes as its name and the error."""
     if source not in choices("dataset"):
         file = Path(source)
-        if not file.exists():
-            raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
-        config = compose_config("estimate", overrides)
         try:
             yield TabularSource(config["dataset"]).read_file(file)
         except DataError as error:
             yield file.name, error
         return
-    config = compose_config("ingest", [f"dataset={source}", *overrides])
     origin = open_source(config["dataset"])
     ingested = find(plan_ingest(config)) if origin.slow else None
     if ingested is not None:  # the same samples as the source would make again
         for recording_id in origin.ids():
-            yield read_recording(ingested.folder / f"{recording_id}.parquet")
+            yield read_recording(ingested.folder / recording_file(recording_id))
         return
     for recording_id in origin.ids():
         try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,26 +14,14 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, Generic, TypeVar
 
-from vehest.data.errors import VehestError
+from vehest.data.limits import Limits, current_limits, use_limits
+from vehest.stages.failures import Failure, failure_of
+from vehest.stages.locks import Waiting
 from vehest.stages.signals import StopSignals
 from vehest.training.context import Progress
 
 Outcome = TypeVar("Outcome")
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A job that failed.
-
-    Args:
-        message: one line.
-        detail: traceback, where it was a defect rather than an expected error.
-        exit_code: what a command that runs this job alone leaves with.
-    """
-
-    message: str
-    detail: str = ""
-    exit_code: int = 1
+PR_SET_PDEATHSIG = 1  # of Linux's prctl: the signal that a process gets when the one that started it ends
 
 
 @dataclass(frozen=True)
@@ -44,7 +34,7 @@ class Task(Generic[Outcome]):
     """
 
     name: str
-    run: Callable[[Callable[[], bool], Callable[[Progress], None]], Outcome]
+    run: Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Outcome]
 
 
 @dataclass(frozen=True)
@@ -55,7 +45,7 @@ class Done(Generic[Outcome]):
     outcome: Outcome | Failure
 
 
-Reporter = Callable[[int, Progress | None], None]
+Reporter = Callable[[int, Progress | Waiting | None], None]
 
 
 def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
@@ -65,7 +55,7 @@ def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report:
         tasks: started in this order.
         jobs: processes; 1 runs everything in this one.
         stop: when a signal came, running tasks are asked to end and no other is started.
-        report: called with the task's position and its progress (None when it starts).
+        report: called with the task's position and its progress (None when it starts), or what it waits for.
     """
     if min(jobs, len(tasks)) <= 1:
         yield from _launch_here(tasks, stop, report)
@@ -91,7 +81,9 @@ def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals, report: Repo
 def _launch_in_processes(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
     context = get_context("spawn")
     stopping, messages = context.Event(), context.SimpleQueue()
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(stopping, messages, os.getpid()))
+    pool = ProcessPoolExecutor(
+        jobs, mp_context=context, initializer=_start_worker, initargs=(stopping, messages, os.getpid(), current_limits())
+    )
     with stop.deferred(), pool:
         futures = {pool.submit(_work, position, task): position for position, task in enumerate(tasks)}
         waiting = set(futures)
@@ -115,12 +107,14 @@ def _launch_in_processes(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSi
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(stopping: Any, messages: Any, parent: int) -> None:
-    """Leave signals to the parent, and end with it."""
+def _start_worker(stopping: Any, messages: Any, parent: int, limits: Limits) -> None:
+    """Leave signals to the parent, and end with it: at once where the system does that, else within half a second."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    _worker.update(stopping=stopping, messages=messages)
+    _worker.update(stopping=stopping, messages=messages, limits=limits)
 
 
 def _end_with(parent: int) -> None:
@@ -136,21 +130,18 @@ def _work(position: int, task: Task[Outcome]) -> Outcome | Failure | None:
     messages.put((position, None))
     last = 0.0
 
-    def on_progress(progress: Progress) -> None:
+    def on_progress(progress: Progress | Waiting) -> None:
         nonlocal last
-        if time.monotonic() - last > 0.2:
+        if isinstance(progress, Waiting) or time.monotonic() - last > 0.2:
             last = time.monotonic()
             messages.put((position, progress))
 
-    return _guarded(task, stopping.is_set, on_progress)
+    with use_limits(_worker["limits"]):
+        return _guarded(task, stopping.is_set, on_progress)
 
 
-def _guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]) -> Outcome | Failure:
+def _guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Outcome | Failure:
     try:
         return task.run(should_stop, on_progress)
-    except VehestError as error:
-        return Failure(str(error), exit_code=error.exit_code)
     except Exception as error:
-        import traceback
-
-        return Failure(f"{type(error).__name__}: {error}", detail=traceback.format_exc())
+        return failure_of(error)

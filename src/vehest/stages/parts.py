@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,11 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
-from vehest.stages.artefacts import StagePlan, provenance
-from vehest.stages.code_version import code_version
+from vehest.stages.artefacts import TIMINGS, StagePlan, provenance
 from vehest.stages.evaluate import METRICS
-from vehest.stages.report import OVERVIEW, PROVENANCE, STAGE, ReportJob, plan_report, recording_digests, study_artefacts
-from vehest.studies.artefacts import PartsArtefacts
+from vehest.stages.publishing import PROVENANCE
+from vehest.stages.report import (
+    OVERVIEW,
+    STAGE,
+    ReportJob,
+    code_of_report,
+    plan_report,
+    recording_digests,
+    study_artefacts,
+    timings_of,
+    titles_of,
+    write_metrics,
+)
+from vehest.studies.artefacts import PartsArtefacts, of_parts
+from vehest.studies.kit.timings import timings_of_study
+from vehest.studies.registry import study_module
 
 
 @dataclass(frozen=True)
@@ -39,7 +51,7 @@ class PartsJob:
         title: its title.
         about: a paragraph on it.
         command: the command that makes it.
-        module: module of `vehest.studies`.
+        module: name of the module that draws it, as `vehest.studies.registry` knows it.
         titles: part -> title, of all there are in the pipeline file.
         parts: part -> what was compared.
         absent: parts that the study goes on without.
@@ -65,13 +77,13 @@ def plan_parts(job: PartsJob, output: Path) -> StagePlan:
         label=job.study,
         config={**config, "parts": {name: plan.config for name, plan in plans.items()}},
         inputs={f"{name}: {label}": digest for name, plan in plans.items() for label, digest in plan.inputs.items()},
-        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
+        code=code_of_report(job.module, __name__),
         output=output,
     )
 
 
 def write_parts(job: PartsJob, folder: Path) -> None:
-    """Draw the study into ``folder``: report.md, report.html, metrics.csv, tables, figures, provenance."""
+    """Draw the study into ``folder``: report.md, report.html, metrics.csv, timings.csv, tables, figures, provenance."""
     from vehest.report.document import write_document
 
     artefacts = PartsArtefacts(
@@ -83,13 +95,16 @@ def write_parts(job: PartsJob, folder: Path) -> None:
         parts={name: study_artefacts(part) for name, part in job.parts.items()},
         absent=[part.name for part in job.absent],
     )
-    module = importlib.import_module(f"vehest.studies.{job.module}")
-    write_document(module.build_parts(artefacts), folder)
+    module = study_module(job.module)
+    timings = {name: timings_of(part) for name, part in job.parts.items()}
+    times = [(job.titles[name], timings[name], titles_of(part)) for name, part in artefacts.parts.items()]
+    write_document(module.build_parts(artefacts), folder, on_page=timings_of_study(times))
     if not (folder / OVERVIEW).is_file():
         raise ConfigurationError(f"the study module '{job.module}' gives no table 'overview', which a study in parts shows in the terminal")
-    artefacts.metrics.to_csv(folder / METRICS, index=False, lineterminator="\n")
+    write_metrics(artefacts.metrics, folder / METRICS)
+    write_metrics(of_parts(timings), folder / TIMINGS)
     about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command, "parts": list(job.parts), "absent": artefacts.absent}
     about["kinds"] = {name: kind for part in job.parts.values() for name, kind in part.evaluation.kinds.items()}
     about["recordings"] = {name: digest for part in job.parts.values() for name, digest in recording_digests(part).items()}
-    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")

@@ -7,33 +7,66 @@ and figures from their recordings.
 from __future__ import annotations
 
 import difflib
-import importlib
-import importlib.util
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
-import yaml
 
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.limits import use_limits
+from vehest.data.schema import validated
 from vehest.data.splits import check_name
+from vehest.data.text_files import read_yaml
 from vehest.stages.artefacts import Artefact
 from vehest.stages.comparison import Compared, compare, raise_failures
-from vehest.stages.config import Config, compose_config, expand, has_key, key_of
+from vehest.stages.config import Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
+from vehest.stages.ingest import STAGE as INGEST
 from vehest.stages.parts import AbsentPart, PartsJob, plan_parts, write_parts
-from vehest.stages.report import ReportJob, leaderboard_of, overview_of, plan_report, publish, shown_in, write_report
+from vehest.stages.publishing import Publication, publish_study
+from vehest.stages.report import ReportJob, leaderboard_of, overview_of, plan_report, write_report
+from vehest.stages.study_keys import Keys, keys_of_study
 from vehest.stages.survey import SurveyJob, ingest_all, plan_survey, write_survey
 from vehest.stages.tracking import Tracker
 from vehest.stages.workshop import NotThereYet, Workshop
+from vehest.studies.registry import study_module, study_names
 
-COMPARISON = {"split", "sweeps"}
-SURVEY = {"datasets", "optional_datasets"}
-KEYS = {"study", "title", "about", "report", "publish", "evaluation", "parts", "based_on", *COMPARISON, *SURVEY}
-PART_KEYS = {*COMPARISON, "title", "optional"}
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
+
+Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
+Names = Annotated[tuple[str, ...], "a list of names"]
+
+
+@dataclass(frozen=True)
+class PartFile:
+    """A part as a pipeline's file names it; what is None is not said, which a part on top of another's may leave to that one."""
+
+    split: str | None = None
+    sweeps: Sweeps | None = None
+    title: str | None = None
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class PipelineFile:
+    """A pipeline's file; what is None is not said. docs/cli.md says what the keys mean."""
+
+    study: str | None = None
+    report: str | None = None
+    title: str | None = None
+    about: str | None = None
+    publish: bool = False
+    evaluation: dict[str, int | float | bool | str | None] | None = None
+    split: str | None = None
+    sweeps: Sweeps | None = None
+    parts: Annotated[dict[str, PartFile | None], "a mapping from names to what each has"] | None = None
+    datasets: Names | None = None
+    optional_datasets: Names | None = None
+    based_on: str | None = None
+
 
 Configs = Mapping[str, Sequence[Config]]
 """Part of a pipeline -> configuration of its jobs; the one part of a pipeline without parts is called ``""``."""
@@ -66,7 +99,7 @@ class Pipeline:
         study: its name.
         title: for people.
         about: a paragraph on what is compared and why.
-        report: module of `vehest.studies` that draws it.
+        report: name of the module that draws it, as `vehest.studies.registry` knows it that draws it.
         parts: what is compared; none where it compares no estimators.
         evaluation: overrides of conf/eval.yaml's ``evaluation``.
         publish: whether its outcome also goes to results/<study>.
@@ -101,12 +134,14 @@ class PipelineOutcome:
         leaderboard: its table, one row an estimator and test set; empty where there is an overview.
         published: folder in results/, if it was published.
         overview: table of a study in parts, or of recordings alone.
+        publication: what is published of it where nothing stands against it.
     """
 
     report: Artefact
     leaderboard: pd.DataFrame
     published: Path | None
     overview: pd.DataFrame | None = None
+    publication: Publication | None = None
 
 
 def read_pipeline(name: str) -> Pipeline:
@@ -117,25 +152,28 @@ def read_pipeline(name: str) -> Pipeline:
         ConfigurationError: the file is not a pipeline.
     """
     file, content = _content_of(name)
-    form = _form_of(content, file)
-    datasets, optional = (_names_in(content.get(key, []), f"'{file}': {key}") for key in ("datasets", "optional_datasets"))
+    described = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
+    form = _form_of(described, file)
+    assert described.study is not None
+    assert described.report is not None
+    datasets, optional = described.datasets or (), described.optional_datasets or ()
     if form == "datasets" and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
         raise ConfigurationError(f"'{file}': datasets must name some, and none of them twice")
-    parts = {"datasets": {}, "parts": content.get("parts"), "split": {"": {key: content.get(key) for key in COMPARISON}}}[form]
-    if not isinstance(parts, dict) or (form == "parts" and not parts):
+    parts: Mapping[str, PartFile | None] = described.parts or {}
+    if form == "parts" and not parts:
         raise ConfigurationError(f"'{file}': parts must be names, each with its split and sweeps")
-    _check_module(str(content["report"]), form, file)
-    check_name(str(content["study"]), f"'{file}': study")
+    if form == "split":
+        parts = {"": PartFile(described.split, described.sweeps)}
+    check_name(described.study, f"'{file}': study")
+    _check_module(described.report, form, file)
     return Pipeline(
-        study=str(content["study"]),
-        title=str(content.get("title", content["study"])),
-        about=" ".join(str(content.get("about", "")).split()),
-        report=str(content["report"]),
-        parts=tuple(_part(str(name), part, file) for name, part in parts.items()),
-        evaluation=tuple(
-            f"evaluation.{key}={'null' if value is None else value}" for key, value in (content.get("evaluation") or {}).items()
-        ),
-        publish=bool(content.get("publish", False)),
+        study=described.study,
+        title=" ".join((described.title or described.study).split()),
+        about=" ".join((described.about or "").split()),
+        report=described.report,
+        parts=tuple(_part(own, part, file) for own, part in parts.items()),
+        evaluation=tuple(f"evaluation.{key}={_as_override(value)}" for key, value in (described.evaluation or {}).items()),
+        publish=described.publish,
         file=file,
         datasets=datasets,
         optional_datasets=optional,
@@ -150,70 +188,66 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
         hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
         raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"'{file}' cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict) or set(content) - KEYS:
-        reason = f"unknown key '{min(set(content) - KEYS)}'" if isinstance(content, dict) else "it holds no keys"
-        raise ConfigurationError(f"'{file}' is not a pipeline: {reason}")
-    if "based_on" not in content:
+        content = read_yaml(file)
+    except DataError as error:
+        raise ConfigurationError(str(error)) from None
+    if not isinstance(content, dict):
+        raise ConfigurationError(f"'{file}' is not a pipeline: it holds no keys")
+    own = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
+    if own.based_on is None:
         return file, content
     if as_base:
-        raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{content['based_on']}'")
-    _, base = _content_of(str(content["based_on"]), as_base=True)
-    own, parts = content.get("parts") or {}, base.get("parts") or {}
-    if not isinstance(own, dict) or not isinstance(parts, dict) or not all(part is None or isinstance(part, dict) for part in own.values()):
-        raise ConfigurationError(f"'{file}': parts must be names, each with what it changes, or null where it is left out")
-    if set(own) - set(parts):
-        raise ConfigurationError(f"'{file}': '{content['based_on']}' has no part '{min(set(own) - set(parts))}'")
+        raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{own.based_on}'")
+    _, base = _content_of(own.based_on, as_base=True)
+    changes, parts = content.get("parts") or {}, base.get("parts") or {}
+    if set(changes) - set(parts):
+        raise ConfigurationError(f"'{file}': '{own.based_on}' has no part '{min(set(changes) - set(parts))}'")
     merged = {**base, **{key: value for key, value in content.items() if key != "based_on"}}
-    kept = {key: {**part, **(own.get(key) or {})} for key, part in parts.items() if own.get(key, part) is not None}
+    kept = {key: {**(part or {}), **(changes.get(key) or {})} for key, part in parts.items() if changes.get(key, part) is not None}
     return file, merged | ({"parts": kept} if parts else {})
 
 
-def _form_of(content: Mapping[str, Any], file: Path) -> str:
+def _as_override(value: int | float | bool | str | None) -> str:
+    """A value as an override of Hydra's grammar says it."""
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _form_of(described: PipelineFile, file: Path) -> str:
     """Which of the three forms a pipeline has, by the key that tells: ``split``, ``parts`` or ``datasets``."""
-    forms = [form for form, own in (("split", COMPARISON), ("parts", {"parts"}), ("datasets", SURVEY)) if own & set(content)]
-    whole = {"study", "report"} <= set(content) and len(forms) == 1
-    whole = whole and (forms != ["split"] or set(content) >= COMPARISON) and (forms != ["datasets"] or "evaluation" not in content)
-    if not whole or (forms == ["datasets"] and "datasets" not in content):
+    says = {
+        "split": described.split is not None or described.sweeps is not None,
+        "parts": described.parts is not None,
+        "datasets": described.datasets is not None or described.optional_datasets is not None,
+    }
+    forms = [form for form, said in says.items() if said]
+    whole = described.study is not None and described.report is not None and len(forms) == 1
+    whole = whole and (forms != ["split"] or (described.split is not None and described.sweeps is not None))
+    if not whole or (forms == ["datasets"] and (described.datasets is None or described.evaluation is not None)):
         raise ConfigurationError(f"'{file}' is not a pipeline: {FORMS}")
     return forms[0]
 
 
-def _part(name: str, content: Any, file: Path) -> Part:
+def _part(name: str, part: PartFile | None, file: Path) -> Part:
     where = f"'{file}': part '{name}'" if name else f"'{file}'"
-    if not isinstance(content, dict) or set(content) - PART_KEYS or not set(content) >= COMPARISON:
+    if part is None or part.split is None or part.sweeps is None:
         raise ConfigurationError(f"{where} needs split and sweeps, and may have title and optional")
     if name:
         check_name(name, f"'{file}': part")
-    sweeps = content["sweeps"]
-    if not isinstance(sweeps, list) or not sweeps or not all(isinstance(sweep, list) and sweep for sweep in sweeps):
+    if not part.sweeps or not all(part.sweeps):
         raise ConfigurationError(f"{where}: sweeps must be a list of lists of overrides")
-    return Part(
-        name=name,
-        title=str(content.get("title", name)),
-        split=str(content["split"]),
-        sweeps=tuple(tuple(str(override) for override in sweep) for sweep in sweeps),
-        optional=bool(content.get("optional", False)),
-    )
+    title = " ".join((part.title or name).split())
+    return Part(name=name, title=title, split=part.split, sweeps=part.sweeps, optional=part.optional)
 
 
 def _check_module(name: str, form: str, file: Path) -> None:
-    if importlib.util.find_spec(f"vehest.studies.{name}") is None:
-        raise ConfigurationError(f"'{file}': there is no study module '{name}' in vehest.studies")
-    module = importlib.import_module(f"vehest.studies.{name}")
+    if name not in study_names():
+        raise ConfigurationError(f"'{file}': there is no study module '{name}'; there are: {', '.join(study_names())}")
+    module = study_module(name)
     takes = {"build": "split and sweeps", "build_parts": "parts", "documents": "datasets"}
     wanted = {"split": "build", "parts": "build_parts", "datasets": "documents"}[form]
     if not hasattr(module, wanted):
         known = " or ".join(words for function, words in takes.items() if hasattr(module, function))
         raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {known or 'something else'}")
-
-
-def _names_in(content: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(content, list) or not all(isinstance(name, str) for name in content):
-        raise ConfigurationError(f"{where} must be a list of names in conf/dataset")
-    return tuple(content)
 
 
 def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
@@ -229,10 +263,15 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
             f"the split belongs to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change it there"
         )
     used: set[str] = set()
-    configs = {part.name: _part_configs(part, pipeline.evaluation, overrides, used) for part in pipeline.parts}
+    sweeps = [sweep for part in pipeline.parts for sweep in part.sweeps]
+    with use_limits(limits_of([*(override for sweep in sweeps for override in sweep), *overrides])):
+        check_jobs(sum(count(sweep) for sweep in sweeps), f"the sweeps of '{pipeline.file.name}' stand")
+        configs = {part.name: _part_configs(part, pipeline.evaluation, overrides, used) for part in pipeline.parts}
     for override in overrides:
         if override not in used:
-            raise ConfigurationError(f"'{override}' suits no sweep of '{pipeline.file.name}': none has an option '{key_of(override)}'")
+            key = key_of(override)
+            hint = option_hint(key) or f": none has an option '{key}'"
+            raise ConfigurationError(f"'{override}' suits no sweep of '{pipeline.file.name}'{hint}")
     return configs
 
 
@@ -245,7 +284,7 @@ def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str
             composed[job] = compose_config("eval", job)
         return composed[job]
 
-    configs: list[Config] = []
+    configs: dict[str, Config] = {}
     for sweep in part.sweeps:
         for job in expand([f"split={part.split}", *evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
@@ -256,10 +295,9 @@ def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str
             config = dict(config_of((*shared, *suiting)))
             own_seed = any(key_of(override) == "seed" for override in suiting)
             if seeds and not own_seed:
-                config["seed"] = compose_seed(seeds[-1])
-            if config not in configs:
-                configs.append(config)
-    return configs
+                config["seed"] = value_of(seeds[-1])
+            configs.setdefault(json.dumps(config, sort_keys=True), config)
+    return list(configs.values())
 
 
 def _survey_configs(pipeline: Pipeline, overrides: Sequence[str]) -> list[Config]:
@@ -286,11 +324,6 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
     return [override for override in overrides if key_of(override).split(".")[0] not in {"root", "output", "tracking"}]
 
 
-def compose_seed(override: str) -> Any:
-    """The value of ``seed=…``."""
-    return yaml.safe_load(override.split("=", 1)[1])
-
-
 def run_pipeline(
     pipeline: Pipeline, configs: Configs, overrides: Sequence[str], workshop: Workshop, *, only_report: bool = False
 ) -> PipelineOutcome:
@@ -312,7 +345,7 @@ def run_pipeline(
     if pipeline.datasets:
         return _run_survey(pipeline, configs[""], overrides, workshop, only_report=only_report)
     first = next(iter(configs.values()))[0]
-    workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn)
+    workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn, workshop.stop.requested)
     workshop.tags = {"vehest.study": pipeline.study}
     compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
     raise_failures(compared.values(), workshop)
@@ -320,7 +353,7 @@ def run_pipeline(
     if not pipeline.in_parts:
         (job,) = jobs.values()
         report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
-        return PipelineOutcome(report, leaderboard_of(job), _publish(pipeline, report, overrides, workshop))
+        return _published(pipeline, configs, report, overrides, workshop, table=leaderboard_of(job))
     whole = PartsJob(
         study=pipeline.study,
         title=pipeline.title,
@@ -332,8 +365,8 @@ def run_pipeline(
         absent=absent,
     )
     report = workshop.ensure(plan_parts(whole, workshop.output), lambda folder: write_parts(whole, folder))
-    published = _publish(pipeline, report, overrides, workshop, absent={part.name: f"part '{part.name}'" for part in absent})
-    return PipelineOutcome(report, pd.DataFrame(), published, overview_of(report))
+    left_out = {part.name: f"part '{part.name}'" for part in absent}
+    return _published(pipeline, configs, report, overrides, workshop, overview=overview_of(report), absent=left_out)
 
 
 def _run_parts(
@@ -361,6 +394,13 @@ def _run_parts(
     if not compared:
         raise MissingError(f"nothing that '{pipeline.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
     return compared, absent
+
+
+def datasets_of(pipeline: Pipeline, configs: Configs, workshop: Workshop) -> dict[str, Config]:
+    """The configuration of every data set that a pipeline draws on, by its name."""
+    if pipeline.datasets:
+        return {str(config["dataset"]["name"]): config["dataset"] for config in configs[""]}
+    return {name: own for part in configs.values() for name, own in workshop.datasets_of(part[0]).items()}
 
 
 def _report_job(pipeline: Pipeline, compared: Compared, overrides: Sequence[str]) -> ReportJob:
@@ -397,32 +437,44 @@ def _run_survey(
     )
     report = workshop.ensure(plan_survey(job, workshop.output), lambda folder: write_survey(job, folder))
     names = {dataset.name: f"data set '{dataset.name}'" for dataset in absent}
-    return PipelineOutcome(report, pd.DataFrame(), _publish(pipeline, report, overrides, workshop, absent=names), overview_of(report))
+    return _published(pipeline, {"": configs}, report, overrides, workshop, overview=overview_of(report), absent=names)
 
 
 def _command(pipeline: Pipeline, overrides: Sequence[str]) -> str:
     return " ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides])
 
 
-def _results_of(pipeline: Pipeline) -> Path:
-    return Path("results") / pipeline.study
-
-
-def _publish(
-    pipeline: Pipeline, report: Artefact, overrides: Sequence[str], workshop: Workshop, absent: Mapping[str, str] | None = None
-) -> Path | None:
-    """Publish a study as it is written: not what overrides changed, nor without what the published one shows.
+def _published(
+    pipeline: Pipeline,
+    configs: Configs,
+    report: Artefact,
+    overrides: Sequence[str],
+    workshop: Workshop,
+    table: pd.DataFrame | None = None,
+    overview: pd.DataFrame | None = None,
+    absent: Mapping[str, str] | None = None,
+) -> PipelineOutcome:
+    """What a pipeline made, published as it is written: not what overrides changed.
 
     Args:
+        pipeline: the study.
+        configs: its jobs.
+        report: its report.
+        overrides: what changed it.
+        workshop: where stages ran.
+        table: its leaderboard.
+        overview: its overview.
         absent: name of what the study went on without -> what it is, for people.
     """
-    if not pipeline.publish or workshop.dry_run or overrides:
-        return None
-    published = _results_of(pipeline)
-    lost = [words for name, words in (absent or {}).items() if name in shown_in(published)]
-    if lost:
-        workshop.messages.warn(f"not published: '{published}' shows {lost[0]}, and this run could not read it")
-        return None
-    if publish(report, published):
-        workshop.messages.line("done", "publish", str(published))
-    return published
+    publication = None
+    if pipeline.publish and not overrides:
+        publication = Publication(pipeline.study, absent or {}, _keys(pipeline, configs, absent or {}, workshop))
+    with workshop.messages.off_record():
+        folder = None if workshop.dry_run else publish_study(publication, report, workshop.messages)
+    return PipelineOutcome(report, pd.DataFrame() if table is None else table, folder, overview, publication)
+
+
+def _keys(pipeline: Pipeline, configs: Configs, absent: Mapping[str, str], workshop: Workshop) -> Keys:
+    """What determined the results: raw files as they were ingested."""
+    inputs = {artefact.label: artefact.inputs for artefact in workshop.artefacts.values() if artefact.stage == INGEST}
+    return keys_of_study(pipeline, configs, absent, workshop.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])

@@ -1,10 +1,8 @@
-"""Last stage: evaluations to tables, figures and a page; and what of it is published in results/."""
+"""Last stage: evaluations to tables, figures and a page."""
 
 from __future__ import annotations
 
-import importlib
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,19 +10,18 @@ from typing import Any
 
 import pandas as pd
 
-from vehest.data.errors import ConfigurationError
-from vehest.data.files import sha256_of, written_aside
 from vehest.estimators.registry import estimator_class
-from vehest.stages.artefacts import MANIFEST, Artefact, StagePlan, provenance
+from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.stages.code_version import code_version
-from vehest.stages.evaluate import METRICS, scored_spans
+from vehest.stages.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.stages.group import Evaluation, Member
-from vehest.stages.train import recording_file
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefacts
+from vehest.stages.publishing import PROVENANCE
+from vehest.stages.train import read_fit_metrics, recording_file
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefacts, read_frame
+from vehest.studies.kit.timings import timings_of_study
+from vehest.studies.registry import study_module, study_module_name
 
 STAGE = "report"
-PAGE_ENDING = ".html"
-PROVENANCE = "provenance.json"
 OVERVIEW = "tables/overview.csv"
 
 
@@ -37,7 +34,7 @@ class ReportJob:
         title: its title.
         about: a paragraph on it.
         command: the command that makes it.
-        module: module of `vehest.studies`.
+        module: name of the module that draws it, as `vehest.studies.registry` knows it.
         members: trained and evaluated, in the order of the pipeline.
         evaluation: split, references and protocol.
         data_titles: data set -> title.
@@ -69,22 +66,39 @@ def plan_report(job: ReportJob, output: Path) -> StagePlan:
         label=job.study,
         config={**config, "data_titles": dict(job.data_titles), "protocol": asdict(job.evaluation.protocol)},
         inputs=inputs,
-        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
+        code=code_of_report(job.module, __name__),
         output=output,
     )
 
 
+def code_of_report(study: str, drawn_by: str) -> str:
+    """Version of what a report runs.
+
+    Args:
+        study: name of the module that draws it, as `vehest.studies.registry` knows it.
+        drawn_by: module that hands artefacts to it.
+    """
+    drawn_with = [study_module_name(study), "vehest.studies.artefacts", "vehest.studies.kit.timings"]
+    return code_version(drawn_with, own=[drawn_by], files=["report/templates"])
+
+
 def write_report(job: ReportJob, folder: Path) -> None:
-    """Draw the study into ``folder``: report.md, report.html, metrics.csv, tables, figures, provenance."""
+    """Draw the study into ``folder``: report.md, report.html, metrics.csv, timings.csv, tables, figures, provenance."""
     from vehest.report.document import write_document
 
-    artefacts = study_artefacts(job)
-    write_document(_module(job).build(artefacts), folder)
-    artefacts.metrics.to_csv(folder / METRICS, index=False, lineterminator="\n")
+    artefacts, timings = study_artefacts(job), timings_of(job)
+    write_document(_module(job).build(artefacts), folder, on_page=timings_of_study([("", timings, titles_of(artefacts))]))
+    write_metrics(artefacts.metrics, folder / METRICS)
+    write_metrics(timings, folder / TIMINGS)
     about = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command, "kinds": dict(job.evaluation.kinds)}
     about["recordings"] = recording_digests(job)
-    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def write_metrics(table: pd.DataFrame, path: Path) -> None:
+    """Write figures of a study, the same bytes for the same figures."""
+    table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
 
 
 def leaderboard_of(job: ReportJob) -> pd.DataFrame:
@@ -99,9 +113,7 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
     for member in job.members:
         assert member.model is not None
         assert member.evaluation is not None
-        table = pd.read_csv(member.evaluation.folder / METRICS, float_precision="round_trip")
-        table.insert(0, "study", job.study)
-        tables.append(table)
+        tables.append(_table_of(member.evaluation, METRICS))
         estimator = estimator_class(str(member.job.estimator["name"])).from_config(member.job.estimator)
         models.append(
             EvaluatedModel(
@@ -124,32 +136,37 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
         protocol=e.protocol,
         kinds=e.kinds,
         data_titles=job.data_titles,
-        metrics=pd.concat(tables, ignore_index=True)[list(METRIC_COLUMNS)],
+        metrics=_together(tables, job.study),
         models=models,
         references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in (*e.split.train, *scored_spans(e.split))},
         facts=list(job.training),
     )
 
 
-def publish(report: Artefact, folder: Path) -> bool:
-    """Copy a report without its pages to ``folder``; returns whether anything there changed.
+def timings_of(job: ReportJob) -> pd.DataFrame:
+    """What trainings, their phases and online steps took, with `METRIC_COLUMNS` [s]; in no published file."""
+    tables = []
+    for member in job.members:
+        assert member.model is not None
+        assert member.evaluation is not None
+        own = _table_of(member.evaluation, TIMINGS)
+        fit = {name: value for name, value in read_fit_metrics(member.model.folder).items() if name.endswith("_seconds")}
+        phases = {name: value for name, value in fit.items() if name not in set(own["metric"])}
+        tables += [own, *(own.head(1).assign(metric=name, value=value) for name, value in phases.items())]
+    return _together(tables, job.study)
 
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else.
-    """
-    wanted = {name: digest for name, digest in report.outputs.items() if name != MANIFEST and not name.endswith(PAGE_ENDING)}
-    if folder.is_dir():
-        present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
-        if present == wanted:
-            return False
-        if present and PROVENANCE not in present:
-            raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
-    with written_aside(folder, replace_folder=True) as aside:
-        for name in wanted:
-            (aside / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(report.folder / name, aside / name)
-    return True
+
+def titles_of(artefacts: StudyArtefacts) -> dict[tuple[str, str], str]:
+    """(estimator, variant) -> title, in the order of the models."""
+    return {(model.estimator, model.variant): model.title for model in artefacts.models}
+
+
+def _table_of(evaluation: Artefact, file: str) -> pd.DataFrame:
+    return read_frame(evaluation.folder / file, COLUMNS, numbers=("value",))
+
+
+def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
+    return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
 
 
 def recording_digests(job: ReportJob) -> dict[str, str]:
@@ -163,17 +180,8 @@ def recording_digests(job: ReportJob) -> dict[str, str]:
 
 def overview_of(report: Artefact) -> pd.DataFrame:
     """The overview of a study that has one, as the report shows it."""
-    return pd.read_csv(report.folder / OVERVIEW, float_precision="round_trip")
-
-
-def shown_in(folder: Path) -> set[str]:
-    """Data sets and parts that a published study shows; none where nothing is published."""
-    try:
-        about = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-        return {*about.get("kinds", {}), *about.get("parts", [])}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return set()
+    return read_frame(report.folder / OVERVIEW)
 
 
 def _module(job: ReportJob) -> Any:
-    return importlib.import_module(f"vehest.studies.{job.module}")
+    return study_module(job.module)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -12,12 +11,13 @@ from typing import Any
 from vehest.data.errors import MissingError
 from vehest.sources.base import kind_of
 from vehest.stages.artefacts import Artefact, StagePlan, find, provenance
-from vehest.stages.code_version import code_version
 from vehest.stages.config import Config
 from vehest.stages.ingest import plan_ingest
-from vehest.stages.report import PROVENANCE, STAGE
+from vehest.stages.publishing import PROVENANCE
+from vehest.stages.report import STAGE, code_of_report
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
+from vehest.studies.registry import study_module
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class SurveyJob:
         title: its title.
         about: a paragraph on it.
         command: the command that makes it.
-        module: module of `vehest.studies`.
+        module: name of the module that draws it, as `vehest.studies.registry` knows it.
         configs: configuration of each ingest.
         ingested: what these made.
         absent: data sets that the study goes on without.
@@ -99,7 +99,7 @@ def plan_survey(job: SurveyJob, output: Path) -> StagePlan:
         label=job.study,
         config={**config, "datasets": about, "absent": [asdict(dataset) for dataset in job.absent]},
         inputs={artefact.label: artefact.digest for artefact in job.ingested},
-        code=code_version([f"vehest.studies.{job.module}", "vehest.studies.artefacts"], own=[__name__], files=["report/templates"]),
+        code=code_of_report(job.module, __name__),
         output=output,
     )
 
@@ -108,7 +108,7 @@ def write_survey(job: SurveyJob, folder: Path) -> None:
     """Draw the study into ``folder``: report.md, a page each part of it, the same as HTML, tables, figures, provenance."""
     from vehest.report.document import write_documents
 
-    write_documents(importlib.import_module(f"vehest.studies.{job.module}").documents(_artefacts(job)), folder)
+    write_documents(study_module(job.module).documents(_artefacts(job)), folder)
     about = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command}
     about["kinds"] = {own["dataset"]["name"]: _kind(own["dataset"]) for own in job.configs}
@@ -116,7 +116,7 @@ def write_survey(job: SurveyJob, folder: Path) -> None:
     about["recordings"] = {
         f"{artefact.label}/{Path(name).stem}": digest for artefact in job.ingested for name, digest in artefact.outputs.items()
     }
-    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def _artefacts(job: SurveyJob) -> SurveyArtefacts:

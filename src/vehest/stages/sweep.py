@@ -11,23 +11,25 @@ from typing import Any
 import pandas as pd
 
 from vehest.data.errors import ConfigurationError, JobsFailedError, VehestError
+from vehest.data.limits import use_limits
+from vehest.data.schema import settings_from_config
 from vehest.data.splits import VALIDATION, Split, check_name
 from vehest.stages.artefacts import Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.comparison import plain_resampling, resampling_fact, training_facts
-from vehest.stages.config import Config, compose_config, expand, key_of, parse
-from vehest.stages.evaluate import METRICS, protocol_from_config
+from vehest.stages.config import Config, check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
+from vehest.stages.evaluate import COLUMNS, METRICS, protocol_from_config
 from vehest.stages.group import Evaluation, Group, Member
-from vehest.stages.pipeline import compose_seed, content_overrides
+from vehest.stages.pipeline import content_overrides
 from vehest.stages.train import new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
+from vehest.studies.artefacts import read_frame
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, Value, build, short_names, shown_value, summary
-from vehest.training.settings import settings_from_config
 
 STAGE = "sweep"
 JOBS = "sweep.csv"
 SUMMARY = "summary.csv"
-ONE_VALUE = ("split", "evaluation", "root", "output", "tracking")
+ONE_VALUE = ("split", "evaluation", "root", "output", "tracking", "limits")
 SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
@@ -109,6 +111,12 @@ def plan_sweep(overrides: Sequence[str], name: str | None = None) -> Sweep:
         ConfigurationError: a key is named twice, a key takes several values that cannot, the name is none for files, or no combination can
             be trained.
     """
+    with use_limits(limits_of(overrides)):
+        check_jobs(count(overrides), "these overrides stand")
+        return _planned(overrides, name)
+
+
+def _planned(overrides: Sequence[str], name: str | None) -> Sweep:
     parsed = parse(overrides)
     keys = [str(override.key_or_group) for override in parsed]
     for key in keys:
@@ -129,7 +137,7 @@ def plan_sweep(overrides: Sequence[str], name: str | None = None) -> Sweep:
         reasons = set(refused.values())
         raise ConfigurationError(reasons.pop() if len(reasons) == 1 else f"no combination can be trained; {_listed(refused)}")
     first = next(combination.config for combination in combinations if not combination.refusal)
-    values = list(dict.fromkeys(compose_seed(job[0]) for job in expand(seeds))) if seeds else [first["seed"]]
+    values = list({repr(seed): seed for seed in (value_of(job[0]) for job in expand(seeds))}.values()) if seeds else [first["seed"]]
     estimators = dict.fromkeys(str(combination.config["estimator"]["name"]) for combination in combinations if not combination.refusal)
     own_name = name or f"{'_'.join(estimators)}-{first['split']['name']}"
     check_name(own_name, "--name")
@@ -192,7 +200,7 @@ def _combinations(jobs: Sequence[Sequence[str]], swept: Sequence[str]) -> list[C
 
 def _value(override: str) -> Value:
     """A plain value, or the text of any other."""
-    value = parse([override])[0].value()
+    value = value_of(override)
     return value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
 
 
@@ -286,7 +294,7 @@ def _figures(member: Member | None, sets: Sequence[str]) -> dict[str, Any]:
     columns = ["n_parameters", "epochs", *(f"{metric}.{name}" for name in sets for metric in SCORES)]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(columns, float("nan"))
-    table = pd.read_csv(member.evaluation.folder / METRICS, float_precision="round_trip")
+    table = read_frame(member.evaluation.folder / METRICS, COLUMNS, numbers=("value",))
     found = {f"{metric}.{name}": value for metric, name, value in zip(table["metric"], table["test_set"], table["value"], strict=True)}
     own = {metric: next(value for name, value in found.items() if name.startswith(f"{metric}.")) for metric in ("n_parameters", "epochs")}
     return {**own, **{column: found.get(column, float("nan")) for column in columns[2:]}, "model": member.model.folder.name}
@@ -332,9 +340,14 @@ def _plan(artefacts: SweepArtefacts, members: Sequence[Member], output: Path) ->
             "facts": list(artefacts.facts),
         },
         inputs=inputs,
-        code=code_version(["vehest.studies.sweep"], own=[__name__]),
+        code=code_of_sweep(),
         output=output,
     )
+
+
+def code_of_sweep() -> str:
+    """Version of what draws a sweep's tables and figures."""
+    return code_version(["vehest.studies.sweep"], own=[__name__])
 
 
 def _write(artefacts: SweepArtefacts, folder: Path) -> None:
@@ -342,9 +355,9 @@ def _write(artefacts: SweepArtefacts, folder: Path) -> None:
     from vehest.report.document import write_document
 
     write_document(build(artefacts), folder, page=False)
-    artefacts.jobs.to_csv(folder / JOBS, index=False, lineterminator="\n")
+    artefacts.jobs.to_csv(folder / JOBS, index=False, lineterminator="\n", errors="backslashreplace")
     table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
-    table.to_csv(folder / SUMMARY, index=False, lineterminator="\n")
+    table.to_csv(folder / SUMMARY, index=False, lineterminator="\n", errors="backslashreplace")
 
 
 def _say_plan(sweep: Sweep, workshop: Workshop) -> None:

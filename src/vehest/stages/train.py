@@ -11,15 +11,16 @@ from typing import Any
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.data.schema import FURTHER_KEYS, settings_from_config, validated
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
+from vehest.data.text_files import number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class, estimator_module
-from vehest.stages.artefacts import Artefact, StagePlan
+from vehest.stages.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.training.context import FitContext
-from vehest.training.settings import settings_from_config
 
 STAGE = "train"
 HISTORY = "history.csv"
@@ -100,10 +101,19 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
             **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
         },
         inputs=inputs,
-        code=code_version([estimator_module(estimator.name), "vehest.estimators.model_files", "vehest.data.store"], own=[__name__]),
+        code=code_of_training(estimator_module(estimator.name)),
         output=Path(config["output"]),
     )
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
+
+
+def code_of_training(module: str) -> str:
+    """Version of what a training runs.
+
+    Args:
+        module: that of the estimator.
+    """
+    return code_version([module, "vehest.estimators.model_files", "vehest.data.store"], own=[__name__])
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
@@ -127,7 +137,7 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
-    """Write a fitted estimator, its history and its figures into ``folder``."""
+    """Write a fitted estimator, its history, its figures and, in a file of their own, its times into ``folder``."""
     about = {
         "seed": job.seed,
         "trained_on": [span.describe() for span in job.split.train],
@@ -141,7 +151,59 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
     if record.history:
         _write_csv(folder / HISTORY, list(record.history), zip(*record.history.values(), strict=True))
     metrics = {**record.metrics, "n_parameters": estimator.n_parameters}
-    _write_csv(folder / FIT_METRICS, ["metric", "value"], metrics.items())
+    for file, timed in ((FIT_METRICS, False), (TIMINGS, True)):
+        _write_csv(folder / file, ["metric", "value"], [item for item in metrics.items() if item[0].endswith("_seconds") is timed])
+
+
+@dataclass(frozen=True)
+class _Range:
+    """A range as the manifest of a model names it; times as text, since JSON knows no infinity."""
+
+    dataset: str
+    recording: str
+    start: str
+    stop: str
+
+
+@dataclass(frozen=True)
+class _Rate:
+    __pydantic_config__ = FURTHER_KEYS
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class _Trained:
+    __pydantic_config__ = FURTHER_KEYS
+    estimator: _Rate
+    train: tuple[_Range, ...]
+    validation: tuple[_Range, ...]
+
+
+def trained_rate(model: Artefact) -> float:
+    """The rate that a model works at [Hz].
+
+    Raises:
+        DataError: its manifest does not tell.
+    """
+    return _trained(model).estimator.rate_hz
+
+
+def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
+    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles.
+
+    Raises:
+        DataError: its manifest does not tell.
+    """
+    told = _trained(model)
+    ranges = [own for role in roles or ("train", "validation") for own in getattr(told, role)]
+    try:
+        return [Span(r.dataset, r.recording, float(r.start), float(r.stop)) for r in ranges]
+    except (ValueError, ConfigurationError) as error:
+        raise DataError(f"'{model.folder / MANIFEST}': config.train and config.validation name no ranges ({error})") from None
+
+
+def _trained(model: Artefact) -> _Trained:
+    return validated(_Trained, dict(model.config), f"'{model.folder / MANIFEST}'", group="config")
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
@@ -151,9 +213,17 @@ def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
 
 
 def read_fit_metrics(folder: Path) -> dict[str, float]:
-    """Figures of a fit, such as ``epochs``."""
-    with open(folder / FIT_METRICS, newline="", encoding="utf-8") as stream:
-        return {row["metric"]: float(row["value"]) for row in csv.DictReader(stream)}
+    """Figures of a fit, such as ``epochs``, and its times.
+
+    Raises:
+        MissingError: they are not there.
+        DataError: they are damaged.
+    """
+    return {
+        row["metric"]: number_in(row, "value", path)
+        for path in (folder / FIT_METRICS, folder / TIMINGS)
+        for row in read_rows(path, ("metric", "value"))
+    }
 
 
 def recording_file(data: Artefact, span: Span) -> Path:

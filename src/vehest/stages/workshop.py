@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,25 +11,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from vehest.data.recording import Recording
-from vehest.data.splits import VALIDATION, Catalogue, Split, dataset_names, split_from_config
+from vehest.data.splits import TRAINING, VALIDATION, Catalogue, Split, dataset_names, split_from_config
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import kind_of
-from vehest.stages.artefacts import Artefact, StagePlan, Status, find, make
+from vehest.stages.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.stages.compiling import has_to_compile
 from vehest.stages.config import Config, compose_config
 from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
-from vehest.stages.evaluate import METRICS, read_scored
-from vehest.stages.group import Evaluation, Group, Member, existing, is_finished, run_group
+from vehest.stages.evaluate import read_metrics, read_scored
+from vehest.stages.failures import Failure
+from vehest.stages.finished import Outcome, RawFolder
+from vehest.stages.group import Evaluation, Group, Member, drop_finished_checkpoint, existing, is_finished, run_group
 from vehest.stages.ingest import drop_parts, plan_ingest, write_ingest
-from vehest.stages.launcher import Failure, Task, launch
+from vehest.stages.launcher import Task, launch
+from vehest.stages.locks import Waiting
+from vehest.stages.publishing import Publication
+from vehest.stages.shown import Shown
 from vehest.stages.signals import StopSignals
 from vehest.stages.tracking import Tracker
 from vehest.stages.train import HISTORY, read_fit_metrics
+from vehest.studies.artefacts import read_frame
+from vehest.training.context import Progress
 
 
 class NotThereYet(Exception):
@@ -49,6 +54,8 @@ class Workshop:
         force: stages to run although their artefacts are there.
         dry_run: say what would run, run nothing.
         tracker: where runs are logged; none for no tracking.
+        tags: what runs are tagged with.
+        artefacts: what was found or made so far, by folder.
     """
 
     output: Path
@@ -59,6 +66,7 @@ class Workshop:
     dry_run: bool = False
     tracker: Tracker | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+    artefacts: dict[Path, Artefact] = field(default_factory=dict)
     _made: dict[str, Artefact] = field(default_factory=dict)
     _datasets: dict[str, Config] = field(default_factory=dict)
     _data: dict[tuple[str, float, str], Artefact] = field(default_factory=dict)
@@ -133,6 +141,33 @@ class Workshop:
             self._datasets[name] = compose_config("ingest", overrides)
         return self._datasets[name]
 
+    def datasets_of(self, config: Config) -> dict[str, Config]:
+        """The configuration of every data set that the split of another command's configuration draws on, by its name."""
+        return {name: self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])}
+
+    def outcome(
+        self,
+        report: Artefact,
+        shown: Shown,
+        publication: Publication | None,
+        tracking: Mapping[str, Any],
+        raw: Mapping[str, RawFolder] | None,
+    ) -> Outcome:
+        """What was done here, to be remembered."""
+        made = list(self.artefacts.values())
+        return Outcome(self.output, report, made, list(self.messages.said), shown, publication, tracking, raw)
+
+    def rehearsed(self, whole_way: Callable[[Workshop], Outcome]) -> Callable[[], Outcome | None]:
+        """What the next run into the same output root will say and find, without making or saying anything."""
+
+        def again() -> Outcome | None:
+            try:
+                return whole_way(Workshop(self.output, Messages(silent=True), self.stop, dry_run=True))
+            except NotThereYet:
+                return None
+
+        return again
+
     def kinds_of(self, split: Split, config: Config) -> dict[str, str]:
         """Data set -> ``real`` or ``simulated``."""
         return {name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets}
@@ -152,6 +187,9 @@ class Workshop:
                 if is_finished(group, member):
                     members.append(member)
                     self._say_skipped(member)
+                    if not self.dry_run:
+                        drop_finished_checkpoint(member.job)
+                        self._track(member, group.evaluation)
             missing = [member.job for member in found if not is_finished(group, member)]
             if missing:
                 waiting.append(replace(group, jobs=missing))
@@ -166,7 +204,14 @@ class Workshop:
         failures: list[tuple[str, Failure]] = []
         tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
         with self.messages.bars() as bars:
-            for done in launch(tasks, self.jobs, self.stop, lambda at, progress: bars.fit(tasks[at].name, progress)):
+
+            def report(at: int, progress: Progress | Waiting | None) -> None:
+                if isinstance(progress, Waiting):
+                    self._say_waiting(progress)
+                else:
+                    bars.fit(tasks[at].name, progress)
+
+            for done in launch(tasks, self.jobs, self.stop, report):
                 name = tasks[done.position].name
                 bars.close(name)
                 if isinstance(done.outcome, Failure):
@@ -175,8 +220,12 @@ class Workshop:
                     continue
                 for member in done.outcome:
                     members.append(member)
-                    self._say_made(member, waiting[done.position].evaluation)
+                    self._say_made(member)
+                    self._track(member, waiting[done.position].evaluation)
         self.stop.raise_if_requested()
+        for made in (artefact for member in members for artefact in (member.model, member.evaluation)):
+            if made is not None:
+                self.artefacts[made.folder] = made
         return members, failures
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
@@ -193,56 +242,75 @@ class Workshop:
             self.messages.line("plan", plan.stage, plan.label)
             raise NotThereYet
         else:
-            found = make(plan, write)
-            self.messages.line("done", plan.stage, plan.label, f"{found.provenance['seconds']:.1f} s, {found.folder}")
+            found = ensured(plan, write, plan.stage in self.force, self.stop.requested, self._say_waiting)
+            self.stop.raise_if_requested()
+            assert found is not None
+            if found.skipped:
+                self.messages.line("skip", plan.stage, plan.label, "up to date")
+            else:
+                self.messages.line("done", plan.stage, plan.label, f"{found.provenance['seconds']:.1f} s, {found.folder}")
         self._made[plan.key] = found
+        self.artefacts[found.folder] = found
         return found
+
+    def _say_waiting(self, waiting: Waiting) -> None:
+        self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
 
     def _say_skipped(self, member: Member) -> None:
         self.messages.line("skip", "train", member.job.plan.label, "up to date")
         if member.evaluation is not None:
             self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
 
-    def _say_made(self, member: Member, how: Evaluation | None) -> None:
+    def _say_made(self, member: Member) -> None:
         if member.model is None:
             self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
             return
-        if not member.model.skipped:
+        if member.model.skipped:
+            self.messages.line("skip", "train", member.model.label, "up to date")
+        elif member.model.status == "interrupted":
+            detail = f"the best so far is kept in {member.model.folder}; the next run goes on"
+            self.messages.line("stop", "train", member.model.label, detail)
+        else:
             fit = read_fit_metrics(member.model.folder)
-            if member.model.status == "interrupted":
-                detail = f"the best so far is kept in {member.model.folder}; the next run goes on"
-                self.messages.line("stop", "train", member.model.label, detail)
-            else:
-                epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
-                loss = fit.get("best_validation_loss")
-                outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}"
-                self.messages.line("done", "train", member.model.label, f"{epochs}{outcome}")
-            self.log_fit(member.model, fit)
-        if member.evaluation is not None and not member.evaluation.skipped:
+            epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
+            loss = fit.get("best_validation_loss")
+            outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}"
+            self.messages.line("done", "train", member.model.label, f"{epochs}{outcome}")
+        if member.evaluation is None:
+            return
+        if member.evaluation.skipped:
+            self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
+        else:
             figures = test_figures(member.evaluation)
             shown = ", ".join(f"{name} {value:.3f}°" for name, value in figures.items() if name.startswith("rmse_sideslip"))
             self.messages.line("done", "evaluate", member.evaluation.label, shown)
-            if how is not None:
-                self.log_evaluation(member.evaluation, member.model, how, figures)
 
-    def log_fit(self, model: Artefact, figures: Mapping[str, float]) -> None:
-        """Track a training: figures, figures over epochs, learning curve."""
-        if self.tracker is not None:
+    def _track(self, member: Member, how: Evaluation | None) -> None:
+        if member.model is not None:
+            self.log_fit(member.model)
+            if member.evaluation is not None and how is not None:
+                self.log_evaluation(member.evaluation, member.model, how)
+
+    def log_fit(self, model: Artefact) -> None:
+        """Track a training, unless it is tracked: figures, figures over epochs, learning curve."""
+        if self.tracker is not None and not self.tracker.is_tracked(model):
             drawn = {"learning.png": partial(_learning_figure, model)}
-            self.tracker.log(model, self.tags, figures, model.folder / HISTORY, drawn)
+            self.tracker.log(model, self.tags, read_fit_metrics(model.folder), model.folder / HISTORY, drawn)
 
-    def log_evaluation(self, evaluation: Artefact, model: Artefact, how: Evaluation, figures: Mapping[str, float]) -> None:
-        """Track an evaluation: figures, and traces over each test set."""
-        if self.tracker is not None:
+    def log_evaluation(self, evaluation: Artefact, model: Artefact, how: Evaluation) -> None:
+        """Track an evaluation, unless it is tracked: figures, and traces over each test set."""
+        if self.tracker is not None and not self.tracker.is_tracked(evaluation):
             drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
-            self.tracker.log(evaluation, self.tags, figures, None, drawn)
+            self.tracker.log(evaluation, self.tags, test_figures(evaluation), None, drawn)
 
 
 def test_figures(evaluation: Artefact) -> dict[str, float]:
     """Figures of an evaluation, ``<metric>.<test set>`` -> value."""
-    with open(evaluation.folder / METRICS, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    return {f"{row['metric']}.{row['test_set']}": float(row["value"]) for row in rows if row["test_set"] != VALIDATION}
+    table = read_metrics(evaluation.folder)
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING))]
+    return {
+        f"{metric}.{name}": float(value) for metric, name, value in zip(tested["metric"], tested["test_set"], tested["value"], strict=True)
+    }
 
 
 def _learning_figure(model: Artefact) -> Any:
@@ -251,7 +319,7 @@ def _learning_figure(model: Artefact) -> Any:
     if not (model.folder / HISTORY).is_file():
         return None
     about = read_description(model.folder)
-    return fit_figure(model.label, about["estimator"], about["variant"], pd.read_csv(model.folder / HISTORY))
+    return fit_figure(model.label, about.estimator, about.variant, read_frame(model.folder / HISTORY))
 
 
 def _trace_figure(evaluation: Artefact, model: Artefact, how: Evaluation, test_set: str) -> Any:
@@ -261,7 +329,7 @@ def _trace_figure(evaluation: Artefact, model: Artefact, how: Evaluation, test_s
     parts = read_scored(evaluation, how.split, how.references, how.protocol, test_set)
     series = [np.concatenate([getattr(part, name) for part in parts]) for name in ("vy_ref", "sideslip_ref", "vy", "sideslip")]
     time = parts[0].time[0] + np.arange(len(series[0])) / how.protocol.rate_hz  # several ranges stand end to end
-    return trace_figure(model.label, about["estimator"], about["variant"], time, (series[0], series[1]), (series[2], series[3]))
+    return trace_figure(model.label, about.estimator, about.variant, time, (series[0], series[1]), (series[2], series[3]))
 
 
 def _quoted(text: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,11 +10,41 @@ from typing import Any
 
 import pandas as pd
 
+from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Split
 from vehest.data.store import read_estimate, read_recording
+from vehest.data.text_files import first_line, number_in, read_rows, read_text
+from vehest.evaluation.blocks import Segments, read_segments
 from vehest.evaluation.metrics import Protocol, Scored, score_all
+
+
+def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()) -> pd.DataFrame:
+    """A table that vehest wrote as CSV, its numbers bit for bit.
+
+    Args:
+        path: the file.
+        columns: that it must have.
+        numbers: those of them that must hold numbers.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, or a column is not there or holds text.
+    """
+    text = read_text(path)
+    try:
+        table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
+    except ValueError as error:  # pandas' own errors are of this kind
+        raise DataError(f"'{path}' cannot be read as CSV ({first_line(error)})") from None
+    for name in columns:
+        if name not in table:
+            raise DataError(f"'{path}' has no column '{name}'")
+    for name in numbers:
+        if not pd.api.types.is_numeric_dtype(table[name]):
+            raise DataError(f"'{path}': column '{name}' holds text where numbers belong")
+    return table
+
 
 METRIC_COLUMNS = (
     "study",
@@ -31,6 +62,8 @@ METRIC_COLUMNS = (
     "metric",
     "value",
     "unit",
+    "low",
+    "high",
 )
 
 
@@ -59,15 +92,25 @@ class EvaluatedModel:
     def history(self) -> pd.DataFrame | None:
         """Training history, one row an epoch (or a search); none if the method has none."""
         path = self.model_folder / "history.csv"
-        return pd.read_csv(path) if path.is_file() else None
+        return read_frame(path) if path.is_file() else None
 
     def fit_metrics(self) -> dict[str, float]:
-        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``; none where nothing was written."""
+        """Figures of the fit beyond those in the metrics, such as ``skipped_steps``, no times; none where nothing was written."""
         path = self.model_folder / "fit.csv"
-        if not path.is_file():
-            return {}
-        table = pd.read_csv(path)
-        return dict(zip(table["metric"].astype(str), table["value"].astype(float), strict=True))
+        rows = read_rows(path, ("metric", "value")) if path.is_file() else []
+        return {row["metric"]: number_in(row, "value", path) for row in rows}
+
+    def segments(self, test_set: str) -> Segments:
+        """Sums of its errors over segments of a test set.
+
+        Raises:
+            DataError: the file is damaged, or has no such test set.
+        """
+        path = self.evaluation_folder / "blocks.csv"
+        found = read_segments(path)
+        if test_set not in found:
+            raise DataError(f"'{path}' has no test set '{test_set}'; evaluate again")
+        return found[test_set]
 
     def estimate(self, test_set: str, position: int) -> Estimate:
         """The stored estimate of the n-th range of a test set, or of the n-th sequence (`sequences`)."""
@@ -87,7 +130,8 @@ class StudyArtefacts:
         protocol: how estimates are scored.
         kinds: data set -> ``real`` or ``simulated``.
         data_titles: data set -> title, for people.
-        metrics: long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range.
+        metrics: long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are not among them, since what a
+            study draws is published, and a time is never the same twice.
         models: evaluated models, in the order of the pipeline file.
         references: (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split.
         facts: further lines on how it was made: training budget, versions, machine.
@@ -142,8 +186,13 @@ class PartsArtefacts:
     @property
     def metrics(self) -> pd.DataFrame:
         """Metrics of all parts, `METRIC_COLUMNS`; ``trained_on`` is followed by the part: ``sim_two_cars/scheme_1``."""
-        tables = [part.metrics.assign(trained_on=part.metrics["trained_on"].fillna("") + f"/{name}") for name, part in self.parts.items()]
-        return pd.concat(tables, ignore_index=True)
+        return of_parts({name: part.metrics for name, part in self.parts.items()})
+
+
+def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Tables of all parts as one; ``trained_on`` is followed by the part."""
+    named = [table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") for name, table in tables.items()]
+    return pd.concat(named, ignore_index=True)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.heat_map import Panel, heat_map
 from vehest.report.style import decimals_for, fixed
 
@@ -213,7 +213,7 @@ def _shouted(kind: str) -> str:
 
 
 def _kind_sentence(artefacts: SweepArtefacts) -> str:
-    parts = "; ".join(f"{artefacts.data_titles[name]} ({_shouted(kind)})" for name, kind in artefacts.kinds.items())
+    parts = "; ".join(f"{as_text(artefacts.data_titles[name])} ({_shouted(kind)})" for name, kind in artefacts.kinds.items())
     kinds = set(artefacts.kinds.values())
     if len(kinds) == 1:
         return f"**{_shouted(kinds.pop())} data:** every number here comes from {parts}."
@@ -263,7 +263,7 @@ def _how_it_was_made(artefacts: SweepArtefacts) -> str:
     ranges = [_ranges("training", split.train), _ranges("validation", split.validation)]
     ranges += [_ranges(f"test `{name}`", spans) for name, spans in split.tests.items()]
     lines = [
-        f"Command: `{artefacts.command}`",
+        f"Command: {as_code(artefacts.command)}",
         f"Budget: {counts}{took}",
         *artefacts.facts,
         f"Split `{split.name}`: {'; '.join(ranges)}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from vehest.data.files import remove, written_aside
+from vehest.data.errors import VehestError
+from vehest.data.files import as_os_error, regular_file, remove, written_aside
+from vehest.data.schema import FURTHER_KEYS, validated
+from vehest.data.text_files import parse_json
 
 _FILE = "checkpoint.safetensors"
 
@@ -25,6 +29,15 @@ class Checkpoint:
     values: Mapping[str, Any]
 
 
+@dataclass(frozen=True)
+class _Progress:
+    """What every checkpoint says beside what its training keeps for itself."""
+
+    __pydantic_config__ = FURTHER_KEYS
+    epoch: int
+    finished: bool = False
+
+
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint in ``folder`` in one step.
 
@@ -34,7 +47,8 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     with written_aside(folder / _FILE) as aside:
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
         try:
-            save_file(tensors, aside, metadata={"values": json.dumps(dict(checkpoint.values))})
+            values = json.dumps(dict(checkpoint.values))
+            save_file(tensors, aside, metadata={"values": values, "digest": _digest(values, tensors)})
         except SafetensorError as error:
             raise as_os_error(error) from error
 
@@ -42,14 +56,27 @@ def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 def load_checkpoint(folder: Path) -> Checkpoint | None:
     """The checkpoint in ``folder``; none if there is none or it cannot be read, in which case training starts anew."""
     path = folder / _FILE
-    if not path.is_file():
-        return None
     try:
+        regular_file(path)
         with safe_open(path, framework="pt") as file:
-            values = json.loads((file.metadata() or {})["values"])
-            return Checkpoint({name: file.get_tensor(name) for name in file.keys()}, values)  # noqa: SIM118
-    except (SafetensorError, KeyError, ValueError, OSError):
+            kept = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            if kept.get("digest") != _digest(kept.get("values", ""), tensors):
+                return None
+            values = parse_json(kept["values"], f"'{path}'")
+            validated(_Progress, values, f"'{path}'")
+            return Checkpoint(tensors, values)
+    except (SafetensorError, VehestError, ValueError, OSError):
         return None
+
+
+def _digest(values: str, tensors: Mapping[str, Tensor]) -> str:
+    """Hash of all that a checkpoint holds: one that has been damaged anywhere is none."""
+    digest = hashlib.sha256(values.encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        digest.update(tensor.numpy().tobytes())
+    return digest.hexdigest()
 
 
 def resume_epoch(folder: Path) -> int:
@@ -60,17 +87,10 @@ def resume_epoch(folder: Path) -> int:
     checkpoint = load_checkpoint(folder)
     if checkpoint is None:
         return 0
-    return -1 if checkpoint.values.get("finished") else int(checkpoint.values["epoch"])
+    progress = validated(_Progress, dict(checkpoint.values), f"'{folder / _FILE}'")
+    return -1 if progress.finished else progress.epoch
 
 
 def drop_checkpoint(folder: Path) -> None:
     """Forget the checkpoint in ``folder``, and the folder with it."""
     remove(folder)
-
-
-def as_os_error(error: SafetensorError) -> OSError:
-    """Safetensors reports failed writes in prose; recover the error number from it."""
-    text = str(error)
-    marker = "os error "
-    number = int(text.split(marker)[1].split(")")[0]) if marker in text else 5
-    return OSError(number, text)

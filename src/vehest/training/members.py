@@ -6,39 +6,90 @@ rows, and what happens in one row never touches another: a member trains exactly
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import Protocol
+from weakref import WeakSet
 
 import torch
 from torch import Tensor, nn
 
+from vehest.data.errors import ConfigurationError
+
+MOST_WINDOWS = 1024
+"""Windows that are evaluated at once where no gradient is wanted: each is laid out by itself in memory."""
+
 
 class WindowNetwork(Protocol):
-    """A network that maps a window of measurements to the lateral velocity one step after it."""
+    """A network that maps a window of measurements to the lateral velocity one step after it: any ``nn.Module`` with this forward."""
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Prediction from prepared windows, (B, N, C) -> (B,) or (B, 1), in m/s."""
+        ...
+
+
+class WindowNetworkHooks(Protocol):
+    """What a `WindowNetwork` may have besides; each does without."""
 
     def prepared(self, series: Tensor) -> Tensor:
-        """Series as the network consumes it (scaled, say), (T, C) -> (T, C); once, before training."""
+        """Series as the network consumes it (scaled, say), (T, C) -> (T, C); once, before training. Without: as it was measured, in SI."""
         ...
 
-    def forward(self, prepared_windows: Tensor) -> Tensor:
-        """Prediction from prepared windows, (..., N, C) -> (...), in m/s."""
-        ...
-
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
-        """The same for M members on their own windows by a compiled recursion; see `predict_members`."""
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw initial weights. Without: those that torch draws when the network is built, under the member's seed."""
         ...
 
     def constrain(self, parameters: Mapping[str, Tensor]) -> None:
-        """Bring parameters of shape (M, ...) back into their admissible range, in place."""
+        """Bring parameters of shape (M, ...) back into their admissible range, in place. Without: all are admissible."""
+        ...
+
+    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+        """The same as forward for M members on their own windows by a compiled recursion, (M, B). Without: see `predict_members`."""
         ...
 
 
+def prepare(network: nn.Module, series: Tensor) -> Tensor:
+    """Series (T, C) as a network consumes it."""
+    hook = getattr(network, "prepared", None)
+    return series if hook is None else hook(series)
+
+
+def constrain(network: nn.Module, parameters: Mapping[str, Tensor]) -> None:
+    """Bring parameters of shape (M, ...) back into their admissible range, in place."""
+    hook = getattr(network, "constrain", None)
+    if hook is not None:
+        hook(parameters)
+
+
+def is_plain(network: nn.Module) -> bool:
+    """Whether a network has no compiled recursion."""
+    return not hasattr(network, "compiled_members")
+
+
+@contextmanager
+def random_numbers(seed: int) -> Iterator[None]:
+    """Let torch draw from this seed on the CPU, and go on afterwards as if nothing had been drawn."""
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        yield
+
+
+def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
+    """Buffers and parameters that no gradient is wanted of, by name, (M, ...)."""
+    own = [
+        {name: p.detach() for name, p in module.named_parameters() if not p.requires_grad} | dict(module.named_buffers())
+        for module in modules
+    ]
+    return {name: torch.stack([state[name] for state in own]) for name in own[0]}
+
+
 class FlatParameters:
-    """Where each parameter of a module sits in a row of a (members, K) matrix."""
+    """Where each parameter of a module that is trained sits in a row of a (members, K) matrix."""
 
     def __init__(self, module: nn.Module) -> None:
-        self.shapes = {name: tuple(parameter.shape) for name, parameter in module.named_parameters()}
-        self.sizes = {name: parameter.numel() for name, parameter in module.named_parameters()}
+        self.shapes = {name: tuple(parameter.shape) for name, parameter in _trained(module)}
+        self.sizes = {name: parameter.numel() for name, parameter in _trained(module)}
 
     @property
     def n_parameters(self) -> int:
@@ -47,7 +98,7 @@ class FlatParameters:
 
     def pack(self, modules: Sequence[nn.Module]) -> Tensor:
         """Rows of parameters, shape (M, K)."""
-        return torch.stack([torch.cat([p.detach().reshape(-1) for p in module.parameters()]) for module in modules])
+        return torch.stack([torch.cat([p.detach().reshape(-1) for _, p in _trained(module)]) for module in modules])
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Parameters by name, each of shape (M, ...), as views of ``flat`` (M, K)."""
@@ -59,28 +110,77 @@ class FlatParameters:
         """Copy one row, shape (K,), into a module."""
         views = self.views(row.reshape(1, -1))
         with torch.no_grad():
-            for name, parameter in module.named_parameters():
+            for name, parameter in _trained(module):
                 parameter.copy_(views[name][0])
 
 
+def _trained(module: nn.Module) -> list[tuple[str, nn.Parameter]]:
+    return [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]
+
+
 def predict_members(
-    network: nn.Module, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor, n_window: int, *, compiled: bool
+    network: nn.Module,
+    parameters: Mapping[str, Tensor],
+    prepared: Tensor,
+    starts: Tensor,
+    n_window: int,
+    *,
+    compiled: bool,
+    seeds: Sequence[int] = (),
 ) -> Tensor:
     """Predictions of M members, each on its own windows.
 
+    Without a compiled recursion members are one batched computation by ``torch.func.vmap`` where torch can batch every layer, and one
+    computation a member where it cannot (``nn.LSTM``, ``nn.GRU``) or where a layer draws random numbers (dropout).
+
     Args:
-        network: a `WindowNetwork`, whose own parameters are not used.
+        network: a `WindowNetwork`, whose own parameters and buffers are used where ``parameters`` does not name them.
         parameters: name -> (M, ...).
-        prepared: (T, C), what ``network.prepared`` returned.
+        prepared: (T, C), what `prepare` returned.
         starts: first row of each window, (M, B), int64.
         n_window: samples N in a window.
-        compiled: use the compiled recursion instead of PyTorch.
+        compiled: use the compiled recursion where the network has one; PyTorch otherwise.
+        seeds: what layers that draw random numbers draw from, one a member; none: from torch's global state.
 
     Returns:
         (M, B) [m/s].
+
+    Raises:
+        ConfigurationError: the network returns another shape.
     """
-    if compiled:
+    if compiled and not is_plain(network):
         result: Tensor = network.compiled_members(parameters, prepared, starts)  # type: ignore[operator]
         return result
-    windows = prepared[starts.unsqueeze(-1) + torch.arange(n_window, device=starts.device)]
-    return torch.func.vmap(lambda row, batch: torch.func.functional_call(network, row, (batch,)))(dict(parameters), windows)
+    offsets = torch.arange(n_window, device=starts.device)
+    pieces = [starts] if torch.is_grad_enabled() else starts.split(MOST_WINDOWS, dim=1)
+    return torch.cat([_plain(network, parameters, prepared[piece.unsqueeze(-1) + offsets], seeds) for piece in pieces], dim=1)
+
+
+_ONE_BY_ONE: WeakSet[nn.Module] = WeakSet()
+"""Networks with a layer that torch cannot batch."""
+
+
+def _plain(network: nn.Module, parameters: Mapping[str, Tensor], windows: Tensor, seeds: Sequence[int]) -> Tensor:
+    """Predictions of M members by PyTorch alone, windows (M, B, N, C) -> (M, B)."""
+
+    def predict(own: Mapping[str, Tensor], batch: Tensor) -> Tensor:
+        predicted = torch.func.functional_call(network, dict(own), (batch,))
+        if predicted.shape not in (batch.shape[:1], (*batch.shape[:1], 1)):
+            raise ConfigurationError(
+                f"{type(network).__name__} maps windows of shape {tuple(batch.shape)} to {tuple(predicted.shape)}; "
+                f"it must return one lateral velocity a window, ({len(batch)},)"
+            )
+        return predicted.reshape(len(batch))
+
+    if len(windows) > 1 and network not in _ONE_BY_ONE:
+        try:
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="There is a performance drop")  # one layer goes member by member: still right
+                return torch.func.vmap(predict)(dict(parameters), windows)
+        except RuntimeError:  # what is wrong with the network itself is raised again below
+            _ONE_BY_ONE.add(network)
+    predictions = []
+    for member, batch in enumerate(windows):
+        with random_numbers(seeds[member]) if seeds else nullcontext():
+            predictions.append(predict({name: values[member] for name, values in parameters.items()}, batch))
+    return torch.stack(predictions)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
-from vehest.training.sequences import Phase
-from vehest.training.settings import PhaseSettings
+from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):

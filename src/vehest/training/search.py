@@ -9,12 +9,32 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from vehest.data.errors import MissingError
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.training.context import FitContext, Progress
-from vehest.training.settings import DirectSearchSettings
 
 FIRST_STEP = 0.05
+
+
+@dataclass(frozen=True)
+class DirectSearchSettings:
+    """Nelder-Mead from a grid of starts inside a box (Da Lio et al. 2023, Appendix A).
+
+    Args:
+        grid: starts along each parameter.
+        max_evaluations: evaluations allowed from each start.
+        tolerance: relative change of the parameters at which a search ends.
+    """
+
+    grid: int = 4
+    max_evaluations: int = 400
+    tolerance: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if self.grid < 1 or self.max_evaluations < 1:
+            raise ConfigurationError("training.grid and training.max_evaluations must be at least 1")
+        if not self.tolerance > 0:
+            raise ConfigurationError(f"training.tolerance must be positive, not {self.tolerance}")
 
 
 @dataclass(frozen=True)

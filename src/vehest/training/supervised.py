@@ -6,17 +6,49 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.windows import WindowSet
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, Progress
-from vehest.training.members import FlatParameters, predict_members
-from vehest.training.settings import SupervisedSettings
+from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
+
+
+@dataclass(frozen=True)
+class SupervisedSettings:
+    """Supervised training of windowed networks (Da Lio et al. 2023, Section VI-B).
+
+    Args:
+        learning_rate: Adam's step size.
+        batch_size: windows in a batch.
+        max_epochs: epochs after which training ends in any case.
+        patience: epochs without a better validation loss after which a member stops.
+        dtype: ``float32`` or ``float64``.
+        compiled: use the compiled recursion where the network has one; plain PyTorch otherwise.
+        checkpoint_seconds: time between two checkpoints [s].
+    """
+
+    learning_rate: float = 1e-3
+    batch_size: int = 64
+    max_epochs: int = 1000
+    patience: int = 25
+    dtype: Literal["float32", "float64"] = "float32"
+    compiled: bool = True
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not self.learning_rate > 0:
+            raise ConfigurationError(f"training.learning_rate must be positive, not {self.learning_rate}")
+        for name in ("batch_size", "max_epochs", "patience"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
 
 
 @dataclass(frozen=True)
@@ -61,7 +93,7 @@ def train_members(
     Every member draws its own order of the windows from its own seed, stops on its own, and leaves the batch then.
 
     Args:
-        networks: M networks (`WindowNetwork`) that differ in their initial weights only; changed in place.
+        networks: M networks (`WindowNetwork`) of one shape and preparation; changed in place, and in evaluation mode afterwards.
         seeds: their seeds.
         train: windows to learn from.
         validation: windows that decide when to stop and which weights to keep.
@@ -73,6 +105,7 @@ def train_members(
 
     Raises:
         DataError: the loss is no longer finite.
+        ConfigurationError: a network does not return one number a window.
 
     Source:
         Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015.
@@ -99,6 +132,7 @@ class _Run:
         self.networks, self.settings, self.context = networks, settings, context
         self.network = networks[0]
         self.layout = FlatParameters(self.network)
+        self.fixed = fixed_state(networks) if is_plain(self.network) else {}
         self.train, self.validation = _Prepared(self.network, train, settings), _Prepared(self.network, validation, settings)
         flat = self.layout.pack(networks)
         self.best = flat.clone()
@@ -128,6 +162,7 @@ class _Run:
         before = self._checkpoints()
         order = torch.stack([torch.randperm(len(self.train), generator=self.generators[m]) for m in self.active.tolist()])
         total = torch.zeros(len(self.active), dtype=torch.float64)
+        self.network.train()
         for batch in order.split(self.settings.batch_size, dim=1):
             if self.context.should_stop():
                 self.interrupted = True
@@ -135,20 +170,29 @@ class _Run:
                 return
             self.adam.zero_grad(set_to_none=True)
             views = self.layout.views(self.flat)
-            error = self._predict(views, self.train, self.train.starts[batch]) - self.train.targets[batch]
+            error = self._predict(views, self.train, self.train.starts[batch], self._batch_seeds()) - self.train.targets[batch]
             losses = error.square().mean(dim=1)
             losses.sum().backward()
             self.adam.step()
             with torch.no_grad():
-                self.network.constrain(self.layout.views(self.flat.detach()))  # type: ignore[operator]
+                constrain(self.network, self.layout.views(self.flat.detach()))
             total += losses.detach().double() * batch.shape[1]
         self.epoch += 1
         self._judge(total / len(self.train))
 
-    def _predict(self, parameters: dict[str, Tensor], data: _Prepared, starts: Tensor) -> Tensor:
-        return predict_members(self.network, parameters, data.series, starts, data.n_window, compiled=self.settings.compiled)
+    def _batch_seeds(self) -> list[int]:
+        """What plain networks draw from for one batch (dropout), one seed an active member; compiled ones draw nothing."""
+        if not is_plain(self.network):
+            return []
+        return [int(torch.randint(2**63 - 1, (), generator=self.generators[member])) for member in self.active.tolist()]
+
+    def _predict(self, parameters: dict[str, Tensor], data: _Prepared, starts: Tensor, seeds: Sequence[int] = ()) -> Tensor:
+        state = parameters | {name: values[self.active] for name, values in self.fixed.items()}
+        compiled = self.settings.compiled
+        return predict_members(self.network, state, data.series, starts, data.n_window, compiled=compiled, seeds=seeds)
 
     def _judge(self, train_loss: Tensor) -> None:
+        self.network.eval()
         with torch.no_grad():
             starts = self.validation.starts.expand(len(self.active), -1)
             prediction = self._predict(self.layout.views(self.flat.detach()), self.validation, starts)
@@ -242,7 +286,7 @@ class _Run:
         seconds = time.monotonic() - self.started
         records = []
         for member, network in enumerate(self.networks):
-            self.layout.unpack(self.best[member], network)
+            self.layout.unpack(self.best[member], network.eval())
             train_loss, validation_loss = self.history[member]
             unfinished = self.interrupted and bool((self.active == member).any())
             records.append(TrainingRecord(tuple(train_loss), tuple(validation_loss), int(self.best_epoch[member]), unfinished, seconds))
@@ -255,7 +299,7 @@ class _Prepared:
     def __init__(self, network: nn.Module, windows: WindowSet, settings: SupervisedSettings) -> None:
         dtype = getattr(torch, settings.dtype)
         with torch.no_grad():
-            self.series: Tensor = network.prepared(torch.as_tensor(windows.series, dtype=dtype)).contiguous()  # type: ignore[operator]
+            self.series: Tensor = prepare(network, torch.as_tensor(windows.series, dtype=dtype)).contiguous()
         self.targets = torch.as_tensor(windows.targets, dtype=dtype)
         self.starts = torch.as_tensor(windows.starts)
         self.n_window = windows.n_window

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.training.sequences import Phase
-from vehest.training.settings import PhaseSettings
+from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Drive(NamedTuple):

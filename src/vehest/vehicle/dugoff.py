@@ -23,10 +23,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from vehest.constants import GRAVITY
+
 TRACK_STATES = ("vy", "yaw_rate")
 TRACK_INPUTS = ("vx", "steer", "ax")
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
-GRAVITY = 9.81
 LARGEST_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
 LEAST_SHARE = 0.2  # of the friction that sliding leaves
 LEAST_LOAD = 0.1  # of an axle's load at rest that a longitudinal acceleration leaves

@@ -17,10 +17,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from vehest.constants import GRAVITY
 from vehest.vehicle.positive import PositiveParameters
 from vehest.vehicle.tyres import Slips, TyreForces, slips_of
-
-GRAVITY = 9.81  # m/s²
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ import numba
 import numpy as np
 import torch
 
+from vehest.constants import GRAVITY
 from vehest.filters.unscented_scan import Array, PointModel
-from vehest.vehicle.dugoff import GRAVITY, LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
+from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 

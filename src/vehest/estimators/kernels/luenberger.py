@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
 
 
 def implicit_euler_observer(

@@ -17,11 +17,11 @@ import numba
 import numpy as np
 import torch
 
+from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import sigmoid, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.filters.unscented_scan import Array, PointModel
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
-from vehest.vehicle.planar import GRAVITY
 from vehest.vehicle.tyres import STILL
 
 BLOCK = 110  # points at a time

@@ -9,23 +9,25 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
+from vehest.alignment.checks import checks_of_clock
+from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.checks import checks_of_clock
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.limits import check_limit
+from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import Column, columns_from_config, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config, uniform_clock
 from vehest.sources.mdf.files import Signal, Wanted, read_measurement
 from vehest.sources.unit_spellings import require_unit
 
 OWN_KEYS = frozenset({"group", "interpolation", "max_gap"})  # of a channel, beside those of every column
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 FASTER = 1.05  # than the raster: the rest would fold into it
-MOST_TICKS = 1e8  # of a recording; a day at 1 kHz
+LATEST_TICK = 1e12  # 30 years at 1 kHz
 TICK = 1e-6  # of an interval; times that are nearer are the same
 
 
@@ -61,6 +63,19 @@ class Grid:
     stamps: FloatArray | None = None
 
 
+@dataclass(frozen=True)
+class MdfOptions:
+    """Options of the source, by type; what is None is not said."""
+
+    channels: ChannelMap
+    path: str | None = None
+    files: str = "*.mf4"
+    rate_hz: float | None = None
+    raster: str | None = None
+    gappy: ChannelNames | None = None
+    file_units: Literal["check", "ignore"] = "check"
+
+
 class MdfSource(Source):
     """Measurements, a recording each.
 
@@ -68,6 +83,7 @@ class MdfSource(Source):
     ``file_units`` (``check`` or ``ignore``).
     """
 
+    options_type = MdfOptions
     keys = frozenset({"path", "files", "rate_hz", "raster", "channels", "gappy", "file_units"})
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -82,10 +98,8 @@ class MdfSource(Source):
             _require_positive(self.rate_hz, f"{self.where}: rate_hz")
         if self.raster is not None and (self.raster not in self.channels or self.raster in self.gappy):
             raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{self.raster}'")
-        if dataset.get("file_units", "check") not in ("check", "ignore"):
-            raise ConfigurationError(f"{self.where}: file_units '{dataset['file_units']}' is not one of: check, ignore")
         pattern = dataset.get("files", "*.mf4")
-        if not isinstance(pattern, str) or not pattern or Path(pattern).is_absolute():
+        if not pattern or Path(pattern).is_absolute():
             raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '*.mf4', not '{pattern}'")
 
     def ids(self) -> list[str]:
@@ -100,8 +114,8 @@ class MdfSource(Source):
         """Read one measurement by its stem.
 
         Raises:
-            MissingError: there is none of that name, or asammdf is not installed.
-            DataError: it is damaged, lacks a signal, or its signals cannot be brought to one clock.
+            MissingError: there is none of that name.
+            DataError: it is damaged, more than the limits, lacks a signal, or its signals cannot be brought to one clock.
         """
         for file in matching_files(self.dataset, "*.mf4"):
             if file.stem == recording_id:
@@ -147,8 +161,9 @@ class MdfSource(Source):
         begin, end = spans[late][0], spans[early][1]
         if self.raster is None:
             rate = float(self.rate_hz or 0.0)
-            if not ((end - begin) * rate < MOST_TICKS and max(abs(begin), abs(end)) * rate < 1e12):
+            if not max(abs(begin), abs(end)) * rate < LATEST_TICK:
                 raise DataError(f"'{file}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {rate:g} Hz; the file is damaged")
+            check_limit("samples", (end - begin) * rate, f"'{file}' would become {(end - begin) * rate:.0f} samples at {rate:g} Hz")
             first, last = math.ceil(begin * rate - TICK), math.floor(end * rate + TICK)
             grid = Grid(np.arange(first, last + 1) / rate, rate)
         else:
@@ -196,8 +211,6 @@ class MdfSource(Source):
         return f"'{file}': signal '{self.channels[name].column.column}' of group {signal.group}, for channel '{name}',"
 
     def _gappy(self, names: Any) -> frozenset[str]:
-        if isinstance(names, str):
-            raise ConfigurationError(f"{self.where}: gappy is a list of channels, for example [{names}], not '{names}'")
         for name in names:
             if name not in self.channels:
                 raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")

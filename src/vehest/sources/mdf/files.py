@@ -1,29 +1,34 @@
-"""Signals of ASAM MDF files through asammdf: physical values with their times, and one clear line for what cannot be used."""
+"""Signals of ASAM MDF files: physical values with their times, and one clear line for what cannot be used.
+
+vehest reads the format itself. A reader that also converts, finishes and decodes measurements hands a file's formulas to an interpreter,
+unpacks its attachments and follows its links in circles; here nothing that a file holds is executed, unpacked to disk or followed twice.
+"""
 
 from __future__ import annotations
 
 import difflib
-import gc
-import logging
-import sys
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
-from vehest.data.checks import checks_of_clock
-from vehest.data.errors import DataError, MissingError
-from vehest.data.recording import FloatArray
+from vehest.alignment.checks import checks_of_clock
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError, printable
+from vehest.data.files import regular_file
+from vehest.data.limits import check_limit
+from vehest.sources.mdf.blocks import BlockFile, shown
+from vehest.sources.mdf.conversions import TextError
+from vehest.sources.mdf.data_blocks import records_of
+from vehest.sources.mdf.layout import ChannelPlace, Contents, Field, Group
+from vehest.sources.mdf.values import invalid_samples, is_number, raw_values
+from vehest.sources.mdf.version3 import read_version3
+from vehest.sources.mdf.version4 import read_version4
 
-MAGIC = (b"MDF     ", b"UnFinMF ")
-TIME = 1  # sync type of a master channel
-MAY_BE_INVALID = 2  # flag of a channel
-VIRTUAL = (3, 6)  # types of channels that stand in no record
+FINISHED, UNFINISHED = b"MDF     ", b"UnFinMF "
+COMPARED = 10_000  # names that a misspelt one is compared with
+BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 
 
 @dataclass(frozen=True)
@@ -76,147 +81,147 @@ class Measurement:
     start: str
 
 
-def read_measurement(file: Path, wanted: Mapping[str, Wanted]) -> Measurement:
-    """Read signals of an MDF file of version 3 or 4.
+def read_measurement(path: Path, wanted: Mapping[str, Wanted]) -> Measurement:
+    """Read signals of an MDF file of version 2, 3 or 4.
 
     Raises:
-        MissingError: asammdf is not installed.
-        DataError: the file cannot be read, or a signal is not there, ambiguous, no number, or without usable times.
+        MissingError: there is no such file.
+        DataError: the file cannot be read or is more than the limits, or a signal is not there, ambiguous, no number, or without
+            usable times.
     """
     try:
-        with _quiet():
-            from asammdf import MDF
-    except ImportError:
-        raise MissingError("reading MDF files needs the package asammdf; pip install 'vehest[mdf]'") from None
-    _require_mdf(file)
-    with TemporaryDirectory(prefix="vehest-mdf-") as folder, _quiet():
-        opened, reason = _attempt(lambda: MDF(file, temporary_folder=folder))
-        if opened is None:
-            gc.collect()  # what asammdf left half open holds a file in the folder
-            raise _unreadable(file, reason)
-        try:
-            signals = {name: _signal(opened, one, file) for name, one in wanted.items()}
-            return Measurement(signals, str(opened.version), _start(opened))
-        finally:
-            with suppress(Exception):  # what could be wrong with the file has been said
-                opened.close()
+        with open(regular_file(path), "rb") as stream:
+            file = BlockFile(stream, path)
+            contents = _contents(file)
+            places = contents.places()
+            found = {name: _locate(places, one, path) for name, one in wanted.items()}
+            signals: dict[str, Signal] = {}
+            for group in {id(group): group for group, _ in found.values()}.values():
+                signals |= _signals(file, contents, group, {name: place for name, (one, place) in found.items() if one is group})
+            return Measurement({name: signals[name] for name in wanted}, contents.version, contents.start)
+    except OSError as error:
+        raise DataError(f"cannot read '{path}': {error.strerror or error}; check the disk and its permissions") from None
+    except MemoryError:
+        raise DataError(f"'{path}' asks for more memory than there is; is it damaged? otherwise read fewer signals of it") from None
 
 
-def _signal(opened: Any, wanted: Wanted, file: Path) -> Signal:
-    number, index = _locate(opened, wanted, file)
-    group, channel_group = _group_name(opened, number), opened.groups[number].channel_group
-    where = f"'{file}': signal '{wanted.name}' of group {group}"
-    master = opened.masters_db.get(number)
-    if master is None or getattr(opened.groups[number].channels[master], "sync_type", TIME) != TIME:
-        raise DataError(f"{where} has no time stamps: its group has no master channel of time")
-    if any(_is_outside(opened.groups[number].channels[place], channel_group) for place in (index, master)):
-        raise DataError(f"{where} stands outside of its group's records; the file is damaged")
-    read, reason = _attempt(lambda: opened.get(group=number, index=index, ignore_invalidation_bits=True))
-    if read is None:
-        raise _unreadable(file, f"signal '{wanted.name}': {reason}")
-    if not len(read.samples) == len(read.timestamps) == channel_group.cycles_nr:
+def _contents(file: BlockFile) -> Contents:
+    """What the file says that it holds."""
+    head = file.read(0, min(file.size, 64))
+    if not head.startswith((FINISHED, UNFINISHED)):
+        raise DataError(f"'{file.path}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?")
+    if len(head) < 64:
+        raise file.damaged("its head is incomplete")
+    number = int.from_bytes(head[28:30], "little")
+    version = printable(head[8:16].split(b"\0", 1)[0].decode("latin-1").strip())
+    unfinished = int.from_bytes(head[60:62], "little") if head.startswith(UNFINISHED) else 0
+    if 200 <= number < 400:
+        return read_version3(file, version, unfinished)
+    if 400 <= number < 500:
+        return read_version4(file, version, unfinished)
+    raise file.unsupported(f"is of version {number / 100:.2f}", "versions 2, 3 and 4 are")
+
+
+def _signals(file: BlockFile, contents: Contents, group: Group, places: Mapping[str, ChannelPlace]) -> dict[str, Signal]:
+    """Signals of one group."""
+    clock = group.clock()
+    first = next(iter(places.values()))
+    if clock is None:
+        raise DataError(f"{_where(file, first, group)} has no time stamps: its group has no master channel of time")
+    fields = {name: contents.field(place) for name, place in places.items()}
+    times = contents.field(clock)
+    for place, field in [*((places[name], field) for name, field in fields.items()), (clock, times)]:
+        where = _where(file, place, group)
+        if field.is_outside(group.record_bytes, group.invalidation_bytes):
+            raise DataError(f"{where} stands outside of its group's records; the file is damaged")
+        _require_number(field, where)
+    columns, count = _columns(file, contents, group, [times, *fields.values()])
+    if contents.counted and count != group.samples:
         raise DataError(
-            f"{where} holds {len(read.samples)} samples, its header says {channel_group.cycles_nr}; the file is truncated or damaged"
+            f"{_where(file, first, group)} holds {count} samples, its header says {group.samples}; the file is truncated or damaged"
         )
-    if read.samples.ndim != 1 or read.samples.dtype.kind not in "biuf":
-        what = "text" if read.samples.ndim == 1 and read.samples.dtype.kind in "SUO" else "an array or structure"
-        raise DataError(f"{where} holds {what}; numbers are needed: name another signal, or one without a conversion to text")
-    stamps = np.asarray(read.timestamps, dtype=np.float64)
+    stamps = _physical(times, columns[0], _where(file, clock, group))
     for finding in checks_of_clock(stamps):
         if finding.check == "clock":
-            raise DataError(f"{where}: {finding.message}; repair the measurement, or cut the range out")
-    values = np.array(read.samples, dtype=np.float64)
-    if read.invalidation_bits is not None:
-        values[np.asarray(read.invalidation_bits, dtype=bool)] = np.nan
-    return Signal(group, stamps, values, str(read.unit or ""))
+            raise DataError(f"{_where(file, first, group)}: {finding.message}; repair the measurement, or cut the range out")
+    signals = {}
+    for number, (name, field) in enumerate(fields.items(), start=1):
+        values = _physical(field, columns[number], _where(file, places[name], group))
+        signals[name] = Signal(shown(group.title), stamps, values, field.unit)
+        columns[number] = np.empty(0)
+    return signals
 
 
-def _is_outside(described: Any, channel_group: Any) -> bool:
-    """Whether a channel reaches beyond its record, where asammdf would read on in foreign memory."""
-    if not hasattr(described, "byte_offset"):  # version 3 or 2
-        extra = getattr(described, "additional_byte_offset", 0)
-        return bool(8 * extra + described.start_offset + described.bit_count > 8 * channel_group.samples_byte_nr)
-    if described.flags & MAY_BE_INVALID and described.pos_invalidation_bit >= 8 * channel_group.invalidation_bytes_nr:
-        return True
-    end = 8 * described.byte_offset + described.bit_offset + described.bit_count
-    return bool(described.channel_type not in VIRTUAL and end > 8 * channel_group.samples_byte_nr)
+def _columns(file: BlockFile, contents: Contents, group: Group, fields: Sequence[Field]) -> tuple[list[FloatArray], int]:
+    """Raw values of channels, NaN where they are marked as invalid, and how many there are of each."""
+    parts: list[list[FloatArray]] = [[] for _ in fields]
+    count = 0
+    pieces = contents.pieces(group.data)
+    for records in records_of(file, pieces, group, group.samples if contents.counted else None):
+        for part, field in zip(parts, fields, strict=True):
+            values = raw_values(records, field, count)
+            if field.all_invalid or field.invalid_bit is not None:
+                values[invalid_samples(records, field, group.record_bytes)] = np.nan
+            part.append(values)
+        count += len(records)
+        check_limit("values", count * len(fields), f"'{file.path}': group {shown(group.title)} holds {count * len(fields)} values or more")
+    columns = []
+    while parts:
+        part = parts.pop(0)
+        columns.append(np.concatenate(part) if part else np.empty(0))
+    return columns, count
 
 
-def _locate(opened: Any, wanted: Wanted, file: Path) -> tuple[int, int]:
-    """Numbers of a signal's group and of the signal in it."""
-    found = [(group, index) for group, index in opened.channels_db.get(wanted.name, ()) if index != opened.masters_db.get(group)]
+def _physical(field: Field, raw: FloatArray, where: str) -> FloatArray:
+    """Physical values; invalid samples stay NaN and meet no conversion."""
+    valid = ~np.isnan(raw) if field.all_invalid or field.invalid_bit is not None else None
+    try:
+        with np.errstate(all="ignore"):
+            if valid is None or valid.all():
+                return np.asarray(field.conversion(raw), dtype=np.float64)
+            raw[valid] = field.conversion(raw[valid])
+            return raw
+    except TextError:
+        raise _no_number(where, "text") from None
+
+
+def _require_number(field: Field, where: str) -> None:
+    if field.kind in ("text", "other"):
+        raise _no_number(where, "text" if field.kind == "text" else "an array or structure")
+    if not is_number(field):
+        raise DataError(f"{where} is coded in {field.bits} bits from bit {field.bit} on, as no number is; the file is damaged")
+
+
+def _no_number(where: str, what: str) -> DataError:
+    return DataError(f"{where} holds {what}; numbers are needed: name another signal, or one without a conversion to text")
+
+
+def _where(file: BlockFile, place: ChannelPlace, group: Group) -> str:
+    return f"'{file.path}': signal '{shown(place.name)}' of group {shown(group.title)}"
+
+
+def _locate(places: Mapping[str, list[tuple[Group, ChannelPlace]]], wanted: Wanted, path: Path) -> tuple[Group, ChannelPlace]:
+    """A signal's group and its place in it."""
+    found = places.get(wanted.name, [])
     if not found:
-        raise DataError(f"'{file}' has no signal '{wanted.name}' ({_near(opened, wanted.name)}); correct the map in conf/dataset")
-    kept = [one for one in found if wanted.group is None or wanted.group in (one[0], _acquisition(opened, one[0]))]
-    groups = ", ".join(dict.fromkeys(_group_name(opened, group) for group, _ in kept or found))
+        raise DataError(f"'{path}' has no signal '{wanted.name}' ({_near(places, wanted.name)}); correct the map in conf/dataset")
+    kept = [(group, place) for group, place in found if wanted.group is None or wanted.group in (group.number, group.name)]
+    titles = list(dict.fromkeys(shown(group.title) for group, _ in kept or found))
+    groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
     if not kept:
-        raise DataError(f"'{file}': signal '{wanted.name}' is not in group '{wanted.group}', but in {groups}; correct group")
-    if len({group for group, _ in kept}) > 1:
-        raise DataError(f"'{file}': signal '{wanted.name}' stands in several groups: {groups}; say which by number or name with group: …")
+        raise DataError(f"'{path}': signal '{wanted.name}' is not in group '{wanted.group}', but in {groups}; correct group")
+    if len(titles) > 1:
+        raise DataError(f"'{path}': signal '{wanted.name}' stands in several groups: {groups}; say which by number or name with group: …")
     if len(kept) > 1:
-        raise DataError(f"'{file}': signal '{wanted.name}' stands {len(kept)} times in group {groups}; rename all but one")
+        raise DataError(f"'{path}': signal '{wanted.name}' stands {len(kept)} times in group {groups}; rename all but one")
     return kept[0]
 
 
-def _near(opened: Any, name: str) -> str:
-    names = {str(known): str(known).lower() for known in opened.channels_db}
+def _near(places: Mapping[str, object], name: str) -> str:
+    names = {known: known.lower() for known in list(places)[:COMPARED] if len(known) < 200}
     close = difflib.get_close_matches(name.lower(), list(names.values()), n=3, cutoff=0.6)
     if close:
-        return "near it: " + ", ".join(known for known, lower in names.items() if lower in close)
-    if any(known.startswith(("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")) for known in names):
+        return "near it: " + ", ".join(shown(known) for known, lower in names.items() if lower in close[:3])
+    if any(known.startswith(BUS_FRAMES) for known in names):
         return "it holds undecoded frames of a bus: decode them with their description, for example by asammdf's extract_bus_logging"
-    return f"it has {len(names)} signals"
-
-
-def _group_name(opened: Any, number: int) -> str:
-    name = _acquisition(opened, number)
-    return f"{number} '{name}'" if name else str(number)
-
-
-def _acquisition(opened: Any, number: int) -> str:
-    """A group's name, in version 4 that of its acquisition, in version 3 its comment."""
-    channel_group = opened.groups[number].channel_group
-    return str(getattr(channel_group, "acq_name", None) or (channel_group.comment if opened.version < "4" else "") or "")
-
-
-def _start(opened: Any) -> str:
-    found, _ = _attempt(lambda: opened.start_time.isoformat())
-    return str(found or "")
-
-
-def _require_mdf(file: Path) -> None:
-    try:
-        with open(file, "rb") as stream:
-            head = stream.read(64)
-    except OSError as error:
-        raise DataError(f"cannot read '{file}': {error.strerror or error}; check the disk and its permissions") from None
-    if not head.startswith(MAGIC):
-        raise DataError(f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?")
-    if len(head) < 64:
-        raise _unreadable(file, "its head is incomplete")
-
-
-def _unreadable(file: Path, reason: str) -> DataError:
-    return DataError(f"'{file}' cannot be read as MDF ({reason}); is it truncated or damaged?")
-
-
-def _attempt(act: Callable[[], Any]) -> tuple[Any, str]:
-    """A result, or in one line why there is none; asammdf fails on damaged files in any way there is."""
-    try:
-        return act(), ""
-    except Exception as error:
-        return None, " ".join(str(error).split())[:160] or type(error).__name__
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep asammdf from logging, and from printing what goes wrong as it clears up after a damaged file."""
-    logger, hook = logging.getLogger("asammdf"), sys.unraisablehook
-    disabled, logger.disabled = logger.disabled, True
-    sys.unraisablehook = lambda _: None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.disabled, sys.unraisablehook = disabled, hook
+    return f"it has {len(places)} signals"

@@ -6,16 +6,17 @@ by Leanza, Reina & Blanco-Claraco 2021.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.recording import Recording
 from vehest.sources.base import Source, existing_folder, require_files
-from vehest.sources.columns import columns_from_config, time_column_from_config, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, ClockPolicy, columns_from_config, time_column_from_config, uniform_clock
 from vehest.sources.revs.csv_layout import read_csv_columns, read_csv_head
 from vehest.sources.revs.mat_layout import read_mat_columns
 from vehest.sources.revs.parameters import read_vehicle_parameters
@@ -26,6 +27,25 @@ SUFFIXES = {"csv": ".csv", "mat": ".mat", "text": ""}
 PREAMBLE_LINES = 10
 
 
+@dataclass(frozen=True)
+class RevsOptions:
+    """Options of the source, by type; what is None is not said."""
+
+    layout: Literal["csv", "mat", "text"]
+    path: str | None = None
+    recordings: tuple[str, ...] | None = None
+    files: str | None = None
+    vehicle_parameters: str | None = None
+    time: dict[str, Any] | None = None
+    channels: ChannelMap | None = None
+    extra_channels: dict[str, dict[str, Any] | None] | None = None
+    clock: ClockPolicy = "strict"
+    gappy: ChannelNames | None = None
+    preamble_lines: int = 10
+    units_row: Literal["check", "ignore"] = "check"
+    rate_hz: float | None = None
+
+
 class RevsSource(Source):
     """Recordings of the Revs database.
 
@@ -33,6 +53,7 @@ class RevsSource(Source):
     ``extra_channels`` (columns, units, signs), ``clock``, ``gappy``, ``preamble_lines`` and ``units_row`` (csv), ``rate_hz`` (mat).
     """
 
+    options_type = RevsOptions
     keys = frozenset(
         {"path", "layout", "recordings", "files", "vehicle_parameters", "time", "channels", "extra_channels"}
         | {"clock", "gappy", "preamble_lines", "units_row", "rate_hz"}
@@ -40,11 +61,9 @@ class RevsSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.layout = str(dataset.get("layout"))
-        if self.layout not in SUFFIXES:
-            raise ConfigurationError(f"data set '{self.name}': layout '{self.layout}' is not one of: {', '.join(SUFFIXES)}")
+        self.layout = str(dataset["layout"])
         extra = dataset.get("extra_channels") or {}
-        if not isinstance(extra, Mapping) or set(extra) - set(SUFFIXES):
+        if set(extra) - set(SUFFIXES):
             raise ConfigurationError(f"data set '{self.name}': extra_channels must map a layout to channels, not {extra}")
         self.columns = columns_from_config(dataset.get("channels") or {}, self.name)
         self.columns |= columns_from_config(extra.get(self.layout) or {}, self.name)
@@ -119,7 +138,8 @@ class RevsSource(Source):
                 where = f"'{file}': column '{column.column}'"
                 require_unit(head.unit_of(column.column), column, channel(name).unit, where, "set units_row: ignore")
         values, dropped = read_csv_columns(file, head, self.time.column, columns, self._gappy_columns())
-        clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), f"'{file}'", self.dataset.get("clock", "strict"))
+        stamps, policy = self.time.to_si(values[self.time.column], "s"), self.dataset.get("clock", "strict")
+        clock = uniform_clock(stamps, f"'{file}'", policy, n_channels=len(self.columns))
         aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
         origin = {"file": file.name, "preamble": list(head.preamble), "rows_dropped_at_the_head": dropped}
         return clock.start_time, clock.rate_hz, aligned, origin
@@ -134,7 +154,8 @@ class RevsSource(Source):
         folder, columns = self._path(recording_id), self._column_names()
         values = read_text_columns(folder, columns, self.time.column)
         where = f"'{text_file(folder, self.time.column)}'"
-        clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.dataset.get("clock", "strict"))
+        stamps, policy = self.time.to_si(values[self.time.column], "s"), self.dataset.get("clock", "strict")
+        clock = uniform_clock(stamps, where, policy, n_channels=len(self.columns))
         aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
         return clock.start_time, clock.rate_hz, aligned, {}
 
@@ -170,21 +191,15 @@ class RevsSource(Source):
 
     def _require_options(self) -> None:
         where = f"data set '{self.name}'"
-        for option in ("recordings", "gappy"):
-            if not isinstance(self.dataset.get(option) or [], list | tuple):
-                raise ConfigurationError(f"{where}: {option} must be a list, for example [{self.dataset[option]}]")
-        for option, choices in (("clock", ("strict", "interpolate")), ("units_row", ("check", "ignore"))):
-            if self.dataset.get(option, choices[0]) not in choices:
-                raise ConfigurationError(f"{where}: {option} '{self.dataset[option]}' is not one of: {', '.join(choices)}")
         unknown = sorted(set(self.dataset.get("gappy") or []) - set(self.columns))
         if unknown:
             raise ConfigurationError(f"{where}: gappy names '{unknown[0]}', which is not one of its channels")
         rate, lines = self.dataset.get("rate_hz"), self.dataset.get("preamble_lines", PREAMBLE_LINES)
         if rate is not None and self.layout != "mat":
             raise ConfigurationError(f"{where}: rate_hz is an option of layout mat; 'vehest downsample' brings others to another rate")
-        if rate is not None and not (isinstance(rate, int | float) and math.isfinite(rate) and rate > 0):
+        if rate is not None and not rate > 0:
             raise ConfigurationError(f"{where}: rate_hz must be a positive number, not {rate}")
-        if not isinstance(lines, int) or not 0 <= lines <= 100:
+        if not 0 <= lines <= 100:
             raise ConfigurationError(f"{where}: preamble_lines must be a whole number up to 100, not {lines}")
 
 

@@ -16,8 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
+from vehest.data.parquet import DAMAGE
+from vehest.sources.text_tables import check_size, table_stream
 
 LONGEST_LINE = 1 << 16  # bytes, of the lines above the rows
 LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but broken
@@ -103,6 +105,7 @@ def read_csv_columns(
         DataError: a row or cell cannot be read, or a column is blank after its head.
     """
     names, gappy = list(dict.fromkeys([time, *columns])), set(gappy)
+    check_size(file, len(names))
     table = _read_rows(file, head, names)
     if not table.num_rows:
         raise DataError(f"'{file}' has a header and no rows; the copy is incomplete")
@@ -138,23 +141,25 @@ def read_csv_columns(
 def _read_rows(file: Path, head: CsvHead, names: list[str]) -> pa.Table:
     try:
         return _read_table(file, head, names, threads=True)
-    except (OSError, pa.ArrowException, UnicodeDecodeError):
+    except DAMAGE:
         pass
     try:
         return _read_table(file, head, names, threads=False)  # only here errors name their row
-    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+    except DAMAGE as error:
         raise _unreadable(file, head, str(error)) from None
 
 
 def _read_table(file: Path, head: CsvHead, names: list[str], *, threads: bool) -> pa.Table:
-    return pc.read_csv(
-        file,
-        pc.ReadOptions(use_threads=threads, skip_rows=head.n_lines, column_names=list(head.names)),
-        convert_options=pc.ConvertOptions(include_columns=names, column_types=dict.fromkeys(names, pa.float64())),
-    )
+    with table_stream(file) as stream:
+        return pc.read_csv(
+            stream,
+            pc.ReadOptions(use_threads=threads, skip_rows=head.n_lines, column_names=list(head.names)),
+            convert_options=pc.ConvertOptions(include_columns=names, column_types=dict.fromkeys(names, pa.float64())),
+        )
 
 
 def _unreadable(file: Path, head: CsvHead, said: str) -> DataError:
+    said = said or "it cannot be held in memory"
     text = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", said, re.DOTALL)
     if text:
         name, line, value = head.names[int(text[1])], text[2], ascii(text[3][:40])[1:-1]

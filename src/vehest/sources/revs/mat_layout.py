@@ -9,15 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
+from vehest.data.limits import check_limit
 from vehest.sources.columns import ClockPolicy, Column, uniform_clock
 from vehest.sources.revs.mat_files import MatArray, read_mat_file
 
 _VALUE = "value"
 _SLACK = 1e-2  # of an interval: as far as stamps may jitter
 
-_Structs = dict[str, dict[str, MatArray]]
+_LATEST_TICK = 1e15
+
+_Structs = dict[str, dict[str, MatArray | None]]
 
 
 @dataclass(frozen=True)
@@ -61,13 +64,18 @@ def read_mat_columns(
     Raises:
         DataError: the file or a column cannot be used as it is.
     """
-    structs = {name: array.fields() for name, array in read_mat_file(file).items()}
+    columns = list(columns)
+    structs = _structs(file, columns)
     signals = {column: _signal(file, structs, column, time, policy, column in set(gappy)) for column in columns}
     slowest = min(signals.values(), key=lambda signal: signal.rate_hz)
     rate = slowest.rate_hz if rate_hz is None else rate_hz
     origin = slowest.stamps[0]
     latest_start = max(signals.values(), key=lambda signal: float(signal.stamps[0]))
     earliest_end = min(signals.values(), key=_Signal.end)
+    span = (earliest_end.end() - origin) * rate
+    if not abs(span) < _LATEST_TICK:
+        raise DataError(f"'{file}': '{earliest_end.name}' ends at {earliest_end.end():.6g} s, which no drive does; fetch the file again")
+    check_limit("samples", span, f"'{file}' would become {span:.0f} samples at {rate:.6g} Hz")
     first = max(math.ceil((latest_start.stamps[0] - origin) * rate - _SLACK), 0)
     n_samples = math.ceil((earliest_end.end() - origin) * rate - _SLACK) - first
     if n_samples < 2:
@@ -98,6 +106,15 @@ class _Signal:
     def held(self, ticks: FloatArray) -> FloatArray:
         """The last value at or before each tick."""
         return self.values[np.searchsorted(self.stamps, ticks + _SLACK / self.rate_hz, side="right") - 1]
+
+
+def _structs(file: Path, columns: Iterable[str]) -> _Structs:
+    """Names of all that stands in structs, with those arrays that may be wanted; what nothing is wanted of is not kept in memory."""
+    wanted = {part for column in columns for part in (column, column.rsplit(".", 1)[-1], column.split(".", 1)[-1])}
+    structs: _Structs = {}
+    for name, array in read_mat_file(file).items():
+        structs[name] = {inner: field if inner in wanted else None for inner, field in array.some_fields(wanted).items()}
+    return structs
 
 
 def _signal(file: Path, structs: _Structs, column: str, time: Column, policy: ClockPolicy, gappy: bool) -> _Signal:
@@ -131,7 +148,7 @@ def _signal(file: Path, structs: _Structs, column: str, time: Column, policy: Cl
 def _found(file: Path, structs: _Structs, column: str, time: str) -> tuple[str, dict[str, MatArray]]:
     """A column's name with its struct, and its fields; parameters of the same name, which have no time, do not count."""
     inside = {f"{outer}.{inner}": array for outer, fields in structs.items() for inner, array in fields.items()}
-    found = {name: inside[name].fields() for name in inside if column in (name, name.split(".", 1)[1])}
+    found = {name: array.fields() for name, array in inside.items() if array is not None and column in (name, name.split(".", 1)[1])}
     timed = {name: fields for name, fields in found.items() if time in fields} or found
     if len(timed) > 1:
         raise DataError(f"'{file}' has '{column}' more than once ({', '.join(timed)}); name its struct too, as in '{next(iter(timed))}'")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError
+from vehest.data.files import regular_file
 
 LARGEST_TABLE = 1 << 20  # bytes
 
@@ -58,11 +59,13 @@ def _values(file: Path, name: str, cells: list[str]) -> Any:
 
 def _rows(file: Path) -> list[list[str]]:
     try:
+        if regular_file(file).stat().st_size > LARGEST_TABLE:
+            raise DataError(f"'{file}' is no table of vehicle parameters, it has more than {LARGEST_TABLE} bytes; is it a recording?")
         content = file.read_bytes()
     except OSError as error:
         raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
-    if len(content) > LARGEST_TABLE or b"\0" in content:
-        raise DataError(f"'{file}' is no table of vehicle parameters; is it a recording, compressed or of another format?")
+    if b"\0" in content:
+        raise DataError(f"'{file}' is no table of vehicle parameters; is it compressed or of another format?")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:

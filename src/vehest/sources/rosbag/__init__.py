@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import FloatArray, Recording
+from vehest.data.limits import check_limit
+from vehest.data.recording import Recording
 from vehest.sources.archive import MOST_BYTES
 from vehest.sources.base import Source, existing_folder
 from vehest.sources.rosbag.declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
@@ -24,6 +26,23 @@ from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_f
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval
+LATEST_TICK = 10**15
+
+
+@dataclass(frozen=True)
+class RosbagOptions:
+    """Options of the source, by type; what is None is not said."""
+
+    path: str | None = None
+    files: str | tuple[str, ...] = "*.zip"
+    rate_hz: float = 100.0
+    start: float | None = None
+    stop: float | None = None
+    messages: dict[str, str] | None = None
+    topics: dict[str, Any] | None = None
+    channels: dict[str, Any] | None = None
+    pose: dict[str, Any] | None = None
+    unpacked_limit: float = 8.0
 
 
 class RosbagSource(Source):
@@ -33,6 +52,7 @@ class RosbagSource(Source):
     ``messages`` (layouts of message types, as text), ``topics``, ``channels``, ``pose`` and ``unpacked_limit`` [GB].
     """
 
+    options_type = RosbagOptions
     keys = frozenset({"path", "files", "rate_hz", "start", "stop", "messages", "topics", "channels", "pose", "unpacked_limit"})
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -107,10 +127,8 @@ class RosbagSource(Source):
             found = sorted(file for file in folder.glob(files) if file.is_dir() or file.suffix.lower() in {".zip", *STORAGES})
             if not found:
                 raise MissingError(f"data set '{self.name}': no bag in '{folder}' matches '{files}'")
-        elif isinstance(files, list | tuple):
-            found = [folder / str(name) for name in files]
         else:
-            raise ConfigurationError(f"data set '{self.name}': files is a pattern or a list of names, not '{files}'")
+            found = [folder / name for name in files]
         bags: dict[str, Path] = {}
         for bag in found:
             if not bag.exists():
@@ -173,11 +191,14 @@ class RosbagSource(Source):
         ends = {one.times[-1]: one.topic.topic for one in series.values()}
         begin, end = max(begins), min(ends)
         first, last = math.ceil(begin * self.rate_hz - 1e-6), math.floor(end * self.rate_hz + 1e-6)
+        if not max(abs(first), abs(last)) < LATEST_TICK:
+            raise DataError(f"'{path}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {self.rate_hz:g} Hz; it is damaged")
         if last <= first:
             raise DataError(
                 f"'{path}': topic '{begins[begin]}' begins at {begin:.6g} s, when '{ends[end]}' has ended at {end:.6g} s; "
                 f"do their stamps come from different clocks? then set stamps: received"
             )
+        check_limit("samples", last - first + 1, f"'{path}' would become {last - first + 1} samples at {self.rate_hz:g} Hz")
         return first, last - first + 1
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:

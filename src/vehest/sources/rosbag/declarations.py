@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import FloatArray
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column, column_from_config
 from vehest.sources.rosbag.pose import UpAxis

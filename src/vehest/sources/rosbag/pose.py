@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from scipy import signal
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
 
 UpAxis = Literal["y", "z"]
 

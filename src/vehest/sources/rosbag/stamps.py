@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vehest.data.checks import checks_of_clock
+from vehest.alignment.checks import checks_of_clock
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import FloatArray
 
 FEWEST = 20
 BLOCK_SECONDS = 1.0

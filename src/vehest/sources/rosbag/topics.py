@@ -1,10 +1,12 @@
-"""Topics of a ROS 2 bag as arrays: sqlite3 and MCAP, read without ROS through the library rosbags (extra ``ros``)."""
+"""Topics of a ROS 2 bag as arrays: sqlite3 and MCAP, read without ROS; the library rosbags (extra ``ros``) knows the types of messages."""
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -12,14 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
-from vehest.data.recording import FloatArray
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
+from vehest.data.limits import check_limit
 from vehest.sources.archive import MOST_BYTES, unpacked
+from vehest.sources.rosbag.bags import METADATA, BagTopic, OpenBag, open_bag
+from vehest.sources.rosbag.unpacking import DamagedBagError
 
 STORAGES = (".db3", ".mcap")
-METADATA = "metadata.yaml"
 HEADER = "header"
-UNUSABLE_IN_PATHS = "?#%"  # SQLite is handed the path as a URI
+MOST_LAYOUT = 100_000  # characters
 
 
 @dataclass(frozen=True)
@@ -79,15 +83,21 @@ def read_bag(path: Path, wanted: Sequence[Wanted], layouts: Mapping[str, str], m
         ConfigurationError: a layout cannot be read, or a type or a field that is not in the layouts.
         DataError: the bag is damaged, or does not hold the topics, types and layouts that are wanted.
     """
-    types = known_types(layouts)
+    types = known_types(tuple(sorted(layouts.items())))
     getters = {one.topic: [_getter(types, one, field) for field in one.fields] for one in wanted}
-    with _unpacked_bag(path, most_bytes) as bag, _opened(bag, path) as reader:
-        connections = [_connection(reader, one, path) for one in wanted]
-        for one, held in zip(wanted, connections, strict=True):
-            for connection in held:
-                _refuse_other_layout(types, connection, one, path)
-        messages = _read_messages(reader, [connection for held in connections for connection in held], types, getters, path)
-        return Bag(int(reader.start_time), {one.topic: _topic_data(one, messages[one.topic], types) for one in wanted})
+    with _unpacked_bag(path, most_bytes) as bag:
+        _require_bag(bag, path)
+        try:
+            with open_bag(bag) as opened:
+                for one in wanted:
+                    for topic in _held(opened, one, path):
+                        _refuse_other_layout(types, topic, one, path)
+                messages = _read_messages(opened, wanted, types, getters, path)
+                return Bag(opened.start, messages)
+        except DamagedBagError as damage:
+            raise _damaged(path, damage, bag) from None
+        except OSError as error:
+            raise MissingError(f"cannot read '{path}' ({error.strerror or error}); check the disk and its permissions") from None
 
 
 def bag_files(path: Path) -> list[Path]:
@@ -110,8 +120,14 @@ def bag_files(path: Path) -> list[Path]:
     return files
 
 
-def known_types(layouts: Mapping[str, str]) -> Any:
+@lru_cache(maxsize=8)
+def known_types(layouts: tuple[tuple[str, str], ...]) -> Any:
     """Standard message types and those declared in text, as a rosbags type store.
+
+    rosbags writes code for these types and runs it; they come from ROS and from the data set's configuration, never from a bag.
+
+    Args:
+        layouts: message types and their definitions.
 
     Raises:
         MissingError: rosbags is not installed.
@@ -123,7 +139,7 @@ def known_types(layouts: Mapping[str, str]) -> Any:
         raise MissingError("reading ROS 2 bags needs the package rosbags; pip install 'vehest[ros]'") from None
     types = get_typestore(Stores.ROS2_HUMBLE)
     declared: dict[str, Any] = {}
-    for name, text in layouts.items():
+    for name, text in layouts:
         try:
             declared.update(get_types_from_msg(text, name))
         except (TypesysError, ValueError, TypeError) as error:
@@ -195,25 +211,11 @@ def _is_storage(path: Path) -> bool:
     return path.suffix.lower() in STORAGES
 
 
-@contextmanager
-def _opened(bag: Path, path: Path) -> Iterator[Any]:
-    from rosbags.rosbag2 import Reader
-
+def _require_bag(bag: Path, path: Path) -> None:
     if bag.is_dir() and not (bag / METADATA).is_file():
         raise DataError(f"'{path}' has no {METADATA}, without which a folder is no bag; make one with 'ros2 bag reindex'")
-    if any(character in str(bag) for character in UNUSABLE_IN_PATHS):
-        raise DataError(f"'{path}' cannot be read from a path with one of {' '.join(UNUSABLE_IN_PATHS)} in it; rename the folder or file")
     for file in bag.iterdir() if bag.is_dir() else [bag]:
         _refuse_short_sqlite(file, path)
-    reader = Reader(bag)
-    try:
-        reader.open()
-    except Exception as error:  # whatever a parser of binary files meets in a damaged one
-        raise _damaged(path, error, bag) from None
-    try:
-        yield reader
-    finally:
-        reader.close()
 
 
 def _refuse_short_sqlite(file: Path, path: Path) -> None:
@@ -237,45 +239,48 @@ def _refuse_short_sqlite(file: Path, path: Path) -> None:
         raise DataError(f"'{path}': '{file.name}' holds {file.stat().st_size} of its {size} bytes; it is truncated, fetch it again")
 
 
-def _connection(reader: Any, wanted: Wanted, path: Path) -> list[Any]:
+def _held(bag: OpenBag, wanted: Wanted, path: Path) -> list[BagTopic]:
     """What the bag holds of a topic, if it is what was declared."""
-    held = [connection for connection in reader.connections if connection.topic == wanted.topic]
+    held = [topic for topic in bag.topics if topic.name == wanted.topic]
     if not held:
-        topics = ", ".join(sorted({str(connection.topic) for connection in reader.connections})) or "none"
+        names = sorted({topic.name for topic in bag.topics})
+        topics = printable(", ".join(names[:30])) + (", …" if len(names) > 30 else "") if names else "none"
         raise DataError(f"'{path}' has no topic '{wanted.topic}' (it has {topics}); correct topics in the data set's configuration")
-    for connection in held:
-        if connection.msgtype != wanted.type:
-            raise DataError(f"'{path}': topic '{wanted.topic}' carries '{connection.msgtype}', not '{wanted.type}' as declared")
-    if not sum(connection.msgcount for connection in held):
+    for topic in held:
+        if topic.type != wanted.type:
+            raise DataError(f"'{path}': topic '{wanted.topic}' carries '{printable(topic.type)}', not '{wanted.type}' as declared")
+    if not any(topic.count is None or topic.count for topic in held):
         raise DataError(f"'{path}': topic '{wanted.topic}' holds no messages")
     return held
 
 
-def _refuse_other_layout(types: Any, connection: Any, wanted: Wanted, path: Path) -> None:
-    """A bag that says itself how its messages are laid out must say what was declared, or numbers would come from the wrong bytes."""
-    from rosbags.interfaces import MessageDefinitionFormat
+def _refuse_other_layout(types: Any, topic: BagTopic, wanted: Wanted, path: Path) -> None:
+    """A bag that says itself how its messages are laid out must say what was declared, or numbers would come from the wrong bytes.
+
+    Its text is parsed and compared; no type is made of it.
+    """
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    definition = connection.msgdef
-    if definition.format == MessageDefinitionFormat.NONE:
-        return
-    try:
-        if definition.format == MessageDefinitionFormat.MSG:
-            own = get_types_from_msg(definition.data, connection.msgtype)
-        else:
-            sections = definition.data.split("=" * 80 + "\n") if definition.data.startswith("=" * 80) else [definition.data]
-            own = {}
-            for section in filter(None, sections):
-                own.update(get_types_from_idl(section.split("\n", 1)[1] if section.startswith("IDL: ") else section))
-    except Exception as error:  # the text comes from the file
-        raise _damaged(path, error) from None
-    for name, (_, fields) in own.items():
-        declared = types.fielddefs.get(name)
-        if declared is not None and _layout(declared[1]) != _layout(fields):
-            raise DataError(
-                f"'{path}': topic '{wanted.topic}': the bag's own layout of '{name}' is not the declared one; "
-                f"correct messages in the data set"
-            )
+    for form, text in topic.layouts:
+        if len(text) > MOST_LAYOUT:
+            raise DataError(f"'{path}': topic '{wanted.topic}': its layout is {len(text)} characters long, more than {MOST_LAYOUT}")
+        own: dict[str, Any] = {}
+        try:
+            if form == "msg":
+                own = get_types_from_msg(text, topic.type)
+            else:
+                sections = text.split("=" * 80 + "\n") if text.startswith("=" * 80) else [text]
+                for section in filter(None, sections):
+                    own.update(get_types_from_idl(section.split("\n", 1)[1] if section.startswith("IDL: ") else section))
+        except Exception as error:  # whatever a parser meets in a text that comes from the file
+            raise _damaged(path, error) from None
+        for name, (_, fields) in own.items():
+            declared = types.fielddefs.get(name)
+            if declared is not None and _layout(declared[1]) != _layout(fields):
+                raise DataError(
+                    f"'{path}': topic '{wanted.topic}': the bag's own layout of '{name}' is not the declared one; "
+                    f"correct messages in the data set"
+                )
 
 
 def _layout(fields: Any) -> list[tuple[str, str]]:
@@ -283,27 +288,37 @@ def _layout(fields: Any) -> list[tuple[str, str]]:
 
 
 def _read_messages(
-    reader: Any, connections: list[Any], types: Any, getters: Mapping[str, list[Callable[[Any], Any]]], path: Path
-) -> dict[str, list[tuple[Any, ...]]]:
+    bag: OpenBag, wanted: Sequence[Wanted], types: Any, getters: Mapping[str, list[Callable[[Any], Any]]], path: Path
+) -> dict[str, TopicData]:
     """Time received, time stamped, and fields of every message."""
-    messages: dict[str, list[tuple[Any, ...]]] = {topic: [] for topic in getters}
-    stamped = {connection.topic: _has_header(types, connection.msgtype) for connection in connections}
-    try:
-        for connection, received, raw in reader.messages(connections):
-            message = types.deserialize_cdr(raw, connection.msgtype)
-            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec if stamped[connection.topic] else None
-            messages[connection.topic].append((received, stamp, *(getter(message) for getter in getters[connection.topic])))
-    except VehestError:
-        raise
-    except Exception as error:  # whatever a parser of binary files meets in a damaged one
-        raise _damaged(path, error) from None
-    for topic, held in messages.items():
-        declared = sum(connection.msgcount for connection in connections if connection.topic == topic)
-        if len(held) != declared:
+    kinds = {one.topic: one.type for one in wanted}
+    stamped = {topic: _has_header(types, kind) for topic, kind in kinds.items()}
+    times = {topic: (array("q"), array("q")) for topic in kinds}
+    values = {topic: [array("d") for _ in getters[topic]] for topic in kinds}
+    for topic, received, raw in bag.messages(set(kinds.items())):
+        try:
+            message = types.deserialize_cdr(raw, kinds[topic])
+            times[topic][0].append(received)
+            if stamped[topic]:
+                times[topic][1].append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+            for samples, getter in zip(values[topic], getters[topic], strict=True):
+                samples.append(getter(message))
+        except Exception as error:  # whatever a parser of binary data meets in a damaged message
+            raise _damaged(path, error) from None
+        check_limit("samples", len(times[topic][0]), f"'{path}': topic '{topic}' holds {len(times[topic][0])} messages or more")
+    read = {}
+    for one in wanted:
+        declared = [topic.count for topic in bag.topics if topic.name == one.topic]
+        held = len(times[one.topic][0])
+        if None not in declared and held != sum(count or 0 for count in declared):
             raise DataError(
-                f"'{path}': topic '{topic}' holds {len(held)} messages, the bag says {declared}; it is truncated, fetch it again"
+                f"'{path}': topic '{one.topic}' holds {held} messages, the bag says {sum(count or 0 for count in declared)}; "
+                f"it is truncated, fetch it again"
             )
-    return messages
+        if not held:
+            raise DataError(f"'{path}': topic '{one.topic}' holds no messages")
+        read[one.topic] = _topic_data(one, *times[one.topic], values[one.topic], stamped[one.topic])
+    return read
 
 
 def _has_header(types: Any, name: str) -> bool:
@@ -316,12 +331,13 @@ class _Plain:
     name = "BASE"
 
 
-def _topic_data(wanted: Wanted, messages: list[tuple[Any, ...]], types: Any) -> TopicData:
-    received, stamped, *fields = zip(*messages, strict=True)
+def _topic_data(wanted: Wanted, received: array[int], stamped: array[int], fields: list[array[float]], has_header: bool) -> TopicData:
+    """Messages in the order in which they were received."""
+    order = np.argsort(np.array(received), kind="stable")
     return TopicData(
-        received=np.array(received, dtype=np.int64),
-        stamped=np.array(stamped, dtype=np.int64) if _has_header(types, wanted.type) else None,
-        fields={name: np.array(values, dtype=np.float64) for name, values in zip(wanted.fields, fields, strict=True)},
+        received=np.array(received, dtype=np.int64)[order],
+        stamped=np.array(stamped, dtype=np.int64)[order] if has_header else None,
+        fields={name: np.array(values, dtype=np.float64)[order] for name, values in zip(wanted.fields, fields, strict=True)},
     )
 
 
@@ -332,4 +348,4 @@ def _damaged(path: Path, error: Exception, unpacked: Path | None = None) -> Data
 
 def _first_line(error: Exception) -> str:
     text = (str(error).splitlines() or [""])[0][:160]
-    return text or type(error).__name__
+    return printable(text) or type(error).__name__

@@ -1,0 +1,1 @@
+"""Channels held against each other: lever arms, mounting angles, delays and offsets between them, and checks of a recording."""

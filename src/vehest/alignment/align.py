@@ -1,0 +1,395 @@
+"""How a measuring set-up is aligned with its reference: lever arm, mounting rotation, delay and offsets of the sensors, steering ratio.
+
+Only what is asked for is estimated, the rest is taken as zero. Nothing is applied: the outcome names the transforms that would do it.
+
+In the plane, with velocities v = vx + i·vy and accelerations a = ax + i·ay as complex numbers, an accelerometer at the lever l from
+the reference point, turned by ψ, late by τ and with the offset b reads
+
+    a(t) = exp(-iψ)·(v' + i·r·v + (i·r' - r²)·l + gravity by tilt) + b,    velocities and yaw rate r taken at t - τ,
+
+and the yaw rate sensor r(t - τ) + b_r. Both sides go through the same low-pass filter, which therefore cancels. ``docs/alignment.md``
+derives it and says what it cannot do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from vehest.alignment.imu import (
+    FEWEST_BLOCKS,
+    IMU_CHANNELS,
+    NOTHING,
+    SHORTEST_BLOCK,
+    Correlation,
+    Fit,
+    ImuFit,
+    ImuModel,
+    Signals,
+    fit_imu,
+    listed,
+    n_blocks,
+    require_complete,
+    require_condition,
+    require_length,
+    rms,
+    scatter_of,
+    signals_of,
+    smoothing_of,
+)
+from vehest.alignment.settings import QUANTITIES, AlignmentSettings
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.data.transforms import transform_from_config
+
+UNITS: dict[str, str] = {
+    "lever_x": "m",
+    "lever_y": "m",
+    "yaw": "rad",
+    "delay": "s",
+    "offset_ax": "m/s²",
+    "offset_ay": "m/s²",
+    "offset_yaw_rate": "rad/s",
+    "steering_ratio": "1",
+    "steering_offset": "rad",
+    "understeer_gradient": "rad/(m/s²)",
+}
+
+READ_AS = {"rad": (180.0 / math.pi, "deg"), "s": (1e3, "ms")}
+"""SI unit -> factor and unit in tables for people; files and JSON hold SI units."""
+
+STEERING_CUTOFF = 0.25
+"""Cut-off of the steering's regression as a part of the other one: only slow steering obeys the steady-state relation."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One estimated number.
+
+    Args:
+        name: as in `UNITS`.
+        value: in SI units.
+        uncertainty: standard uncertainty, both contributions together.
+        low: lower end of the 95 % interval.
+        high: its upper end.
+        scatter: the contribution of the residuals' scatter.
+        tilt: the contribution of roll and pitch of body and road that nobody measured.
+    """
+
+    name: str
+    value: float
+    uncertainty: float
+    low: float
+    high: float
+    scatter: float
+    tilt: float
+
+    @property
+    def unit(self) -> str:
+        """SI unit."""
+        return UNITS[self.name]
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Low-passed difference between a sensor and what the reference says it should read.
+
+    Args:
+        channel: name of the channel.
+        unit: its unit.
+        time_before, before: as recorded, (T,) each.
+        time_after, after: once the transforms have been applied, (U,) each.
+        rest: ``after`` without the part that follows the accelerations, as a body's roll and pitch do; None where that is not fitted, (U,).
+    """
+
+    channel: str
+    unit: str
+    time_before: FloatArray
+    before: FloatArray
+    time_after: FloatArray
+    after: FloatArray
+    rest: FloatArray | None = None
+
+    @property
+    def rms_before(self) -> float:
+        """Root mean square as recorded."""
+        return rms(self.before)
+
+    @property
+    def rms_after(self) -> float:
+        """Root mean square with the transforms applied."""
+        return rms(self.after)
+
+    @property
+    def rms_rest(self) -> float:
+        """Root mean square of the rest; NaN where there is none."""
+        return math.nan if self.rest is None else rms(self.rest)
+
+
+@dataclass(frozen=True, eq=False)
+class Steering:
+    """What the steering ratio was fitted to: slow samples of calm driving.
+
+    Args:
+        channel: what was measured.
+        expected: road-wheel angle by the curvature of the path, lateral acceleration and lead included [rad], (T,).
+        measured: the channel [rad], (T,).
+    """
+
+    channel: str
+    expected: FloatArray
+    measured: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """What a drive says about its measuring set-up.
+
+    Args:
+        recording_id: name of the recording.
+        kind: ``real`` or ``simulated``.
+        rate_hz: its sampling rate [Hz].
+        duration: its length [s].
+        settings: what was asked for.
+        parameters: what was found, in the order of `UNITS`.
+        transforms: configurations of the transforms that would correct it, in the order of their application.
+        residuals: of the channels that were compared.
+        correlation: where there is a reference.
+        steering: where the steering ratio was asked for.
+        notes: what a reader must know, a sentence or two each.
+    """
+
+    recording_id: str
+    kind: str
+    rate_hz: float
+    duration: float
+    settings: AlignmentSettings
+    parameters: tuple[Parameter, ...]
+    transforms: tuple[Mapping[str, Any], ...]
+    residuals: tuple[Residual, ...] = ()
+    correlation: Correlation | None = None
+    steering: Steering | None = None
+    notes: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> Parameter:
+        """A parameter by its name.
+
+        Raises:
+            KeyError: it was not asked for.
+        """
+        return {parameter.name: parameter for parameter in self.parameters}[name]
+
+
+def in_words(name: str, value: float) -> str:
+    """A value with the unit that people read: angles in degrees, delays in milliseconds."""
+    factor, unit = READ_AS.get(UNITS[name], (1.0, UNITS[name]))
+    shown = f"{factor * value:.3g}"
+    return shown if unit == "1" else f"{shown} {unit}"
+
+
+def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
+    """Estimate what is asked for; the recording stays as it is.
+
+    The steering ratio is estimated last, on the drive as the other transforms would correct it.
+
+    Args:
+        recording: with ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``) for all but the steering ratio, with
+            ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for that.
+        settings: what to estimate, and how.
+
+    Raises:
+        DataError: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
+            drive cannot tell the parameters apart.
+        ConfigurationError: the cut-off is too high for the recording's rate.
+    """
+    parameters: list[Parameter] = []
+    transforms: list[dict[str, Any]] = []
+    residuals: tuple[Residual, ...] = ()
+    notes: list[str] = []
+    corrected, correlation, steering = recording, None, None
+    if settings.kinematic:
+        fit = fit_imu(recording, settings, [name for quantity in settings.kinematic for name in QUANTITIES[quantity]])
+        parameters = _imu_parameters(fit)
+        transforms = _imu_transforms(parameters)
+        for transform in transforms:
+            corrected = transform_from_config(transform)(corrected)
+        residuals = _residuals(fit, signals_of(corrected, settings))
+        correlation, notes = fit.correlation, _imu_notes(fit, parameters, settings)
+    if "steering_ratio" in settings.estimate:
+        found, transform, steering, note = _align_steering(corrected, settings)
+        parameters, transforms, notes = [*parameters, *found], [*transforms, transform], [*notes, note]
+    return Alignment(
+        recording_id=recording.id,
+        kind=recording.kind,
+        rate_hz=recording.rate_hz,
+        duration=recording.duration,
+        settings=settings,
+        parameters=tuple(parameters),
+        transforms=tuple(transforms),
+        residuals=residuals,
+        correlation=correlation,
+        steering=steering,
+        notes=tuple(notes),
+    )
+
+
+def _imu_parameters(fit: ImuFit) -> list[Parameter]:
+    return [
+        _parameter(name, fit.values[name], scatter, tilt, fit.blocks - 1)
+        for name, scatter, tilt in zip(fit.names, fit.scatter.tolist(), fit.tilt.tolist(), strict=True)
+    ]
+
+
+def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
+    """With the 95 % interval of Student's distribution, effective degrees of freedom after Welch and Satterthwaite (GUM, G.4.1)."""
+    uncertainty = math.hypot(scatter, tilt)
+    effective = freedom * (uncertainty / scatter) ** 4 if scatter > 0 else math.inf
+    half = uncertainty * float(stats.t.ppf(0.975, effective) if effective < 1e6 else stats.norm.ppf(0.975))
+    return Parameter(name, value, uncertainty, value - half, value + half, scatter, tilt)
+
+
+def _imu_transforms(parameters: Sequence[Parameter]) -> list[dict[str, Any]]:
+    """Delay, then offsets (they are in the sensor's axes), then mounting."""
+    found = {parameter.name: _rounded(parameter.value) for parameter in parameters}
+    transforms: list[dict[str, Any]] = []
+    if "delay" in found:
+        transforms.append({"name": "delay_correction", "delay": found["delay"], "channels": list(IMU_CHANNELS)})
+    if "offset_ax" in found:
+        transforms.append({"name": "offset_correction", "offsets": {channel: found[f"offset_{channel}"] for channel in IMU_CHANNELS}})
+    mounting: dict[str, Any] = {name: found[name] for name in ("lever_x", "lever_y", "yaw") if name in found}
+    if mounting:
+        transforms.append({"name": "mounting_correction", **mounting})
+    return transforms
+
+
+def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
+    """Sensor less reference, as recorded and as the transforms leave them."""
+    before, after = ImuModel(fit.signals), ImuModel(corrected)
+    tilt = {name: value for name, value in fit.values.items() if name.startswith("tilt")}
+    error_before, error_after = (model.measured - model(NOTHING)[0] for model in (before, after))
+    rest = after.measured - after({**NOTHING, **tilt})[0]
+    return tuple(
+        Residual(
+            channel=channel,
+            unit=UNITS[f"offset_{channel}"],
+            time_before=fit.signals.time,
+            before=error_before[row],
+            time_after=corrected.time,
+            after=error_after[row],
+            rest=rest[row] if any(tilt.values()) and channel != "yaw_rate" else None,
+        )
+        for row, channel in enumerate(fit.signals.channels)
+    )
+
+
+def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings) -> list[str]:
+    signals, values, notes = fit.signals, fit.values, []
+    left = [name for name in QUANTITIES if name not in settings.estimate and name != "steering_ratio"]
+    if left:
+        notes.append(f"Not asked for and taken as zero: {', '.join(left)}.")
+    if fit.suspects:
+        found = listed([f"{name} {in_words(name, value)} ± {in_words(name, sigma)}" for name, (value, sigma) in fit.suspects.items()])
+        notes.append(
+            f"What is left over speaks for what was not asked for, each taken alone: {found}. With it the other figures may change."
+        )
+    unproven = [parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high]
+    if unproven:
+        notes.append(f"Zero lies within the interval of {listed(unproven)}: this drive gives no reason to correct it.")
+    if signals.speed == "vx":
+        notes.append("There is no vx_ref: vx serves as the reference's forward velocity, taken to be on its clock.")
+    if signals.reference_rate is None:
+        notes.append(
+            "There is no yaw_rate_ref: delay and yaw rate offset come from the accelerations, where they are known less well, "
+            "and a road that is banked where the car is slow looks like a yaw rate offset."
+        )
+    if "offset_ax" in fit.names:
+        angles = (math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0))) for name in ("offset_ax", "offset_ay"))
+        notes.append(
+            "An accelerometer that is mounted with a pitch or roll angle shows a constant part of gravity: the offsets of ax and ay may as "
+            "well be {:.2f}° and {:.2f}° of it, and no drive tells the two apart.".format(*angles)
+        )
+    if signals.gravity is not None:
+        notes.append("Gravity is taken off the accelerations by the measured roll and pitch for this estimate.")
+    if settings.tilt > 0:
+        notes.append(
+            f"Beyond the acceleration of the reference the sensor shows {_percent(values['tilt_gain_x'])} of it in ax and "
+            f"{_percent(values['tilt_gain_y'])} in ay: gravity through pitch and roll of the body (1 % is 0.57° at 1 g), or a scale "
+            f"error. This is fitted beside what was asked for, and no transform takes it off."
+        )
+    return notes
+
+
+def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[list[Parameter], dict[str, Any], Steering, str]:
+    """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives calmly.
+
+    A term in the derivative of the angle is fitted beside it: in transients the steering leads.
+
+    Raises:
+        DataError: a channel is missing or has gaps, there is too little calm driving, or it cannot tell the parameters apart.
+    """
+    assert settings.wheelbase is not None
+    source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
+    if source not in recording:
+        raise DataError(
+            f"recording '{recording.id}' has no channel '{source}' (it has {', '.join(recording.channels)}): "
+            f"the steering ratio needs handwheel or steer"
+        )
+    yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
+    require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")
+    smoothing = smoothing_of(recording, STEERING_CUTOFF * settings.cutoff_hz)
+    lost = 2 * smoothing.reach / recording.rate_hz
+    require_length(recording, recording.duration - lost, lost)
+
+    def low(samples: FloatArray, order: int = 0) -> FloatArray:
+        return smoothing(samples, order, margin=smoothing.reach)
+
+    speed = np.maximum(recording["vx"], 0.1 * settings.min_speed)
+    angle = np.arctan(settings.wheelbase * recording[yaw_rate] / speed)
+    calm = (low(recording["vx"]) >= settings.min_speed) & (np.abs(low(recording["ay"])) <= settings.max_ay)
+    seconds = float(calm.sum()) * smoothing.step / recording.rate_hz
+    if seconds < FEWEST_BLOCKS * SHORTEST_BLOCK:
+        raise DataError(
+            f"recording '{recording.id}': only {seconds:.3g} s are above {settings.min_speed:g} m/s and below {settings.max_ay:g} m/s² "
+            f"of lateral acceleration; the steering ratio needs at least {FEWEST_BLOCKS * SHORTEST_BLOCK:g} s"
+        )
+    columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[:, calm]
+    measured = low(recording[source])[calm]
+    names = ["steering_ratio", "steering_offset", "understeer_gradient", "lead"]
+    require_condition(recording, columns @ columns.T, names, names[:3])
+    solution = np.linalg.lstsq(columns.T, measured, rcond=None)[0]
+    error = measured - solution @ columns
+    fit = Fit(names, dict(zip(names, solution.tolist(), strict=True)), error[None], columns[:, None], np.ones(1), np.zeros((4, 4)))
+    blocks = n_blocks(seconds)
+    ratio, offset, slope, _ = solution.tolist()
+    to_gradient = np.diag([1.0, 1.0, 1.0 / ratio, 1.0])  # understeer gradient = slope / ratio
+    to_gradient[2, 0] = -slope / ratio**2
+    scatter = np.sqrt(np.diag(to_gradient @ scatter_of(fit, blocks) @ to_gradient.T))
+    found = [
+        _parameter(name, value, float(size), 0.0, blocks - 1)
+        for name, value, size in zip(names[:3], (ratio, offset, slope / ratio), scatter[:3], strict=True)
+    ]
+    if found[0].low <= 0.0 <= found[0].high:
+        raise DataError(
+            f"recording '{recording.id}': '{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g}); "
+            f"check the channel and its sign, or use a drive with slow turns"
+        )
+    transform = {"name": "steering_ratio", "ratio": _rounded(ratio), "offset": _rounded(offset), "channel": source}
+    note = (
+        f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m, from "
+        f"{seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
+    )
+    return found, transform, Steering(source, (solution @ columns - offset) / ratio, measured), note
+
+
+def _percent(share: float) -> str:
+    return f"{round(100.0 * share, 1) + 0.0:.1f} %"  # no -0.0
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")

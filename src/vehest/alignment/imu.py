@@ -1,0 +1,700 @@
+"""What an inertial sensor should read where it sits, and the fit of where it sits to what it did read."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from vehest.alignment.settings import AlignmentSettings
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.limits import check_limit
+from vehest.data.recording import Recording
+
+ComplexArray = NDArray[np.complex128]
+
+IMU_CHANNELS = ("ax", "ay", "yaw_rate")
+IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
+
+TILT_GAIN = 0.1
+"""Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
+TILT_LAG_GAIN = 0.005
+"""The same for the derivative of the acceleration [s]: the body follows late, say 0.1 times 50 ms."""
+TILT_LIKENESS = 0.3
+"""Assumed correlation of what else body and road tilt with the effect of a parameter."""
+
+ROAD_CUTOFF = 0.2
+"""Bank and grade of the road change more slowly than that [Hz]."""
+
+N_BLOCKS = 12
+SHORTEST_BLOCK = 2.0  # s, longer than residuals of the band remember
+FEWEST_BLOCKS = 8
+LEAST_CORRELATION = 0.5
+LARGEST_CONDITION = 50.0  # of the scaled columns; ordinary drives have 4 to 20
+LARGEST_NOISE_SHARE = 0.05
+SHORTEST_KERNEL = 1.5  # samples; a narrower sampled Gaussian has no exact derivatives
+LARGEST_CUTOFF = math.sqrt(math.log(2.0)) / (2.0 * math.pi * SHORTEST_KERNEL)  # of the sampling rate
+KERNEL_REACH = 6.0  # standard deviations
+N_ITERATIONS = 60
+SETTLED = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
+SMALLEST_VARIANCE = 1e-24
+SUSPICIOUS = 3.0  # standard uncertainties
+
+TILT_PRIOR = {"tilt_gain_x": TILT_GAIN, "tilt_gain_y": TILT_GAIN, "tilt_lag_x": TILT_LAG_GAIN, "tilt_lag_y": TILT_LAG_GAIN}
+NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
+"""All parameters of a sensor that is aligned."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Cross-correlation between the sensor and what the reference says it should read.
+
+    Args:
+        signal: what was compared, for people.
+        lag: by how much the sensor is late [s], shape (L,).
+        value: between -1 and 1, shape (L,).
+        peak: lag of the largest value, between samples by a parabola [s].
+    """
+
+    signal: str
+    lag: FloatArray
+    value: FloatArray
+    peak: float
+
+    @property
+    def highest(self) -> float:
+        """The largest value."""
+        return float(self.value.max())
+
+
+@dataclass(frozen=True, eq=False)
+class ImuFit:
+    """What was found.
+
+    Args:
+        names: the parameters that were asked for, N of them.
+        values: of all parameters, those that were not asked for zero.
+        scatter: standard uncertainty of each by the scatter of the residuals, (N,).
+        tilt: standard uncertainty of each by roll and pitch that are not modelled, (N,).
+        blocks: number of blocks that ``scatter`` comes from.
+        suspects: parameters that were not asked for and that the residuals speak for: name -> value and standard uncertainty.
+        correlation: where the delay was looked for first.
+        signals: what was compared.
+    """
+
+    names: Sequence[str]
+    values: Mapping[str, float]
+    scatter: FloatArray
+    tilt: FloatArray
+    blocks: int
+    suspects: Mapping[str, tuple[float, float]]
+    correlation: Correlation
+    signals: Signals
+
+
+def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
+    """Fit parameters of the sensor to a drive; the others are zero.
+
+    Args:
+        recording: with ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` or ``vx``.
+        settings: of the estimation.
+        names: some of `IMU_PARAMETERS`.
+
+    Raises:
+        DataError: see `vehest.alignment.align.align`.
+    """
+    signals = signals_of(recording, settings)
+    model = ImuModel(signals)
+    start, (predicted, columns) = dict(NOTHING), model(NOTHING)
+    if "yaw" in names:
+        start["yaw"] = _turned_by(predicted, model.measured, with_offsets="offset_ax" in names)
+    correlation = _cross_correlation(signals, start["yaw"], settings)
+    if "delay" in names:
+        _require_peak(recording, correlation, settings)
+        start["delay"] = correlation.peak
+    noise = _noise_of_columns(signals)
+    tilts = [name for name in TILT_PRIOR if settings.tilt > 0 and _is_seen(columns[name], noise[name])]
+    fit = _most_likely(model, start, [*names, *tilts], names)
+    _require_identified(signals, fit, names, noise)
+    if "delay" in names and abs(fit.values["delay"]) > settings.max_delay:
+        raise DataError(f"recording '{recording.id}': the delay left the {settings.max_delay:g} s that are searched; raise max_delay")
+    blocks = n_blocks(signals.duration)
+    columns, kept_rate = model(fit.values)[1], signals.rate_hz / signals.smoothing.step
+    scatter, tilt = _uncertainties(fit, columns, settings.tilt, blocks, kept_rate)
+    return ImuFit(
+        names=names,
+        values=fit.values,
+        scatter=scatter[: len(names)],
+        tilt=tilt[: len(names)],
+        blocks=blocks,
+        suspects=_suspects(fit, columns, settings.tilt, blocks, kept_rate),
+        correlation=correlation,
+        signals=signals,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """What is compared, unfiltered, and the filter.
+
+    Args:
+        recording: where it comes from.
+        speed: the channel that gives the reference's forward velocity.
+        measured: ax + i·ay of the sensor, (T,).
+        gyro: its yaw rate, (T,).
+        velocity: vx + i·vy of the reference, (T,).
+        reference_rate: yaw rate of the reference if there is one, (T,).
+        gravity: what measured roll and pitch let into the accelerometer; None where they are not measured or not used, (T,).
+        smoothing: the low-pass filter.
+        margin: samples at either end that serve filtering and shifting only.
+    """
+
+    recording: Recording
+    speed: str
+    measured: ComplexArray
+    gyro: FloatArray
+    velocity: ComplexArray
+    reference_rate: FloatArray | None
+    gravity: ComplexArray | None
+    smoothing: Smoothing
+    margin: int
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate of the recording."""
+        return self.recording.rate_hz
+
+    @property
+    def duration(self) -> float:
+        """What is compared, without the margins [s]."""
+        return (len(self.measured) - 2 * self.margin) / self.rate_hz
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels that are compared."""
+        return IMU_CHANNELS if self.reference_rate is not None else IMU_CHANNELS[:2]
+
+    @property
+    def time(self) -> FloatArray:
+        """Of the low-passed samples [s]."""
+        return self.recording.time[self.margin : len(self.measured) - self.margin : self.smoothing.step]
+
+    def low_passed(self, samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
+        """A derivative of the low-passed samples without the margins."""
+        return self.smoothing(samples, order, margin=self.margin)
+
+    def as_rows(self, plane: ComplexArray, turn: FloatArray | None = None) -> FloatArray:
+        """A complex signal, and a real one where the yaw rate is compared too, as rows of shape (C, T)."""
+        rows = [plane.real, plane.imag]
+        if self.reference_rate is not None:
+            rows.append(np.zeros(len(plane)) if turn is None else turn)
+        return np.stack(rows)
+
+
+def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
+    """Look that all is there and put it side by side.
+
+    Raises:
+        DataError: a channel is missing or has gaps, or the recording is too short.
+        ConfigurationError: the cut-off is too high for the recording's rate, or it or the largest delay asks for more than the limits.
+    """
+    asked = ", ".join(settings.kinematic)
+    if "vy_ref" not in recording:
+        raise DataError(
+            f"recording '{recording.id}' has no reference channel 'vy_ref': {asked} can only be found against a reference velocity"
+        )
+    speed = "vx_ref" if "vx_ref" in recording else "vx"
+    require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref"], asked)
+    optional = [name for name in ("yaw_rate_ref", "roll", "pitch") if name in recording]
+    require_complete(recording, optional, asked)
+    gravity = None
+    if settings.tilt > 0 and ("roll" in recording or "pitch" in recording):
+        level = np.zeros(len(recording))
+        roll, pitch = (recording.channels.get(name, level) for name in ("roll", "pitch"))
+        gravity = GRAVITY * (-np.sin(pitch) + 1j * np.sin(roll) * np.cos(pitch))
+    smoothing = smoothing_of(recording, settings.cutoff_hz)
+    lags = settings.max_delay * recording.rate_hz
+    what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
+    check_limit("filter_samples", lags, what, ConfigurationError)
+    shift = math.ceil(settings.max_delay * recording.rate_hz) if "delay" in settings.estimate else 0
+    signals = Signals(
+        recording=recording,
+        speed=speed,
+        measured=recording["ax"] + 1j * recording["ay"],
+        gyro=recording["yaw_rate"],
+        velocity=recording[speed] + 1j * recording["vy_ref"],
+        reference_rate=recording.channels.get("yaw_rate_ref"),
+        gravity=gravity,
+        smoothing=smoothing,
+        margin=smoothing.reach + shift,
+    )
+    require_length(recording, signals.duration, 2 * signals.margin / recording.rate_hz)
+    return signals
+
+
+class ImuModel:
+    """What the sensor should read, low-passed, and its derivatives by every parameter."""
+
+    def __init__(self, signals: Signals) -> None:
+        self.signals = signals
+        low = signals.low_passed
+        self.measured = signals.as_rows(low(signals.measured), low(signals.gyro))
+        self._gravity = 0.0 if signals.gravity is None else low(signals.gravity)
+        self._clock = np.arange(len(signals.measured)) / signals.rate_hz
+        self._velocity = CubicSpline(self._clock, signals.velocity)
+        self._rate = None if signals.reference_rate is None else CubicSpline(self._clock, signals.reference_rate)
+
+    def __call__(self, at: Mapping[str, float]) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Prediction (C, T) and its derivatives, name -> (C, T), at a set of parameters."""
+        low = self.signals.low_passed
+        now = np.clip(self._clock - at["delay"], 0.0, self._clock[-1])
+        v, v_dot = self._velocity(now), self._velocity(now, 1)
+        r = self.signals.gyro - at["offset_yaw_rate"] if self._rate is None else self._rate(now)
+        lever = at["lever_x"] + 1j * at["lever_y"]
+        gain, lag = (complex(at[f"tilt_{what}_x"], at[f"tilt_{what}_y"]) for what in ("gain", "lag"))
+
+        rv = r * v
+        acceleration, jerk = low(v, 1) + 1j * low(rv), low(v, 2) + 1j * low(rv, 1)  # at the reference point
+        r_low, r_dot, r_squared = low(r), low(r, 1), low(r * r)
+        arm = 1j * r_dot - r_squared
+        tilted = acceleration + _axiswise(gain, acceleration) + _axiswise(lag, jerk)
+        turned = np.exp(-1j * at["yaw"])
+        plane = turned * (tilted + arm * lever + self._gravity)
+
+        if self._rate is None:  # the yaw rate is on the sensor's own clock
+            late, late_dot, late_arm = low(v, 2) + 1j * low(r * v_dot), low(v, 3) + 1j * low(r * v_dot, 1), np.zeros_like(arm)
+        else:
+            late, late_dot, late_arm = jerk, low(v, 3) + 1j * low(rv, 2), 1j * low(r, 2) - low(r * r, 1)
+        by_delay = late + _axiswise(gain, late) + _axiswise(lag, late_dot) + late_arm * lever
+        rows, ones = self.signals.as_rows, np.ones(len(plane), dtype=np.complex128)
+        columns = {
+            "lever_x": rows(turned * arm),
+            "lever_y": rows(turned * 1j * arm),
+            "yaw": rows(-1j * plane),
+            "delay": rows(-turned * by_delay, -r_dot),
+            "offset_ax": rows(ones),
+            "offset_ay": rows(1j * ones),
+            "offset_yaw_rate": rows(np.zeros_like(ones), np.ones(len(plane))),
+            "tilt_gain_x": rows(turned * acceleration.real),
+            "tilt_gain_y": rows(turned * 1j * acceleration.imag),
+            "tilt_lag_x": rows(turned * jerk.real),
+            "tilt_lag_y": rows(turned * 1j * jerk.imag),
+        }
+        if self._rate is None:
+            by_rate, by_rate_dot = -1j * low(v), -1j * low(v, 1)
+            columns["offset_yaw_rate"] = rows(
+                turned * (by_rate + _axiswise(gain, by_rate) + _axiswise(lag, by_rate_dot) + 2.0 * r_low * lever)
+            )
+        prediction = rows(plane + at["offset_ax"] + 1j * at["offset_ay"], r_low + at["offset_yaw_rate"])
+        return prediction, columns
+
+
+def _axiswise(factors: complex, plane: ComplexArray) -> ComplexArray:
+    """Each axis times a factor of its own."""
+    return factors.real * plane.real + 1j * factors.imag * plane.imag
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fit of C channels over T samples by P parameters.
+
+    Args:
+        names: of the P parameters.
+        values: of all parameters, also of those that are not free.
+        error: measured less predicted, (C, T).
+        columns: derivatives of the prediction, (P, C, T).
+        weights: of the channels, (C,).
+        prior: precisions, (P, P); zero but for parameters that have a prior.
+    """
+
+    names: Sequence[str]
+    values: Mapping[str, float]
+    error: FloatArray
+    columns: FloatArray
+    weights: FloatArray
+    prior: FloatArray
+
+    @property
+    def point(self) -> FloatArray:
+        """Values of the free and nuisance parameters, (P,)."""
+        return np.array([self.values[name] for name in self.names])
+
+    @property
+    def cost(self) -> float:
+        """Twice the negative logarithm of the likelihood, but for a constant."""
+        own = self.point
+        return float(-self.error.shape[1] * np.log(self.weights).sum() + own @ self.prior @ own)
+
+    @property
+    def information(self) -> FloatArray:
+        """Inverse of the covariance, were the errors white, (P, P)."""
+        return np.einsum("pct,qct,c->pq", self.columns, self.columns, self.weights, optimize=True) + self.prior
+
+
+def _turned_by(predicted: FloatArray, measured: FloatArray, *, with_offsets: bool) -> float:
+    """The rotation that brings reference and sensor together best, without delay and lever arm."""
+    expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, measured))
+    if with_offsets:
+        expected, shown = expected - expected.mean(), shown - shown.mean()
+    return -float(np.angle(np.vdot(expected, shown)))
+
+
+def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
+    """Yaw rates if the reference has one, else what remains of the accelerations without vx·yaw rate, which has no delay of its own."""
+    v, gyro = signals.velocity, signals.gyro
+
+    def low(samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
+        return signals.smoothing(samples, order, margin=signals.smoothing.reach, step=1)
+
+    if signals.reference_rate is not None:
+        pairs, what = [(low(gyro, 1), low(signals.reference_rate, 1))], "yaw acceleration"
+    else:
+        own = np.exp(1j * yaw) * low(signals.measured) - 1j * low(gyro * v)
+        derived = low(v, 1)
+        pairs, what = [(own.real, derived.real), (own.imag, derived.imag)], "acceleration"
+    n_lags = math.ceil(settings.max_delay * signals.rate_hz)
+    lags = np.arange(-n_lags, n_lags + 1)
+    products, own_energy, derived_energy = np.zeros(len(lags)), np.zeros(len(lags)), 0.0
+    for own, derived in pairs:
+        own, core = own - own.mean(), (derived - derived.mean())[n_lags : len(derived) - n_lags]
+        products += signal.correlate(own, core, mode="valid", method="fft")
+        energy = np.concatenate([[0.0], np.cumsum(np.square(own))])
+        own_energy += energy[len(core) :] - energy[: len(lags)]
+        derived_energy += float(core @ core)
+    size = np.sqrt(own_energy * derived_energy)
+    value = np.divide(products, size, out=np.zeros(len(lags)), where=size > 0)
+    top = int(np.argmax(value))
+    shift = 0.0
+    if 0 < top < len(value) - 1:
+        before, at, after = value[top - 1 : top + 2]
+        bend = before - 2.0 * at + after
+        shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
+    return Correlation(what, lags / signals.rate_hz, value, float(lags[top] + shift) / signals.rate_hz)
+
+
+def _require_peak(recording: Recording, correlation: Correlation, settings: AlignmentSettings) -> None:
+    """See that sensor and reference have something in common.
+
+    Raises:
+        DataError: they have not, or no further than at the end of the delays that are searched.
+    """
+    if correlation.highest < LEAST_CORRELATION:
+        raise DataError(
+            f"recording '{recording.id}': {correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most for "
+            f"delays up to {settings.max_delay:g} s, too little to find one; check units, signs and channels (vehest data check)"
+        )
+    if np.argmax(correlation.value) in (0, len(correlation.value) - 1):
+        raise DataError(
+            f"recording '{recording.id}': sensor and reference correlate best at the end of the {settings.max_delay:g} s that are "
+            f"searched; raise max_delay"
+        )
+
+
+def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[str], asked: Sequence[str]) -> Fit:
+    """The largest likelihood by Levenberg and Marquardt's steps; each channel's variance is the mean square of its own residuals."""
+    prior = np.diag([TILT_PRIOR[name] ** -2 if name in TILT_PRIOR else 0.0 for name in names])
+
+    def fit_at(values: Mapping[str, float]) -> Fit:
+        predicted, by_name = model(values)
+        error = model.measured - predicted
+        weights = 1.0 / np.maximum(np.mean(np.square(error), axis=1), SMALLEST_VARIANCE)
+        return Fit(names, dict(values), error, np.stack([by_name[name] for name in names]), weights, prior)
+
+    fit, damping = fit_at(start), 1e-4
+    for _ in range(N_ITERATIONS):
+        information = fit.information
+        require_condition(model.signals.recording, information, names, asked)
+        gradient = np.einsum("pct,ct,c->p", fit.columns, fit.error, fit.weights) - prior @ fit.point
+        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        moved = fit_at({**fit.values, **dict(zip(names, (fit.point + step).tolist(), strict=True))})
+        settled = float(np.abs(step).max()) < SETTLED
+        if moved.cost <= fit.cost:
+            fit, damping = moved, damping / 10.0
+        elif not settled:
+            damping = max(damping, 1e-4) * 10.0
+        if settled:
+            return fit
+    raise DataError(
+        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; ask for fewer quantities, "
+        f"lower the cut-off, or use a drive with more turning, braking and accelerating"
+    )
+
+
+def require_condition(recording: Recording, information: FloatArray, names: Sequence[str], asked: Sequence[str]) -> None:
+    """Refuse parameters that the drive cannot tell apart.
+
+    Raises:
+        DataError: the condition number of the scaled problem is too large.
+    """
+    scale = np.sqrt(np.diag(information))
+    silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
+    if silent:
+        raise DataError(f"recording '{recording.id}': nothing in it depends on {listed(silent)}; the drive needs turning and accelerating")
+    condition = condition_of(information)
+    if condition <= LARGEST_CONDITION:
+        return
+    vectors = np.linalg.eigh(information / scale / scale[:, None])[1]
+    confused = [name for name, part in zip(names, np.abs(vectors[:, 0]), strict=True) if part > 0.3]
+    confused = [name for name in confused if name in asked] + sorted({"tilt of the body" for name in confused if name not in asked})
+    raise DataError(
+        f"recording '{recording.id}': this drive cannot tell {listed(confused)} apart (condition number {condition:.2g}, at most "
+        f"{LARGEST_CONDITION:g}); ask for fewer quantities, or use a drive with varying speed and turns both ways"
+    )
+
+
+def condition_of(information: FloatArray) -> float:
+    """Condition number of a least-squares problem whose columns are scaled to length 1; infinite where one is zero."""
+    scale = np.sqrt(np.diag(information))
+    if not scale.all():
+        return math.inf
+    values = np.linalg.eigvalsh(information / scale / scale[:, None])
+    return math.sqrt(values[-1] / values[0]) if values[0] > 0 else math.inf
+
+
+def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]:
+    """Standard deviation of the noise in the derivatives by each parameter, for ax, ay and yaw rate.
+
+    It is that of the reference and of the yaw rate, taken as white.
+    """
+    speed_noise, side_noise = _noise(signals.velocity.real), _noise(signals.velocity.imag)
+    rate_noise = _noise(signals.gyro if signals.reference_rate is None else signals.reference_rate)
+    level, slope, bend = (signals.smoothing.noise_gain(order) for order in range(3))
+    speed, turning = rms(np.abs(signals.velocity)), rms(signals.gyro)
+    ahead, aside = slope * speed_noise, math.hypot(slope * side_noise, level * speed * rate_noise)
+    arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
+    own_rate = signals.reference_rate is None
+    return {
+        "lever_x": (arm, arm, 0.0),
+        "lever_y": (arm, arm, 0.0),
+        "yaw": (aside, ahead, 0.0),
+        "delay": (bend * speed_noise, bend * side_noise, slope * rate_noise),
+        "offset_ax": (0.0, 0.0, 0.0),
+        "offset_ay": (0.0, 0.0, 0.0),
+        "offset_yaw_rate": (level * side_noise, level * speed_noise, 0.0) if own_rate else (0.0, 0.0, 0.0),
+        "tilt_gain_x": (ahead, 0.0, 0.0),
+        "tilt_gain_y": (0.0, aside, 0.0),
+        "tilt_lag_x": (bend * speed_noise, 0.0, 0.0),
+        "tilt_lag_y": (0.0, math.hypot(bend * side_noise, slope * speed * rate_noise), 0.0),
+    }
+
+
+def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
+    """Whether an effect varies enough to be told from noise; where it does not, it counts as an uncertainty only."""
+    return sum(size**2 for size in noise) <= LARGEST_NOISE_SHARE * float(column.var(axis=1).sum())
+
+
+def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise: Mapping[str, tuple[float, float, float]]) -> None:
+    """Refuse parameters that would be fitted to the noise of the yaw rate and of the reference rather than to motion.
+
+    What is left of a parameter's column once the other parameters have taken their share must stand well above the noise in it.
+
+    Raises:
+        DataError: it does not.
+    """
+    unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(asked), : len(asked)]))
+    for index, name in enumerate(asked):
+        share = fit.error.shape[1] * float(fit.weights @ np.square(noise[name][: len(fit.weights)])) / unique[index]
+        if share > LARGEST_NOISE_SHARE:
+            raise DataError(
+                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of what this drive says "
+                f"about it is noise, at most {100 * LARGEST_NOISE_SHARE:g} % may be; lower the cut-off, or use a drive with more turning, "
+                f"braking and accelerating"
+            )
+
+
+def _noise(samples: FloatArray) -> float:
+    """Standard deviation of the white noise on a smooth signal, from its third differences."""
+    return rms(np.diff(samples, 3)) / math.sqrt(20.0)
+
+
+def require_length(recording: Recording, usable: float, lost: float) -> None:
+    """See that there is enough for the uncertainty.
+
+    Raises:
+        DataError: there is not.
+    """
+    least = FEWEST_BLOCKS * SHORTEST_BLOCK
+    if usable < least:
+        raise DataError(
+            f"recording '{recording.id}' lasts {recording.duration:.3g} s; an uncertainty needs at least {least + lost:.3g} s "
+            f"({FEWEST_BLOCKS} blocks of {SHORTEST_BLOCK:g} s, and {lost:.2g} s for filtering and shifting)"
+        )
+
+
+def n_blocks(seconds: float) -> int:
+    """Number of blocks that a drive is divided into: longer ones for longer drives."""
+    return min(max(int(seconds / SHORTEST_BLOCK), FEWEST_BLOCKS), N_BLOCKS)
+
+
+def scatter_of(fit: Fit, blocks: int) -> FloatArray:
+    """Covariance of the parameters (P, P), from leaving out one block of time after another.
+
+    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. What a prior
+    holds in place varies as the prior says.
+
+    Source:
+        Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
+        232 (2), 2023, section 3; blocks of a time series as clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
+    """
+    information = fit.information
+    edges = np.linspace(0, fit.error.shape[1], blocks + 1).astype(int)
+    changes = []
+    for first, last in itertools.pairwise(edges):
+        columns, error = fit.columns[:, :, first:last], fit.error[:, first:last]
+        own = np.einsum("pct,qct,c->pq", columns, columns, fit.weights, optimize=True)
+        score = np.einsum("pct,ct,c->p", columns, error, fit.weights, optimize=True)
+        changes.append(np.linalg.lstsq(information - own, -score, rcond=None)[0])
+    moved, inverse = np.stack(changes), np.linalg.inv(information)
+    return (blocks - 1) / blocks * moved.T @ moved + inverse @ fit.prior @ inverse
+
+
+def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> tuple[FloatArray, FloatArray]:
+    """Standard uncertainties of the parameters by scatter and by tilt, (P,) each.
+
+    Tilt is what roll and pitch that the fit does not know would change: of the body, constant, moving, or following the accelerations where
+    that is not fitted, and of the road. How much the road tilts shows in the slow part of what the fit leaves; that it looks like the
+    effect of a parameter is assumed.
+    """
+    scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
+    if tilt == 0.0:
+        return scatter, np.zeros(len(fit.names))
+    pull = np.linalg.solve(fit.information, (fit.columns[:, :2] * fit.weights[:2, None]).reshape(len(fit.names), -1))
+    pull = pull.reshape(len(fit.names), 2, -1)  # change of each parameter by an error of either axis at one time
+    moving = pull - pull.mean(axis=2, keepdims=True)
+    deviation = _deviation(ROAD_CUTOFF, rate_hz)
+    slow, road = (gaussian_filter1d(samples, deviation, axis=-1, mode="reflect") for samples in (moving, fit.error[:2]))
+    body = GRAVITY * tilt
+    variance = np.square(body * pull.sum(axis=2)) + _likened(moving, body) + _likened(slow, road.std(axis=1))
+    total = variance.sum(axis=1)
+    for name in [name for name in TILT_PRIOR if name not in fit.names]:
+        total += np.square(TILT_PRIOR[name] * np.einsum("pct,ct->p", pull, columns[name][:2]))
+    return scatter, np.sqrt(total)
+
+
+def _suspects(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> dict[str, tuple[float, float]]:
+    """Parameters that are no part of the fit and that one more step would move by more than three standard uncertainties."""
+    suspects = {}
+    for name in [name for name in IMU_PARAMETERS if name not in fit.names]:
+        names = [*fit.names, name]
+        prior = np.pad(fit.prior, (0, 1))
+        wider = Fit(names, fit.values, fit.error, np.stack([columns[each] for each in names]), fit.weights, prior)
+        if condition_of(wider.information) > LARGEST_CONDITION:
+            continue
+        step = np.linalg.solve(wider.information, np.einsum("pct,ct,c->p", wider.columns, fit.error, fit.weights) - prior @ wider.point)
+        left = Fit(names, fit.values, fit.error - np.einsum("p,pct->ct", step, wider.columns), wider.columns, fit.weights, prior)
+        scatter, tilted = _uncertainties(left, columns, tilt, blocks, rate_hz)
+        uncertainty = math.hypot(float(scatter[-1]), float(tilted[-1]))
+        if abs(step[-1]) > SUSPICIOUS * uncertainty:
+            suspects[name] = (float(step[-1]), uncertainty)
+    return suspects
+
+
+def _likened(pull: FloatArray, size: float | FloatArray) -> FloatArray:
+    """Variance of each parameter (P, axes) by an error of that size that resembles its effect to the assumed degree."""
+    return pull.shape[2] * np.square(pull).sum(axis=2) * np.square(TILT_LIKENESS * size)
+
+
+@dataclass(frozen=True)
+class Smoothing:
+    """Low-passing by a Gaussian kernel, whose derivatives differentiate; of the output as many samples are kept as its band needs.
+
+    Args:
+        deviation: standard deviation of the kernel [samples].
+        rate_hz: sampling rate of the input.
+    """
+
+    deviation: float
+    rate_hz: float
+
+    @property
+    def reach(self) -> int:
+        """Half the length of the kernel [samples]."""
+        return math.ceil(KERNEL_REACH * self.deviation)
+
+    @property
+    def step(self) -> int:
+        """Every how many samples one is kept."""
+        return max(math.floor(self.deviation / SHORTEST_KERNEL), 1)
+
+    def __call__(self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0) -> NDArray[Any]:
+        """A derivative of the low-passed samples, from ``margin`` (at least the reach) to as many before the end.
+
+        Args:
+            samples: (T,), real or complex.
+            order: of the derivative.
+            margin: samples left out at either end.
+            step: another step than the own one.
+        """
+        if np.iscomplexobj(samples):  # faster than a real kernel on complex samples
+            ahead, aside = (self(part, order, margin=margin, step=step) for part in (samples.real, samples.imag))
+            return ahead + 1j * aside
+        step = step or self.step
+        inside = samples[margin - self.reach : len(samples) - margin + self.reach]
+        padding = -2 * self.reach % step  # the first sample whose kernel is whole is to be the first of a step
+        smooth = signal.upfirdn(self._kernel(order), np.concatenate([np.zeros(padding), inside]), down=step)
+        first, count = (padding + 2 * self.reach) // step, -(-(len(samples) - 2 * margin) // step)
+        return smooth[first : first + count]
+
+    def noise_gain(self, order: int) -> float:
+        """Standard deviation of the derivative of low-passed white noise of standard deviation 1."""
+        return float(np.linalg.norm(self._kernel(order)))
+
+    def _kernel(self, order: int) -> FloatArray:
+        impulse = np.zeros(2 * self.reach + 1)
+        impulse[self.reach] = 1.0
+        kernel = gaussian_filter1d(impulse, self.deviation, order=order, mode="constant", truncate=KERNEL_REACH)
+        return np.asarray(kernel * self.rate_hz**order, dtype=np.float64)
+
+
+def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
+    """The filter whose response is -3 dB at a frequency.
+
+    Raises:
+        ConfigurationError: its kernel would be too narrow to be sampled, or longer than the limit.
+    """
+    length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
+    what = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
+    check_limit("filter_samples", length, what, ConfigurationError)
+    limit = LARGEST_CUTOFF * recording.rate_hz
+    if cutoff_hz > limit:
+        raise ConfigurationError(
+            f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for {recording.rate_hz:g} Hz; "
+            f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
+        )
+    return Smoothing(_deviation(cutoff_hz, recording.rate_hz), recording.rate_hz)
+
+
+def require_complete(recording: Recording, names: Sequence[str], asked: str) -> None:
+    """See that channels are there without gaps.
+
+    Raises:
+        DataError: one is not.
+    """
+    for name in names:
+        if np.isnan(recording[name]).any():
+            raise DataError(
+                f"recording '{recording.id}': channel '{name}' has gaps; {asked} cannot be estimated across them, cut a range without out"
+            )
+
+
+def _deviation(cutoff_hz: float, rate_hz: float) -> float:
+    return math.sqrt(math.log(2.0)) / (2.0 * math.pi * cutoff_hz) * rate_hz
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as in a sentence."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def rms(samples: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(samples))))

@@ -1,0 +1,11 @@
+"""What every room shares: standard gravity as vehicle dynamics rounds it, and the type of arrays of numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+GRAVITY = 9.81  # m/s²
+
+FloatArray = NDArray[np.float64]
+"""Array of double precision, of any shape."""

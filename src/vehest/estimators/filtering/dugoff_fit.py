@@ -1,0 +1,111 @@
+"""Identification of Dugoff's tyres on measured drives, skidpads above all, by a genetic algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import optimize
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.estimators.filtering.tyre_fit import axle_motion
+from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres, dugoff_force
+
+DUGOFF_PARAMETERS = ("cornering_stiffness", "friction", "reduction")
+BOUNDS = ((2.0, 60.0), (0.3, 2.0), (0.0, 0.05))
+"""Cornering stiffness over the axle's load at rest [1/rad], friction [1], reduction [s/m]."""
+MOST_SAMPLES = 1500  # evenly thinned to
+POPULATION = 15  # a parameter
+
+
+@dataclass(frozen=True, eq=False)
+class DugoffFit:
+    """Tyres of both axles.
+
+    Args:
+        front: of the front axle.
+        rear: of the rear axle.
+        spread: half of the range of each parameter over restarts, in the order of `DUGOFF_PARAMETERS`, (2, 3).
+        residual_rms: of the front and of the rear force, (2,) [N].
+        force_rms: of the forces themselves, (2,) [N].
+    """
+
+    front: DugoffAxle
+    rear: DugoffAxle
+    spread: FloatArray
+    residual_rms: FloatArray
+    force_rms: FloatArray
+
+
+def fit_dugoff(
+    recordings: Sequence[Recording],
+    car: LoadedCar,
+    tyres: Tyres,
+    *,
+    minimum_speed: float = 3.0,
+    measured_forces: bool = True,
+    seed: int = 0,
+    restarts: int = 3,
+    generations: int = 150,
+) -> DugoffFit:
+    """The three parameters of each axle with the smallest squared error of force over slip angle.
+
+    Args:
+        recordings: as `axle_motion` takes them, with ``ax``; forces across the body are turned into the front wheels' axes.
+        car: mass, inertia, places of the axles, height of the centre of gravity.
+        tyres: ``plain`` or ``smooth``.
+        minimum_speed: slower samples are left out [m/s].
+        measured_forces: take forces from the channels ``fy_*``, instead of from accelerations.
+        seed: of the first restart; the others follow it.
+        restarts: searches, of which the best counts.
+        generations: of each, at most.
+
+    Raises:
+        DataError: a channel is missing, ``ax`` has gaps, or hardly any samples are left.
+
+    Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal of Global Optimization 11, 1997.
+    """
+    for recording in recordings:
+        if np.isnan(recording["ax"]).any():
+            raise DataError(f"recording '{recording.id}': channel 'ax' has gaps, without which the axles' loads are not known")
+    motion = axle_motion(recordings, car, minimum_speed, measured_forces=measured_forces)
+    thin = max(1, -(-motion.slip.shape[1] // MOST_SAMPLES))
+    vx, steer, ax = (torch.as_tensor(row) for row in motion.driven[:, ::thin])
+    forces = motion.force[:, ::thin] / np.stack([np.cos(steer.numpy()), np.ones(len(steer))])
+    loads, at_rest = car.loads(ax), car.loads(torch.zeros(()))
+    found = []
+    for axle in (0, 1):
+        tangent = torch.as_tensor(np.tan(motion.slip[axle, ::thin]))
+        scale = np.array([float(at_rest[axle]), 1.0, 1.0])
+        rms = float(np.sqrt(np.mean(forces[axle] ** 2)))
+        force = torch.as_tensor(forces[axle])
+
+        def cost(candidates: FloatArray, tangent=tangent, force=force, load=loads[axle], scale=scale, rms=rms):  # type: ignore[no-untyped-def]
+            stiffness, friction, reduction = torch.as_tensor(candidates * scale[:, None])[:, :, None]
+            error = dugoff_force(tangent, load, vx, stiffness, friction, reduction, tyres) - force
+            return error.square().mean(-1).sqrt().numpy() / rms
+
+        searches = [
+            optimize.differential_evolution(
+                cost,
+                BOUNDS,
+                maxiter=generations,
+                popsize=POPULATION,
+                tol=1e-5,
+                rng=seed + number,
+                vectorized=True,
+                updating="deferred",
+                polish=False,
+            )
+            for number in range(restarts)
+        ]
+        parameters = np.array([search.x * scale for search in searches])
+        best = min(searches, key=lambda search: float(search.fun))
+        found.append((best.x * scale, 0.5 * np.ptp(parameters, axis=0), float(best.fun) * rms, rms))
+    front, rear = (DugoffAxle(*values.tolist()) for values, *_ in found)
+    spread, residual, size = (np.array([entry[part] for entry in found]) for part in (1, 2, 3))
+    return DugoffFit(front, rear, spread, residual, size)

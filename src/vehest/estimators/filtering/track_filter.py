@@ -1,0 +1,171 @@
+"""The unscented filter of a single track on Dugoff's tyres, over batches of drives; differentiable in measurements and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vehest.constants import FloatArray
+from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
+from vehest.estimators.kernels.threads import over_members
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.nonlinear import NonlinearFiltered
+from vehest.filters.sigma_points import symmetric_rule
+from vehest.filters.unscented_scan import PointModel, TorchModel, UnscentedStepper, unscented_scan
+from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
+
+UNKNOWN = (0.5, 0.2)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
+ROLLING = np.diag(np.square(UNKNOWN))
+KNOWN = 1e-6  # the same of a state that is handed over
+KAPPA = 1.0  # n + κ = 3
+
+
+class TrackFilter:
+    """States v and r; measured are those of `TRACK_MEASUREMENTS` that the track sees; inputs are forward speed, steering angle and ax.
+
+    Where the car is slower than the track's minimum speed, nothing counts as measured, and the state is that of rolling wheels, with the
+    deviations `UNKNOWN`.
+
+    Args:
+        track: the model.
+        compiled: whether sigma points move through compiled code, or through the torch it must equal.
+    """
+
+    def __init__(self, track: DugoffTrack, *, compiled: bool = True) -> None:
+        self.track, self.compiled = track, compiled
+        self.rule = symmetric_rule(len(TRACK_STATES), KAPPA)
+        self._models: dict[torch.dtype, PointModel] = {}
+
+    def filtered(
+        self,
+        measurements: Tensor,
+        inputs: Tensor,
+        process_noise: Tensor,
+        observation_noise: Tensor,
+        initial: Gaussian[Tensor] | None = None,
+    ) -> NonlinearFiltered:
+        """Filter sequences of one length; means and covariances are differentiable in measurements and noise.
+
+        Args:
+            measurements: (B, T, 4), or (B, T, 5) with a sideslip angle [rad]; NaN where nothing was measured.
+            inputs: (B, T, 3), finite.
+            process_noise: covariance of each sample's step, (B, T, 2, 2) or what broadcasts to it.
+            observation_noise: (B, T, m, m) or what broadcasts to it.
+            initial: state before the first measurement, mean (2,) or (B, 2); none: `start` of every sequence.
+
+        Raises:
+            ValueError: shapes do not fit each other.
+        """
+        slow = (inputs[..., 0] < self.track.minimum_speed)[..., None]
+        if bool(slow.any()):
+            rolling = torch.as_tensor(ROLLING, dtype=inputs.dtype)
+            measurements = torch.where(slow, torch.nan, measurements)
+            process_noise = torch.where(slow[..., None], rolling, process_noise)
+        return unscented_scan(
+            self.model(measurements.dtype),
+            measurements,
+            inputs,
+            self.start(inputs[:, 0]) if initial is None else initial,
+            process_noise,
+            observation_noise,
+            self.rule,
+            share=partial(over_members, pieces=1),
+        )
+
+    def start(self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None) -> Gaussian[Tensor]:
+        """State before the first measurement: straight ahead and unknown, rolling where the car is slow, or what is handed over.
+
+        Args:
+            inputs: at the first sample, (B, 3).
+            states: a mapping a sequence of `TRACK_STATES` that are known.
+        """
+        slow = (inputs[:, :1] < self.track.minimum_speed).to(inputs.dtype)
+        mean = slow * self.track.rolling(inputs)
+        deviation = torch.tensor(UNKNOWN, dtype=inputs.dtype).repeat(len(inputs), 1)
+        for row, given in enumerate(states or ()):
+            for column, name in enumerate(TRACK_STATES):
+                if given and name in given:
+                    mean[row, column], deviation[row, column] = given[name], KNOWN
+        return Gaussian(mean, torch.diag_embed(deviation.square()))
+
+    def model(self, dtype: torch.dtype) -> PointModel:
+        """The track as the scan takes it."""
+        if dtype not in self._models:
+            track = self.track
+            self._models[dtype] = CompiledDugoffTrack(track, dtype) if self.compiled else TorchModel(track.transition, track.observation)
+        return self._models[dtype]
+
+
+class TrackStepper:
+    """The same filter of one sequence, one sample at a time, in float64.
+
+    Args:
+        own: the filter.
+    """
+
+    def __init__(self, own: TrackFilter) -> None:
+        self._own, self._model = own, own.model(torch.float64)
+        self._filter: UnscentedStepper | None = None
+        self._rolled = False
+
+    def step(self, measurement: FloatArray, inputs: FloatArray, process_noise: FloatArray, observation_noise: FloatArray) -> FloatArray:
+        """The state at a sample, (2,), valid until the next one.
+
+        Args:
+            measurement: (m,); what is NaN was not measured.
+            inputs: (3,), finite.
+            process_noise: covariance of the step that led here, (2, 2).
+            observation_noise: (m, m).
+        """
+        slow = bool(inputs[0] < self._own.track.minimum_speed)
+        if self._filter is None:
+            mean, covariance = (part[0].numpy() for part in self._own.start(torch.as_tensor(inputs)[None]))
+            self._filter = UnscentedStepper(self._model, mean, covariance, len(measurement), self._own.rule)
+        seen = np.full_like(measurement, np.nan) if slow else measurement
+        noise, self._rolled = ROLLING if self._rolled else process_noise, slow
+        return self._filter.step(seen, inputs, noise[None], observation_noise[None])
+
+
+def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:
+    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``.
+
+    Args:
+        ay: lateral acceleration, (T,) [m/s²]; what is NaN changes nothing.
+        enter: [m/s²].
+        leave: [m/s²], less than ``enter``.
+        before: what it was before the first sample.
+
+    Source: Bertipaglia et al. 2024, Section IV-C, which gives no thresholds.
+    """
+    size = np.abs(ay)
+    change = np.where(size >= enter, 1, np.where(size <= leave, -1, 0))
+    last = np.maximum.accumulate(np.where(change != 0, np.arange(len(ay)), -1))
+    return np.where(last < 0, before, change[last] > 0)
+
+
+def groups_of(lengths: Sequence[int], most: int) -> Iterator[list[int]]:
+    """Rows of similar length, so many that together, padded to the longest, they hold at most so many samples; one at least."""
+    rows: list[int] = []
+    for row in sorted(range(len(lengths)), key=lambda own: -lengths[own]):
+        if rows and (len(rows) + 1) * lengths[rows[0]] > most:
+            yield rows
+            rows = []
+        rows.append(row)
+    if rows:
+        yield rows
+
+
+def padded(arrays: Sequence[FloatArray], fill: float | None) -> FloatArray:
+    """Arrays (T, n) of different lengths as one, (B, max T, n), filled up with a value, or with their last row (none)."""
+    longest = max(len(array) for array in arrays)
+    return np.stack(
+        [
+            np.concatenate([array, np.repeat(array[-1:] if fill is None else np.full_like(array[-1:], fill), longest - len(array), axis=0)])
+            for array in arrays
+        ]
+    )

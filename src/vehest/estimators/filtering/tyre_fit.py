@@ -1,0 +1,266 @@
+"""Fit of axle curves, force over slip angle, to drives whose sideslip angle was measured.
+
+A recording holds no tyre forces. Those of the axles follow from what the car as a whole does, small steering angles taken for granted
+(Di Biase, Lenzo & Timpone 2020, Eqs. 1, 2, 5, 6):
+
+    F_F + F_R = m a_y,   a_F F_F - a_R F_R = J dr/dt,   α_F = δ - (β + a_F r/u),   α_R = -(β - a_R r/u)
+
+The paper has its forces from another tool, TRICK, which also knows the vertical ones; here an axle carries what it carries at rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, signal
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.vehicle.dugoff import LoadedCar
+from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.rational_tyres import rational_axle
+
+Kind = Literal["linear", "rational"]
+
+PARAMETERS: dict[str, tuple[str, ...]] = {"linear": ("cornering_stiffness",), "rational": ("c1", "c2")}
+"""Names of an axle's parameters, by the kind of its curve: [N/rad]; [rad²], [N/rad]."""
+
+BOUNDS = {"cornering_stiffness": (1e2, 1e8), "c1": (1e-5, 1.0), "c2": (1e2, 1e8)}
+PEAK_SLIP = math.radians(9.0)  # where road tyres make their largest force: two in three between 6 and 13 degrees, assumed
+PEAK_SPREAD = 0.4  # standard deviation of its logarithm
+KNOWN_C1 = (math.log(0.5 * PEAK_SLIP**2), 2.0 * PEAK_SPREAD)  # mean and standard deviation of ln c₁; the peak lies at √(2c₁)
+LEAST_SPREAD = 1e-6  # of the forces, where a curve fits without any residual
+PASSES = 3  # of weighing what is known against what the drives leave unexplained
+SMOOTHING_SECONDS = 0.5  # of the polynomial that forces and slips are smoothed by
+SMOOTHING_ORDER = 2
+BLOCK_SECONDS = 10.0  # residuals further apart than this count as independent
+FEWEST_SAMPLES = 100
+NORMAL_95 = 1.959964
+
+
+class AxleMotion(NamedTuple):
+    """What the axles do along drives; slips and forces have a row an axle, front and rear.
+
+    Attributes:
+        slip: slip angles, positive where they make a force to the left, (2, N) [rad].
+        force: lateral forces, (2, N) [N].
+        block: number of the stretch of time a sample belongs to, (N,).
+        driven: forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN where none was measured.
+    """
+
+    slip: FloatArray
+    force: FloatArray
+    block: NDArray[np.int64]
+    driven: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class TyreFit:
+    """Curves of both axles.
+
+    Args:
+        kind: ``linear`` or ``rational``.
+        front: parameters of the front axle in the order of `PARAMETERS`, (P,).
+        rear: those of the rear axle.
+        covariance: of the front and of the rear parameters, (2, P, P).
+        residual_rms: of the front and of the rear force, (2,) [N].
+        slip: slip angles that were fitted to, (2, N) [rad].
+        force: forces that were fitted to, (2, N) [N].
+    """
+
+    kind: Kind
+    front: FloatArray
+    rear: FloatArray
+    covariance: FloatArray
+    residual_rms: FloatArray
+    slip: FloatArray
+    force: FloatArray
+
+    @property
+    def interval(self) -> FloatArray:
+        """Half of the 95 % confidence interval of each parameter, (2, P)."""
+        return NORMAL_95 * np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def curve(self, axle: Literal["front", "rear"], slip: FloatArray) -> FloatArray:
+        """Force of an axle [N] at slip angles [rad]; same shape."""
+        return axle_force(self.kind, getattr(self, axle), slip)
+
+
+def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArray:
+    """Lateral force of an axle: C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
+
+    Args:
+        kind: ``linear`` or ``rational``.
+        parameters: in the order of `PARAMETERS`, (P,).
+        slip: slip angles (...) [rad].
+
+    Returns:
+        Forces (...) [N].
+    """
+    c1, c2 = (math.inf, parameters[0]) if kind == "linear" else parameters
+    force: FloatArray = rational_axle(slip, c1, c2, 1.0).force
+    return force
+
+
+def axle_motion(
+    recordings: Sequence[Recording],
+    parameters: SingleTrackParameters | LoadedCar,
+    minimum_speed: float = 3.0,
+    *,
+    measured_forces: bool = False,
+) -> AxleMotion:
+    """Slip angles and forces of the axles along drives.
+
+    Yaw acceleration is the slope of a second-order polynomial through half a second of the yaw rate (Savitzky and Golay); whatever else
+    enters is smoothed by the same polynomial, so that slips and forces belong together. Future samples are used.
+
+    Args:
+        recordings: with ``yaw_rate``, ``vx``, ``ay``, ``steer`` and ``sideslip_ref``, or ``vy_ref`` in its place.
+        parameters: mass, inertia and the places of the axles; cornering stiffnesses are not used.
+        minimum_speed: slower samples are left out [m/s].
+        measured_forces: take forces from the channels ``fy_fl`` to ``fy_rr``, which simulated cars have, instead of from accelerations.
+
+    Raises:
+        DataError: a channel is missing, or hardly any samples are left.
+    """
+    slips, forces, blocks, driven = [], [], [], []
+    first_block = 0
+    for recording in recordings:
+        length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
+        if length <= SMOOTHING_ORDER:
+            raise DataError(f"recording '{recording.id}': {recording.rate_hz:g} Hz are too few for a yaw acceleration; take 4 Hz or more")
+        if len(recording) < length:
+            continue
+        slip, force, inputs = _motion_of(recording, parameters, minimum_speed, length, measured_forces=measured_forces)
+        block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
+        first_block = int(block[-1]) + 1
+        usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
+        slips.append(slip[:, usable])
+        forces.append(force[:, usable])
+        blocks.append(block[usable])
+        driven.append(inputs[:, usable])
+    count = sum(slip.shape[1] for slip in slips)
+    if count < FEWEST_SAMPLES:
+        named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
+        raise DataError(
+            f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {FEWEST_SAMPLES} are needed "
+            f"(recordings: {named})"
+        )
+    return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks), np.concatenate(driven, axis=1))
+
+
+def _motion_of(
+    recording: Recording, parameters: SingleTrackParameters | LoadedCar, minimum_speed: float, length: int, *, measured_forces: bool
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slips and forces of one drive, (2, T) each, and what it was driven with, (3, T)."""
+    front, rear, mass, inertia = (
+        float(value) for value in (parameters.cg_to_front_axle, parameters.cg_to_rear_axle, parameters.mass, parameters.yaw_inertia)
+    )
+
+    def smoothed(samples: FloatArray, derivative: int = 0) -> FloatArray:
+        step = 1.0 / recording.rate_hz
+        fitted = signal.savgol_filter(samples, length, SMOOTHING_ORDER, deriv=derivative, delta=step, mode="constant", cval=np.nan)
+        return np.asarray(fitted, dtype=np.float64)  # nothing at the ends and around gaps
+
+    u = np.maximum(recording["vx"], minimum_speed)
+    sideslip = recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], u)
+    turn = recording["yaw_rate"] / u
+    slip = np.stack([smoothed(recording["steer"] - sideslip - front * turn), smoothed(rear * turn - sideslip)])
+    ax = smoothed(recording["ax"]) if "ax" in recording else np.full(len(u), np.nan)
+    driven = np.stack([smoothed(u), smoothed(recording["steer"]), ax])
+    if measured_forces:
+        wheels = [recording[f"fy_{wheel}"] for wheel in ("fl", "fr", "rl", "rr")]
+        return slip, np.stack([smoothed(wheels[0] + wheels[1]), smoothed(wheels[2] + wheels[3])]), driven
+    total, moment = mass * smoothed(recording["ay"]), inertia * smoothed(recording["yaw_rate"], derivative=1)
+    return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear), driven
+
+
+def fit_tyres(
+    recordings: Sequence[Recording],
+    parameters: SingleTrackParameters,
+    kind: Kind = "rational",
+    *,
+    minimum_speed: float = 3.0,
+    measured_forces: bool = False,
+) -> TyreFit:
+    """Least squares of both axle curves on measured drives.
+
+    Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well as `PEAK_SLIP` says of road tyres, a
+    block of 10 s counting as one sample against it.
+
+    The covariance is that of least squares whose residuals hang together within blocks of 10 s and may differ in size (a sandwich of
+    blocks): residuals of neighbouring samples are hardly independent, and to count them so would make intervals far too narrow.
+
+    Args:
+        recordings: as `axle_motion` takes them.
+        parameters: mass, inertia and the places of the axles.
+        kind: ``linear`` or ``rational``.
+        minimum_speed: slower samples are left out [m/s].
+        measured_forces: as in `axle_motion`.
+
+    Raises:
+        ConfigurationError: no such kind.
+        DataError: a channel is missing, or hardly any samples are left.
+
+    Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
+    """
+    return fit_motion(axle_motion(recordings, parameters, minimum_speed, measured_forces=measured_forces), kind)
+
+
+def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
+    """The same of slips and forces that are at hand already.
+
+    Args:
+        motion: of both axles.
+        kind: ``linear`` or ``rational``.
+
+    Raises:
+        ConfigurationError: no such kind.
+        DataError: forces run against slips.
+    """
+    if kind not in PARAMETERS:
+        raise ConfigurationError(f"a tyre curve of kind '{kind}' is not one of: {', '.join(PARAMETERS)}")
+    axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
+    (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
+    covariance = np.stack([front_covariance, rear_covariance])
+    return TyreFit(kind, front, rear, covariance, np.array([front_rms, rear_rms]), motion.slip, motion.force)
+
+
+def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, float]:
+    """Parameters of one axle, their covariance and the rms of what is left; logarithms are fitted, so that all stay positive."""
+    names = PARAMETERS[kind]
+    low, high = (np.log([BOUNDS[name][side] for name in names]) for side in (0, 1))
+    stiffness = float(slip @ force) / float(slip @ slip)
+    scale = math.sqrt(float(np.mean(force**2)))
+    if not stiffness > 0.0:
+        raise DataError(
+            f"tyre curves: forces run against slip angles (slope {stiffness:.3g} N/rad); check the signs of steer, ay and vy_ref"
+        )
+    guess = {"cornering_stiffness": stiffness, "c1": math.exp(KNOWN_C1[0]), "c2": 1.2 * stiffness}
+    logarithms = np.clip(np.log([guess[name] for name in names]), low, high)
+    _, member = np.unique(block, return_inverse=True)
+    blocks = int(member.max()) + 1
+    spread = math.sqrt(float(np.mean((force - stiffness * slip) ** 2)))
+
+    def misfit(at: FloatArray, weight: float) -> FloatArray:
+        left = weight * (axle_force(kind, np.exp(at), slip) - force)
+        return np.append(left, (at[names.index("c1")] - KNOWN_C1[0]) / KNOWN_C1[1]) if "c1" in names else left
+
+    for _ in range(PASSES):
+        weight = math.sqrt(blocks / len(slip)) / max(spread, LEAST_SPREAD * scale)
+        found = optimize.least_squares(misfit, logarithms, bounds=(low, high), xtol=1e-12, ftol=1e-12, args=(weight,))
+        logarithms, spread = found.x, math.sqrt(float(np.mean(found.fun[: len(slip)] ** 2))) / weight
+    of_data, of_knowledge = found.jac[: len(slip)], found.jac[len(slip) :]
+    scores = of_data * found.fun[: len(slip), None]
+    sums = np.stack([np.bincount(member, weights=column) for column in scores.T], axis=1)
+    curvature = np.linalg.pinv(found.jac.T @ found.jac)
+    spread_of_scores = sums.T @ sums * blocks / max(blocks - 1, 1) + of_knowledge.T @ of_knowledge
+    covariance = curvature @ spread_of_scores @ curvature
+    parameters = np.exp(logarithms)
+    return parameters, covariance * np.outer(parameters, parameters), spread

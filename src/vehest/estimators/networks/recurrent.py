@@ -1,0 +1,115 @@
+"""What the GRU and LSTM benchmarks share: gates with one bias each and a linear read-out."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator, WindowedSettings
+
+
+@dataclass(frozen=True)
+class RecurrentSettings(WindowedSettings):
+    """Settings of a recurrent benchmark.
+
+    Args:
+        n_states: size of the hidden state.
+    """
+
+    n_states: int = 5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.n_states < 1:
+            raise ConfigurationError(f"estimator.n_states must be at least 1, not {self.n_states}")
+
+
+class RecurrentNetwork(StandardisedNetwork):
+    """One recurrent layer, one bias a gate, and a linear read-out of the last hidden state.
+
+    Args:
+        settings: sizes.
+        n_gates: gates of the cell.
+        n_channels: measured channels.
+
+    Shapes:
+        prepared windows: (..., N, C), standardised.
+        returns: (...) lateral velocity [m/s] one step after the window.
+    """
+
+    def __init__(self, settings: RecurrentSettings, n_gates: int, n_channels: int) -> None:
+        super().__init__(n_channels)
+        states = settings.n_states
+        self.settings = settings
+        self.input_weight = nn.Parameter(torch.empty(n_gates, states, n_channels))
+        self.state_weight = nn.Parameter(torch.empty(n_gates, states, states))
+        self.gate_bias = nn.Parameter(torch.empty(n_gates, states))
+        self.output_weight = nn.Parameter(torch.empty(states))
+        self.output_bias = nn.Parameter(torch.empty(()))
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw initial weights: Glorot uniform, biases zero."""
+        with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                if name.endswith("bias"):
+                    parameter.zero_()
+                    continue
+                fan_out, fan_in = parameter.shape[-2:] if parameter.dim() > 1 else (1, parameter.shape[0])
+                limit = (6.0 / (fan_in + fan_out)) ** 0.5
+                draw = torch.rand(parameter.shape, generator=generator, dtype=torch.float64)
+                parameter.copy_((2.0 * draw - 1.0) * limit)
+
+    @abstractmethod
+    def last_state(self, prepared_windows: Tensor) -> Tensor:
+        """Hidden state after the window, (..., N, C) -> (..., H)."""
+
+    def forward(self, prepared_windows: Tensor) -> Tensor:
+        """Lateral velocity from the hidden state after the window."""
+        return self._read_out(self.last_state(prepared_windows), self.output_weight, self.output_bias)
+
+    def _read_out(self, state: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        return ((state * weight).sum(-1) + bias) * self.output_scale + self.output_mean
+
+    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+        """The same for M members by the compiled recursion, (M, B)."""
+        state = self._kernel()(
+            parameters["input_weight"],
+            parameters["state_weight"],
+            parameters["gate_bias"],
+            prepared,
+            starts,
+            self.settings.window,
+        )
+        return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
+
+    @abstractmethod
+    def _kernel(self) -> Any:
+        """The compiled recursion, ``last_state`` of its module in estimators/kernels."""
+
+
+class RecurrentEstimator(WindowedEstimator):
+    """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
+
+    settings_type = RecurrentSettings
+    settings: RecurrentSettings
+    network_type: ClassVar[type[RecurrentNetwork]]
+
+    @property
+    def variant(self) -> str:
+        """Name of the structure."""
+        return f"states_{self.settings.n_states}"
+
+    @property
+    def full_title(self) -> str:
+        """With the number of states."""
+        return f"{self.title}, {self.settings.n_states} states"
+
+    def empty_network(self) -> RecurrentNetwork:
+        """A network to load weights into."""
+        return self.network_type(self.settings)  # type: ignore[call-arg, arg-type]

@@ -1,0 +1,216 @@
+"""What networks share that map the measurements of one instant to a sideslip angle: inputs, the network, its samples, its weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import EstimatorSettings
+from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of
+from vehest.estimators.references import reference_sideslip
+from vehest.training.samples import Draw, Samples
+
+CORNERS = ("fl", "fr", "rl", "rr")
+IMU = ("ax", "ay", "vx", "steer", "yaw_rate")
+INPUTS: dict[str, tuple[str, ...]] = {"full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)), "imu": IMU}
+"""Sets of inputs: with tyre forces (Bertipaglia et al. 2024, Section III-A, 17 of them), and without."""
+
+CHUNK = 50_000  # samples that are estimated at a time
+STEEPEST = 1.5  # rad, beyond which no sideslip angle of a network is believed
+
+
+@dataclass(frozen=True)
+class SampleNetworkSettings(EstimatorSettings):
+    """Settings of a network over single samples.
+
+    Args:
+        inputs: ``full``, with the forces of all tyres, or ``imu``, without.
+        hidden: widths of the two hidden layers.
+        dropout: share of hidden values that are hidden in training.
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+
+    inputs: Literal["full", "imu"] = "full"
+    hidden: tuple[int, int] = (250, 125)
+    dropout: float = 0.2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.inputs not in INPUTS:
+            raise ConfigurationError(f"estimator.inputs '{self.inputs}' is not one of: {', '.join(INPUTS)}")
+        object.__setattr__(self, "hidden", checked_layers(self.hidden, self.dropout))
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Measured channels that the network sees."""
+        return INPUTS[self.inputs]
+
+
+def checked_layers(hidden: Sequence[int], dropout: float) -> tuple[int, int]:
+    """Widths of two hidden layers as a tuple.
+
+    Raises:
+        ConfigurationError: they are no such widths, or the dropout is no share.
+    """
+    widths = tuple(hidden) if isinstance(hidden, Sequence) and not isinstance(hidden, str) else ()
+    if len(widths) != 2 or not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in widths):
+        raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {hidden!r}")
+    if not 0 <= dropout < 1:
+        raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {dropout}")
+    return widths[0], widths[1]
+
+
+class SampleNetwork(nn.Module):
+    """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1 convolutions over time.
+
+    Inputs are mapped to [0, 1] by their ranges in training, where a constant one becomes 0; targets are divided by their root mean square
+    in training. Both are kept with the weights and are not parameters.
+
+    Args:
+        n_inputs: measured channels C.
+        hidden: widths of the hidden layers.
+        n_outputs: numbers O that a network says of a sample.
+        members: M.
+
+    Source: Bertipaglia et al. 2024, Section III-A.
+    """
+
+    input_low: Tensor
+    input_span: Tensor
+    unit: Tensor
+
+    def __init__(self, n_inputs: int, hidden: tuple[int, int], n_outputs: int, members: int = 1) -> None:
+        super().__init__()
+        self.members = members
+        self.register_buffer("input_low", torch.zeros(n_inputs))
+        self.register_buffer("input_span", torch.ones(n_inputs))
+        self.register_buffer("unit", torch.ones(()))
+        sizes = (n_inputs, *hidden, n_outputs)
+        for layer, (before, after) in enumerate(pairwise(sizes), start=1):
+            self.register_parameter(f"weight_{layer}", nn.Parameter(torch.zeros(members, before, after)))
+            self.register_parameter(f"bias_{layer}", nn.Parameter(torch.zeros(members, after)))
+
+    def reset(self, generators: Sequence[torch.Generator]) -> None:
+        """Draw initial weights of each member: Xavier's uniform ones; biases 0.
+
+        Source: Glorot & Bengio, Understanding the difficulty of training deep feedforward neural networks, 2010.
+        """
+        with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                if name.startswith("bias"):
+                    parameter.zero_()
+                    continue
+                limit = (6.0 / sum(parameter.shape[1:])) ** 0.5
+                for member, generator in enumerate(generators):
+                    draw = torch.rand(parameter.shape[1:], generator=generator, dtype=torch.float64)
+                    parameter[member].copy_((2.0 * draw - 1.0) * limit)
+
+    def scale(self, inputs: FloatArray, sideslip: FloatArray) -> None:
+        """Take ranges of inputs, (N, C), and the unit of targets, (N,) [rad], from training samples."""
+        low, high = inputs.min(axis=0), inputs.max(axis=0)
+        self.input_low.copy_(torch.as_tensor(low))
+        self.input_span.copy_(torch.as_tensor(np.where(high > low, high - low, np.finfo(np.float32).max)))
+        self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
+
+    def scaled(self, inputs: Tensor) -> Tensor:
+        """Inputs as the network takes them, (..., C), of measured ones in SI units; those of training lie in 0 … 1."""
+        return (inputs - self.input_low) / self.input_span
+
+    def samples(self, inputs: FloatArray, sideslip: FloatArray) -> Samples:
+        """Measured inputs (N, C) and sideslip angles (N,) [rad] as the network takes them."""
+        seen, wanted = (torch.as_tensor(values, dtype=self.unit.dtype) for values in (inputs, sideslip))
+        return Samples(self.scaled(seen).contiguous(), wanted / self.unit)
+
+    def forward(self, inputs: Tensor, seeds: Tensor | None = None, dropout: float = 0.0) -> Tensor:
+        """Outputs (M, B, O) of scaled inputs, (M, B, C) or (1, B, C) for all members; see `outputs_of`."""
+        return outputs_of(inputs, list(self.parameters()), seeds, dropout)
+
+    def losses(self, samples: Samples, draw: Draw, dropout: float, criterion: Criterion) -> Tensor:
+        """Losses of a batch, (M,); see `losses_of`."""
+        return losses_of(*samples, draw.rows, list(self.parameters()), draw.seeds, dropout, criterion)
+
+    def said(self, inputs: FloatArray) -> NDArray[Any]:
+        """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's own units."""
+        pieces = []
+        with torch.no_grad():
+            for first in range(0, len(inputs), CHUNK):
+                piece = torch.as_tensor(inputs[first : first + CHUNK], dtype=self.unit.dtype)
+                pieces.append(self(self.scaled(piece).unsqueeze(0)).double().numpy())
+        return np.concatenate(pieces, axis=1)
+
+    def judged(self, samples: Samples, criterion: Criterion) -> Tensor:
+        """Losses on samples without dropout, (M,)."""
+        total = np.zeros(self.members)
+        with torch.no_grad():
+            for first in range(0, len(samples.targets), CHUNK):
+                inputs, targets = (part[first : first + CHUNK] for part in samples)
+                outputs = self(inputs.unsqueeze(0)).numpy()
+                unused = np.empty_like(outputs[0])
+                total += [len(targets) * criterion(own, targets.numpy(), unused) for own in outputs]
+        return torch.from_numpy(total / len(samples.targets))
+
+
+def learnt_samples(
+    recordings: Sequence[Recording], channels: Sequence[str], estimator: str, minimum_speed: float = -np.inf
+) -> tuple[FloatArray, FloatArray]:
+    """Inputs (N, C) and reference sideslip angles, atan2(vy_ref, vx) with the measured vx, (N,) [rad], recordings one after another.
+
+    Samples slower than ``minimum_speed`` [m/s] are left out.
+
+    Raises:
+        DataError: a channel is missing or has gaps, or all samples are too slow.
+    """
+    for recording in recordings:
+        for name in (*channels, "vy_ref"):
+            if name not in recording:
+                raise DataError(
+                    f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{_hint(name)}"
+                )
+            if np.isnan(recording[name]).any():
+                raise DataError(
+                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; "
+                    f"cut them out in conf/split"
+                )
+    fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
+    if not fast.any():
+        raise DataError(f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s")
+    inputs = np.concatenate([recording.stack(channels) for recording in recordings])
+    return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
+
+
+def believed(sideslip: FloatArray) -> FloatArray:
+    """Sideslip angles within `STEEPEST`, since the lateral velocity is vx tan β."""
+    return np.clip(sideslip, -STEEPEST, STEEPEST)
+
+
+def network_with_weights(network: SampleNetwork, weights: Mapping[str, NDArray[Any]], estimator: str) -> SampleNetwork:
+    """The network with weights put in, in the precision they were trained in.
+
+    Raises:
+        DataError: a name or shape does not fit.
+    """
+    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    found = {name: tuple(np.shape(values)) for name, values in weights.items()}
+    if expected != found:
+        differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
+        raise DataError(f"weights of '{estimator}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
+    tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
+    network = network.to(tensors["unit"].dtype)
+    network.load_state_dict(tensors)
+    return network
+
+
+def _hint(name: str) -> str:
+    return "; set estimator.inputs=imu for cars without measured tyre forces" if name.startswith("f") else ""

@@ -1,0 +1,438 @@
+"""What recurrent networks share that estimate a car's velocities from all samples so far: training, estimating, running online."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from vehest.constants import FloatArray
+from vehest.data.channels import channel
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
+from vehest.training.context import FitContext
+from vehest.training.sequences import Phase, PhaseRecord, PhaseSettings, train_phases
+
+REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
+CHUNK = 10_000  # samples that are estimated at a time
+
+State = tuple[Tensor, ...]
+
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024, Section IV).
+
+    Args:
+        phase: the one phase of the training.
+        sequence_steps: samples in a training sequence, the dropped ones included.
+        validation_steps: samples in a validation sequence, the dropped ones included.
+        dropped_steps: first samples of every sequence, on which the hidden state settles; no loss is taken of them.
+        batch_size: sequences in a batch.
+        weight_vx: of the squared error of vx in the loss; likewise the others.
+        weight_vy: of vy.
+        weight_yaw_rate: of the yaw rate.
+        dtype: ``float32`` or ``float64``.
+        checkpoint_seconds: time between two checkpoints [s].
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+
+    phase: PhaseSettings = PhaseSettings()  # noqa: RUF009
+    sequence_steps: int = 300
+    validation_steps: int = 1000
+    dropped_steps: int = 200
+    batch_size: int = 4
+    weight_vx: float = 0.2225
+    weight_vy: float = 0.5064
+    weight_yaw_rate: float = 0.1566
+    dtype: Literal["float32", "float64"] = "float32"
+    checkpoint_seconds: float = 15.0
+
+    def __post_init__(self) -> None:
+        if self.batch_size < 1:
+            raise ConfigurationError(f"training.batch_size must be at least 1, not {self.batch_size}")
+        if self.dropped_steps < 0:
+            raise ConfigurationError(f"training.dropped_steps must not be negative, not {self.dropped_steps}")
+        for name in ("sequence_steps", "validation_steps"):
+            if getattr(self, name) <= self.dropped_steps:
+                raise ConfigurationError(
+                    f"training.{name} must be more than dropped_steps ({self.dropped_steps}), not {getattr(self, name)}"
+                )
+        for name in ("weight_vx", "weight_vy", "weight_yaw_rate"):
+            if getattr(self, name) < 0:
+                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        if self.dtype not in ("float32", "float64"):
+            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+
+
+@dataclass(frozen=True)
+class VelocityNetworkSettings(EstimatorSettings):
+    """Settings of a recurrent network that sees all samples so far.
+
+    Args:
+        rate_hz: sampling rate [Hz].
+        inputs: measured channels that the network sees.
+        outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates; each is learnt from its ``_ref`` channel.
+        n_states: size of the hidden state.
+        dropout: share of the hidden state that is hidden from the layers after it in training.
+
+    Raises:
+        ConfigurationError: a value that makes no sense.
+    """
+
+    inputs: tuple[str, ...] = ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer")
+    outputs: tuple[str, ...] = ("vx", "vy", "yaw_rate")
+    n_states: int = 64
+    dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("inputs", "outputs"):
+            value = getattr(self, name)
+            if isinstance(value, str) or not all(isinstance(entry, str) for entry in value) or len(set(value)) != len(value):
+                raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {value!r}")
+            object.__setattr__(self, name, tuple(value))
+        if not self.inputs:
+            raise ConfigurationError("estimator.inputs must name at least one channel")
+        for name in self.inputs:
+            try:
+                reference = channel(name).is_reference
+            except DataError as error:
+                raise ConfigurationError(f"estimator.inputs: {error}") from None
+            if reference:
+                raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
+        if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
+            raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
+        if self.n_states < 1:
+            raise ConfigurationError(f"estimator.n_states must be at least 1, not {self.n_states}")
+        if not 0 <= self.dropout < 1:
+            raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {self.dropout}")
+
+
+class VelocityNetwork(nn.Module):
+    """Base of recurrent networks from standardised measurements to standardised velocities.
+
+    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters.
+
+    Args:
+        settings: channels and sizes.
+    """
+
+    input_mean: Tensor
+    input_scale: Tensor
+    output_mean: Tensor
+    output_scale: Tensor
+
+    def __init__(self, settings: VelocityNetworkSettings) -> None:
+        super().__init__()
+        for name, size in (("input", len(settings.inputs)), ("output", len(settings.outputs))):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_scale", torch.ones(size))
+
+    def standardise(self, inputs: FloatArray, outputs: FloatArray) -> None:
+        """Take means and standard deviations from samples, (T, C) and (T, O)."""
+        for mean, scale, samples in ((self.input_mean, self.input_scale, inputs), (self.output_mean, self.output_scale, outputs)):
+            mean.copy_(torch.as_tensor(samples.mean(axis=0)))
+            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)))
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden state for gates; biases alike."""
+        with torch.no_grad():
+            for module in self.modules():
+                n = module.hidden_size if isinstance(module, nn.RNNBase) else module.in_features if isinstance(module, nn.Linear) else 0
+                for parameter in module.parameters(recurse=False):
+                    draw = torch.rand(parameter.shape, generator=generator, dtype=torch.float64)
+                    parameter.copy_((2.0 * draw - 1.0) / math.sqrt(n))
+
+    def forward(self, measured: Tensor, state: State, mask: Tensor | None = None) -> tuple[Tensor, State]:
+        """Estimates at the times of the samples.
+
+        Args:
+            measured: (B, T, C), SI.
+            state: before the first sample, of `start` or of an earlier call.
+            mask: (B, T, H), what the hidden state is multiplied by on its way out; none outside training.
+
+        Returns:
+            Velocities (B, T, O) [m/s, rad/s] and the state after the last sample.
+        """
+        outputs, state = self.advance((measured - self.input_mean) / self.input_scale, state, mask)
+        return outputs * self.output_scale + self.output_mean, state
+
+    @abstractmethod
+    def start(self, velocities: Tensor) -> State:
+        """The state before the first sample.
+
+        Args:
+            velocities: (B, O) at that time [m/s, rad/s], given or measured.
+        """
+
+    @abstractmethod
+    def advance(self, inputs: Tensor, state: State, mask: Tensor | None) -> tuple[Tensor, State]:
+        """`forward` on standardised quantities."""
+
+
+class RecurrentVelocityEstimator(Estimator):
+    """A recurrent network run over all samples of a drive, its hidden state starting from zero.
+
+    The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
+    if it is among ``estimator.inputs``. The loss is that of Węgrzynowski et al. 2024: squared errors, each output with its weight, over
+    sequences without their first samples.
+    """
+
+    channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
+    training_type = SequenceSettings
+    settings_type: ClassVar[type[VelocityNetworkSettings]]
+    settings: VelocityNetworkSettings
+
+    def __init__(self, settings: VelocityNetworkSettings) -> None:
+        super().__init__(settings)
+        self.channels = tuple(dict.fromkeys(("vx", *settings.inputs)))
+        self.network = self._new_network()
+        self._seed = 0
+
+    @abstractmethod
+    def _new_network(self) -> VelocityNetwork:
+        """A network to train or to load weights into."""
+
+    @property
+    def variant(self) -> str:
+        """Name of the structure."""
+        return f"states_{self.settings.n_states}"
+
+    @property
+    def full_title(self) -> str:
+        """With the number of states."""
+        return f"{self.title}, {self.settings.n_states} states"
+
+    @property
+    def n_parameters(self) -> int:
+        """Numbers that training determines; means and deviations of the data do not count."""
+        return sum(parameter.numel() for parameter in self.network.parameters())
+
+    def seed(self, seed: int) -> None:
+        """Seed of the initial weights, of sequences and of dropout."""
+        self._seed = seed
+
+    @classmethod
+    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+        """Train members one after the other."""
+        records = []
+        for index, member in enumerate(members):
+            assert isinstance(member, RecurrentVelocityEstimator)
+            records.append(member._fit(data, training, context, index))
+        return records
+
+    def _fit(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
+        drives = [self._drive(recording) for recording in data.train]
+        network = self._new_network().to(getattr(torch, training.dtype))
+        network.standardise(np.concatenate([drive.inputs for drive in drives]), np.concatenate([drive.targets for drive in drives]))
+        network.reset(torch.Generator().manual_seed(self._seed))
+        self.network = network
+        phase = _phase(network, self.settings, training, drives, [self._drive(recording) for recording in data.validation])
+        (record,) = train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
+        return _fit_record(record)
+
+    def _drive(self, recording: Recording) -> _Drive:
+        references = tuple(REFERENCES[name] for name in self.settings.outputs)
+        for name in (*self.channels, *references):
+            if np.isnan(recording[name]).any():
+                raise DataError(
+                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from; "
+                    f"cut them out in conf/split"
+                )
+        return _Drive(
+            recording.id, recording.stack(self.settings.inputs), recording.stack(references), self._measured_velocities(recording.channels)
+        )
+
+    def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
+        """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read, and 0 for the lateral velocity."""
+        n = len(channels["vx"])
+        columns = [channels[name] if name in self.channels and name != "vy" else np.zeros(n) for name in self.settings.outputs]
+        return np.stack(columns, axis=1)
+
+    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+        inputs = recording.stack(self.settings.inputs)
+        state = self._start(recording.channels, initial_state)
+        pieces = []
+        for first in range(0, len(recording), CHUNK):
+            values, state = self._advance(inputs[first : first + CHUNK], state)
+            pieces.append(values)
+        columns = dict(zip(self.settings.outputs, np.concatenate(pieces).T, strict=True))
+        return self._wrapped(recording, columns.pop("vy"), **columns)
+
+    def _start(self, channels: Mapping[str, FloatArray], initial_state: Mapping[str, float] | None) -> State:
+        given = initial_state or {}
+        first = self._measured_velocities({name: samples[:1] for name, samples in channels.items()})[0]
+        values = [given.get(name, measured) for name, measured in zip(self.settings.outputs, first, strict=True)]
+        with torch.no_grad():
+            return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
+
+    def _advance(self, inputs: FloatArray, state: State) -> tuple[FloatArray, State]:
+        """Estimates (T, O) from measurements (T, C), and the state after them."""
+        with torch.no_grad():
+            outputs, state = self.network(torch.as_tensor(inputs, dtype=self.network.input_mean.dtype).unsqueeze(0), state)
+        return outputs[0].double().numpy(), state
+
+    def online(self) -> RecurrentVelocityStepper:
+        """A stepper that starts from measured velocities at its first sample."""
+        return RecurrentVelocityStepper(self)
+
+    def weights(self) -> dict[str, NDArray[Any]]:
+        """Parameters, means and deviations."""
+        return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
+
+    def load_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
+        """Take parameters, means and deviations back, in the precision they were trained in."""
+        network = self._new_network()
+        expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+        found = {name: tuple(np.shape(values)) for name, values in weights.items()}
+        if expected != found:
+            raise DataError(f"weights of '{self.name}' do not fit its settings: expected {expected}, found {found}")
+        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
+        network = network.to(tensors["input_mean"].dtype)
+        network.load_state_dict(tensors)
+        self.network = network
+
+
+class RecurrentVelocityStepper(Stepper):
+    """Carries the network's state from sample to sample."""
+
+    def __init__(self, estimator: RecurrentVelocityEstimator) -> None:
+        self._estimator = estimator
+        self._state: State | None = None
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Velocities [m/s, rad/s] at the time of the sample."""
+        estimator = self._estimator
+        channels = dict(zip(estimator.channels, required(sample, estimator.channels), strict=True))
+        if self._state is None:
+            self._state = estimator._start({name: np.array([value]) for name, value in channels.items()}, None)
+        inputs = np.array([[channels[name] for name in estimator.settings.inputs]])
+        values, self._state = estimator._advance(inputs, self._state)
+        return dict(zip(estimator.settings.outputs, values[0].tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """What is learnt from a recording: measurements (T, C), references (T, O), measured velocities to start from (T, O)."""
+
+    name: str
+    inputs: FloatArray
+    targets: FloatArray
+    starts: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """Sequences side by side: measurements (B, T, C), references (B, T, O), velocities to start from (B, O), mask of dropout."""
+
+    inputs: Tensor
+    targets: Tensor
+    starts: Tensor
+    mask: Tensor | None = None
+
+
+class _Cutter:
+    """Recordings one after another as tensors, from which sequences are cut by their first samples."""
+
+    def __init__(self, drives: Sequence[_Drive], dtype: torch.dtype) -> None:
+        self.lengths = [len(drive) for drive in drives]
+        self.offsets = np.concatenate([[0], np.cumsum(self.lengths)[:-1]]).tolist()
+        stacked = [np.concatenate([getattr(drive, name) for drive in drives]) for name in ("inputs", "targets", "starts")]
+        self.inputs, self.targets, self.starts = (torch.as_tensor(values, dtype=dtype) for values in stacked)
+
+    def cut(self, firsts: Tensor, steps: int, mask: Tensor | None = None) -> _Batch:
+        """Sequences of ``steps`` samples from the rows ``firsts`` (B,) on."""
+        rows = firsts.unsqueeze(1) + torch.arange(steps)
+        return _Batch(self.inputs[rows], self.targets[rows], self.starts[firsts], mask)
+
+
+def _phase(
+    network: VelocityNetwork,
+    settings: VelocityNetworkSettings,
+    training: SequenceSettings,
+    train: Sequence[_Drive],
+    validation: Sequence[_Drive],
+) -> Phase:
+    """The one phase of a recurrent network."""
+    dtype, steps, dropped = getattr(torch, training.dtype), training.sequence_steps, training.dropped_steps
+    cutter = _Cutter(train, dtype)
+    if max(cutter.lengths) < steps:
+        lengths = ", ".join(f"'{drive.name}' {len(drive)}" for drive in train)
+        raise DataError(f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it")
+    judged = _validation_batches(validation, training, dtype)
+    weights = torch.tensor([getattr(training, f"weight_{name}") for name in settings.outputs], dtype=dtype)
+
+    def errors(batch: _Batch) -> Tensor:
+        outputs, _ = network(batch.inputs, network.start(batch.starts), batch.mask)
+        weighted: Tensor = (outputs - batch.targets)[:, dropped:].square() @ weights
+        return weighted
+
+    def batches(generator: torch.Generator) -> Iterator[_Batch]:
+        firsts = []
+        for length, offset in zip(cutter.lengths, cutter.offsets, strict=True):
+            count = length // steps
+            if count:
+                shift = int(torch.randint(length - count * steps + 1, (), generator=generator))
+                firsts += [offset + shift + number * steps for number in range(count)]
+        order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
+        for chosen in order.split(training.batch_size):
+            mask = None
+            if settings.dropout:
+                kept = torch.rand(len(chosen), steps, settings.n_states, generator=generator) >= settings.dropout
+                mask = kept.to(dtype) / (1.0 - settings.dropout)
+            yield cutter.cut(chosen, steps, mask)
+
+    def validate() -> float:
+        samples = torch.cat([errors(batch).reshape(-1) for batch in judged])
+        return float(samples.double().mean())
+
+    return Phase("sequences", training.phase, network, batches, lambda batch: errors(batch).mean(), validate)
+
+
+def _validation_batches(drives: Sequence[_Drive], training: SequenceSettings, dtype: torch.dtype) -> list[_Batch]:
+    """Sequences without overlap from the start of each recording; of one that is too short, all of it."""
+    cutter = _Cutter(drives, dtype)
+    batches = []
+    for drive, length, offset in zip(drives, cutter.lengths, cutter.offsets, strict=True):
+        steps = min(length, training.validation_steps)
+        if steps <= training.dropped_steps:
+            raise DataError(
+                f"recording '{drive.name}' is {length} samples long: too short to validate on with training.dropped_steps "
+                f"{training.dropped_steps}; choose a longer range in conf/split"
+            )
+        firsts = offset + steps * torch.arange(length // steps)
+        batches.append(cutter.cut(firsts, steps))
+    return batches
+
+
+def _fit_record(record: PhaseRecord) -> FitRecord:
+    return FitRecord(
+        history={
+            "epoch": list(range(1, record.epochs + 1)),
+            "train_loss": record.train_loss,
+            "validation_loss": record.validation_loss,
+        },
+        metrics={
+            "epochs": record.epochs,
+            "best_epoch": record.best_epoch,
+            "best_validation_loss": record.best_loss,
+            "skipped_steps": record.skipped_steps,
+            "train_seconds": record.seconds,
+        },
+        interrupted=record.interrupted,
+    )

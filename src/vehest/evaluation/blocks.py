@@ -1,0 +1,203 @@
+"""Errors of an estimate summed over short segments of a drive, and segments joined into blocks that are about independent of each other.
+
+An evaluation keeps the segments, so that intervals need neither model nor estimate again.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.text_files import number_in, read_rows
+from vehest.evaluation.metrics import Scored
+
+SEGMENT_SECONDS = 1.0
+LEAST_PIECES = 8  # ranges or sequences, from which on each is a block
+LEAST_BLOCKS = 3  # below which no interval is given
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Sums over the scored samples of each segment, all of shape (K,).
+
+    Args:
+        piece: number of the range, or sequence, that a segment belongs to.
+        start: time of its first sample [s].
+        samples: how many it has.
+        squared_error_vy: sum of (v̂ - v)² [m²/s²].
+        squared_error_sideslip: sum of (β̂ - β)² [deg²].
+        error_vy: sum of v̂ - v [m/s].
+        vy_ref: sum of v [m/s].
+        squared_vy_ref: sum of v² [m²/s²].
+    """
+
+    piece: FloatArray
+    start: FloatArray
+    samples: FloatArray
+    squared_error_vy: FloatArray
+    squared_error_sideslip: FloatArray
+    error_vy: FloatArray
+    vy_ref: FloatArray
+    squared_vy_ref: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.piece)
+
+    def same_grid(self, other: Segments) -> bool:
+        """Whether both are over the same samples."""
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in ("piece", "start", "samples"))
+
+
+COLUMNS = tuple(field.name for field in fields(Segments))
+
+
+def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
+    """Cut scored ranges or sequences into segments of `SEGMENT_SECONDS`; the last of a range may be shorter.
+
+    Args:
+        parts: estimate and reference, in order.
+        rate_hz: of the scored samples [Hz].
+    """
+    steps = max(round(SEGMENT_SECONDS * rate_hz), 1)
+    columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
+    for position, part in enumerate(parts):
+        starts = np.arange(0, len(part.time), steps)
+        turn = np.remainder(part.sideslip - part.sideslip_ref + math.pi, 2.0 * math.pi) - math.pi
+        error = part.vy - part.vy_ref
+        summed = {
+            "samples": np.ones_like(error),
+            "squared_error_vy": np.square(error),
+            "squared_error_sideslip": np.square(np.degrees(turn)),
+            "error_vy": error,
+            "vy_ref": part.vy_ref,
+            "squared_vy_ref": np.square(part.vy_ref),
+        }
+        columns["piece"].append(np.full(len(starts), float(position)))
+        columns["start"].append(part.time[starts])
+        for name, values in summed.items():
+            columns[name].append(np.add.reduceat(values, starts))
+    return Segments(**{name: np.concatenate(values) for name, values in columns.items()})
+
+
+def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
+    """Write the segments of every test set into one CSV file, floats to the last digit."""
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["test_set", *COLUMNS])
+        for test_set, segments in by_test_set.items():
+            for row in zip(*(getattr(segments, name).tolist() for name in COLUMNS), strict=True):
+                writer.writerow([test_set, *(repr(value) for value in row)])
+
+
+def read_segments(path: Path) -> dict[str, Segments]:
+    """Segments of every test set.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: the file is damaged.
+    """
+    rows: dict[str, list[list[float]]] = {}
+    for row in read_rows(path, ("test_set", *COLUMNS)):
+        rows.setdefault(row["test_set"], []).append([number_in(row, name, path) for name in COLUMNS])
+    return {name: Segments(*np.array(values).T) for name, values in rows.items()}
+
+
+def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
+    """Number of the block that each segment belongs to, (K,): a range or sequence each, or stretches of the Politis-White length.
+
+    Args:
+        segments: that say which belong to one range.
+        losses: one or several estimators' losses, (C, K); the longest block that any of them needs serves all.
+    """
+    pieces = np.unique(segments.piece)
+    if len(pieces) >= LEAST_PIECES:
+        return np.asarray(np.searchsorted(pieces, segments.piece), dtype=np.int64)
+    runs = [losses[:, segments.piece == piece] for piece in pieces]
+    length = max(math.ceil(politis_white_length([run[row] for run in runs])) for row in range(len(losses)))
+    labels, count = np.empty(len(segments), dtype=np.int64), 0
+    for piece in pieces:
+        own = np.flatnonzero(segments.piece == piece)
+        n_blocks = max(len(own) // length, 1)  # what is left over is shared out, so that no block is a stump
+        labels[own] = count + np.minimum(np.arange(len(own)) * n_blocks // len(own), n_blocks - 1)
+        count += n_blocks
+    return labels
+
+
+def politis_white_length(runs: Sequence[FloatArray]) -> float:
+    """Block length, in segments, that suits the bootstrap of a mean of dependent values.
+
+    The rule for blocks of one length, with the autocovariance R pooled over uninterrupted runs: b = (2 G²/D)^(1/3) n^(1/3) with
+    G = Σ λ(k/M)|k| R(k), D = 4/3 (Σ λ(k/M) R(k))², λ the flat-top window, and M twice the lag after which autocorrelations are no longer
+    significant.
+
+    Args:
+        runs: values of each run, (T,) each.
+
+    Returns:
+        At least 1, at most a third of the number of values.
+
+    Source: Politis & White, Econometric Reviews 23 (1), 2004, Section 3, with the correction of Patton, Politis & White, Econometric
+    Reviews 28 (4), 2009.
+    """
+    covariances = _pooled_covariances(runs)
+    n = sum(len(run) for run in runs)
+    return _length(covariances, _window(covariances, n), n) if len(covariances) > 1 and covariances[0] > 0 else 1.0
+
+
+def _beyond(n: int) -> int:
+    """Lags in a row that have to be insignificant."""
+    return max(5, int(math.sqrt(math.log10(max(n, 2)))))
+
+
+def _pooled_covariances(runs: Sequence[FloatArray]) -> FloatArray:
+    """Autocovariances from lag 0 on, (L + 1,)."""
+    n = sum(len(run) for run in runs)
+    mean = float(np.concatenate(runs).mean())
+    deviations = [run - mean for run in runs]
+    longest = max(min(math.ceil(math.sqrt(n)) + _beyond(n), n - 1), 0)
+    return np.array(
+        [sum(float(run[lag:] @ run[: len(run) - lag]) for run in deviations if len(run) > lag) / n for lag in range(longest + 1)]
+    )
+
+
+def _window(covariances: FloatArray, n: int) -> int:
+    """M, twice the lag after which `_beyond` autocorrelations in a row are insignificant."""
+    small = np.abs(covariances[1:] / covariances[0]) < 2.0 * math.sqrt(math.log10(n) / n)
+    settled = [lag for lag in range(len(small) - _beyond(n) + 1) if small[lag : lag + _beyond(n)].all()]
+    longest = len(covariances) - 1
+    return min(2 * max(settled[0], 1), longest) if settled else longest
+
+
+def _length(covariances: FloatArray, window: int, n: int) -> float:
+    lags = np.arange(1, window + 1)
+    weights = np.clip(2.0 * (1.0 - lags / window), 0.0, 1.0)
+    spread = 2.0 * float(np.sum(weights * lags * covariances[1 : window + 1]))
+    level = float(covariances[0] + 2.0 * np.sum(weights * covariances[1 : window + 1]))
+    bound = max(math.ceil(min(3.0 * math.sqrt(n), n / 3.0)), 1)
+    if level == 0.0:
+        return float(bound)
+    length = (2.0 * spread**2 / (4.0 / 3.0 * level**2)) ** (1.0 / 3.0) * n ** (1.0 / 3.0)
+    return float(min(max(length, 1.0), bound))
+
+
+def block_sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
+    """Sums of segments' values over blocks: (…, K) to (…, B)."""
+    rows = np.atleast_2d(values)
+    summed: FloatArray = np.stack([np.bincount(labels, weights=row) for row in rows])
+    return summed if values.ndim > 1 else np.asarray(summed[0])
+
+
+def effective_blocks(sums: FloatArray) -> float:
+    """How many blocks of equal loss would be spread out like these, (B,): (Σ s)² / Σ s², 1 where a single block holds all of it.
+
+    Source: Kish, Survey Sampling, 1965, Section 11.7, for weights.
+    """
+    total = float(np.sum(np.square(sums)))
+    return float(np.sum(sums)) ** 2 / total if total > 0 else float(len(sums))

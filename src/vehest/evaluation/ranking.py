@@ -1,0 +1,166 @@
+"""Which of several estimators may be called best: paired intervals of their differences, corrected for their number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, effective_blocks
+from vehest.evaluation.significance import CONFIDENCE, difference_of_blocks, holm, root_interval
+
+Name = tuple[str, str]
+"""Estimator and variant."""
+
+Verdict = Literal["lower", "higher", "not told apart"]
+BASELINES = ("zero", "static_map")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """RMSE of one estimator less that of another, over all seeds of both.
+
+    Args:
+        difference: first - second.
+        low: lower end of its interval, corrected by Holm over all comparisons of the table.
+        high: its upper end.
+        p_value: adjusted likewise.
+        verdict: whether the first lies lower, higher, or is not told apart from the second.
+    """
+
+    difference: float
+    low: float
+    high: float
+    p_value: float
+    verdict: Verdict
+
+    @property
+    def turned(self) -> Comparison:
+        """The second less the first."""
+        verdict: Verdict = "higher" if self.verdict == "lower" else "lower" if self.verdict == "higher" else self.verdict
+        return Comparison(-self.difference, -self.high, -self.low, self.p_value, verdict)
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """What a test set says of a number of estimators.
+
+    Args:
+        order: by RMSE over all seeds, the lowest first.
+        rmse: over all seeds of each.
+        intervals: its 95 % interval, blocks and seeds drawn anew.
+        against_best: the best against each other.
+        against_baseline: (candidate, baseline) -> comparison, of each baseline that is there.
+        pairs: (first, second) -> comparison, of every pair that was compared, either way round.
+        n_blocks: blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons.
+        block_seconds: mean length of a block [s].
+        effective_blocks: how many equal blocks the best one's squared error is spread over.
+    """
+
+    order: Sequence[Name]
+    rmse: Mapping[Name, float]
+    intervals: Mapping[Name, tuple[float, float]]
+    against_best: Mapping[Name, Comparison]
+    against_baseline: Mapping[tuple[Name, Name], Comparison]
+    pairs: Mapping[tuple[Name, Name], Comparison]
+    n_blocks: int
+    block_seconds: float
+    effective_blocks: float
+
+    @property
+    def missing_baselines(self) -> list[str]:
+        """Those of `BASELINES` that were not compared."""
+        return [baseline for baseline in BASELINES if not any(name[0] == baseline for name in self.order)]
+
+    def beats(self, name: Name, baseline: str) -> bool | None:
+        """Whether a candidate's RMSE lies below a baseline's; None where that is not told apart or was not compared."""
+        found = [own for (candidate, other), own in self.against_baseline.items() if candidate == name and other[0] == baseline]
+        if not found or found[0].verdict == "not told apart":
+            return None
+        return found[0].verdict == "lower"
+
+    @property
+    def winner(self) -> Name | None:
+        """The one that may be called best: below every other candidate, `zero` and `static_map`, each by more than chance."""
+        if self.n_blocks < LEAST_BLOCKS or not self.order or self.missing_baselines or self.order[0][0] in BASELINES:
+            return None
+        beaten = all(own.verdict == "lower" for own in self.against_best.values())
+        return self.order[0] if beaten and all(self.beats(self.order[0], baseline) for baseline in BASELINES) else None
+
+    @property
+    def not_told_apart(self) -> list[Name]:
+        """Those that the best is not told apart from."""
+        return [name for name in self.order[1:] if name in self.against_best and self.against_best[name].verdict == "not told apart"]
+
+
+def rank(
+    segments: Mapping[Name, Sequence[Segments]],
+    rate_hz: float,
+    loss: str = "squared_error_sideslip",
+    asked: Sequence[tuple[Name, Name]] = (),
+) -> Ranking:
+    """Compare estimators on one test set by the root of a mean loss.
+
+    Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected
+    together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
+
+    Args:
+        segments: of each seed of each estimator, all over the same samples.
+        rate_hz: of the scored samples [Hz].
+        loss: column of `Segments`, squared errors.
+        asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
+    """
+    first = next(iter(segments.values()))[0]
+    losses = {name: np.stack([getattr(own, loss) for own in seeds]) for name, seeds in segments.items()}
+    per_sample = np.concatenate([own / first.samples for own in losses.values()])
+    labels = block_labels(first, per_sample)
+    sizes = block_sums(first.samples, labels)
+    sums = {name: block_sums(own, labels) for name, own in losses.items()}
+    rmse = {name: float(np.sqrt(own.sum(axis=1).mean() / sizes.sum())) for name, own in sums.items()}
+    order = sorted(rmse, key=lambda name: rmse[name])
+    enough = len(sizes) >= LEAST_BLOCKS
+    pairs = _pairs(order, asked) if enough else []
+    compared = dict(zip(pairs, _corrected([(sums[one], sums[other]) for one, other in pairs], sizes), strict=True))
+    best = order[0]
+    return Ranking(
+        order=order,
+        rmse=rmse,
+        intervals={name: _interval_of(sums[name], sizes) for name in order} if enough else {},
+        against_best={other: own for (one, other), own in compared.items() if one == best},
+        against_baseline={pair: own for pair, own in compared.items() if pair[1][0] in BASELINES},
+        pairs={key: own for (one, other), found in compared.items() for key, own in (((one, other), found), ((other, one), found.turned))},
+        n_blocks=len(sizes),
+        block_seconds=float(sizes.mean()) / rate_hz,
+        effective_blocks=effective_blocks(sums[best].mean(axis=0)),
+    )
+
+
+def _pairs(order: Sequence[Name], asked: Sequence[tuple[Name, Name]]) -> list[tuple[Name, Name]]:
+    """The best with every other, every candidate with every baseline, and those asked for; each pair once."""
+    pairs = [(order[0], other) for other in order[1:]]
+    pairs += [(name, other) for name in order for other in order if other[0] in BASELINES and name[0] not in BASELINES]
+    for one, other in asked:
+        if one in order and other in order and (other, one) not in pairs:
+            pairs.append((one, other))
+    return list(dict.fromkeys(pairs))
+
+
+def _corrected(pairs: Sequence[tuple[FloatArray, FloatArray]], sizes: FloatArray) -> list[Comparison]:
+    """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is tested."""
+    differences = [difference_of_blocks(first, second, sizes).root for first, second in pairs]
+    adjusted = holm([own.p_value for own in differences])
+    comparisons = []
+    for own, p_value in zip(differences, adjusted, strict=True):
+        factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(pairs))
+        low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
+        verdict: Verdict = "not told apart" if p_value >= 1.0 - CONFIDENCE else ("lower" if own.value < 0 else "higher")
+        comparisons.append(Comparison(own.value, low, high, p_value, verdict))
+    return comparisons
+
+
+def _interval_of(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
+    own = root_interval(sums, sizes)
+    return own.low, own.high

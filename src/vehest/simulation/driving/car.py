@@ -1,0 +1,181 @@
+"""What a driver knows of a car: its size, its limits, and how much steering it wants at which lateral acceleration.
+
+Sizes and limits are the vehicle's parameters. The steering is measured: the car goes into an ever tighter turn at constant speed until
+it follows no more, as in the constant-speed test of ISO 4138.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.plant.handling import ramp_steer
+from vehest.simulation.plant.multi_body import MultiBodyPlant
+
+TEST_SPEED = 25.0
+"""Of the measurement [m/s], or half of the top speed if that is less; assumed."""
+USEFUL_SHARE = 0.985
+"""Share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed."""
+UNSTEADY = 0.5
+"""Difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed."""
+MARGIN = 0.85
+"""Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver counts as all of the grip; assumed."""
+TRACTION_SHARE = 0.8
+"""Share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed."""
+DRAG_AREA = 0.25
+"""Drag coefficient times frontal area, per square of the width; assumed: 0.7 m² for a car 1.7 m wide. ``driver: drag_area`` replaces it."""
+AIR_DENSITY = 1.2
+"""[kg/m³]"""
+POWER_SHARE = 0.9
+"""Share of the engine's power that a driver uses; assumed."""
+
+
+@dataclass(frozen=True)
+class Car:
+    """A car as its driver knows it, on a dry road.
+
+    Args:
+        name: of the vehicle.
+        wheelbase: [m].
+        width: over all [m].
+        front_share: share of the weight on the front axle.
+        grip: largest steady lateral acceleration [m/s²].
+        driving_share: share of the grip that serves for accelerating straight ahead.
+        power_per_mass: used at most [W/kg].
+        top_speed: driven at most [m/s].
+        drag: deceleration by the air per square of the speed [1/m].
+        steering_rate: largest steering velocity of the road wheels [rad/s].
+        largest_steer: of the road wheels [rad].
+        lateral_acceleration: (M,), from 0 to the grip [m/s²].
+        excess_steer: (M,), road-wheel angle beyond wheelbase times curvature there [rad].
+        rear_slip: (M,), slip angle of the rear axle there, as a positive angle [rad].
+    """
+
+    name: str
+    wheelbase: float
+    width: float
+    front_share: float
+    grip: float
+    driving_share: float
+    power_per_mass: float
+    top_speed: float
+    drag: float
+    steering_rate: float
+    largest_steer: float
+    lateral_acceleration: tuple[float, ...]
+    excess_steer: tuple[float, ...]
+    rear_slip: tuple[float, ...]
+
+    def steer_for(self, curvature: float, lateral_acceleration: float, friction: float = 1.0) -> float:
+        """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
+
+        Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
+
+        Args:
+            curvature: positive to the left [1/m].
+            lateral_acceleration: that the tyres must give, positive to the left [m/s²].
+            friction: scale of the tyres' friction.
+        """
+        excess = self._at(self.excess_steer, lateral_acceleration, friction)
+        return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
+
+    def sideslip_for(self, curvature: float, lateral_acceleration: float, friction: float = 1.0) -> float:
+        """Sideslip [rad] in the same turn."""
+        slip = self._at(self.rear_slip, lateral_acceleration, friction)
+        return (self.wheelbase * self.front_share) * curvature - math.copysign(friction * slip, lateral_acceleration)
+
+    def resistance(self, speed: float, yaw_rate: float, steer: float, sideslip: float) -> float:
+        """Deceleration along the path [m/s²] by the air, and by tyres that slip in a turn."""
+        return self.drag * speed**2 + yaw_rate * speed * (self.front_share * math.sin(steer) - math.sin(sideslip))
+
+    def _at(self, values: tuple[float, ...], lateral_acceleration: float, friction: float) -> float:
+        grid = self.lateral_acceleration
+        wanted = min(abs(lateral_acceleration) / friction, grid[-1])
+        after = min(max(bisect_right(grid, wanted), 1), len(grid) - 1)
+        share = (wanted - grid[after - 1]) / (grid[after] - grid[after - 1])
+        return values[after - 1] + share * (values[after] - values[after - 1])
+
+
+def car_of(plant: MultiBodyPlant) -> Car:
+    """The car as its driver knows it; measured once a process for each vehicle and step.
+
+    Raises:
+        ConfigurationError: the vehicle's ``driver`` values make no sense, or it cannot be driven around a corner.
+    """
+    own = dict(plant.vehicle.driver)
+    key = json.dumps([plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step], sort_keys=True)
+    if key not in _KNOWN:
+        _KNOWN[key] = _as_known(plant, own)
+    return _KNOWN[key]
+
+
+_KNOWN: dict[str, Car] = {}
+_OWN_VALUES = ("drag_area", "grip", "power_per_mass", "top_speed")
+
+
+def _as_known(plant: MultiBodyPlant, own: Mapping[str, Any]) -> Car:
+    vehicle, parameters = plant.vehicle, plant.parameters
+    unknown = sorted(set(own) - set(_OWN_VALUES))
+    if unknown:
+        raise ConfigurationError(f"vehicle '{vehicle.name}': unknown values {unknown} of its driver; known ones: {', '.join(_OWN_VALUES)}")
+    front_share = parameters.b / (parameters.a + parameters.b)
+    driven_axle = min(_ratio(front_share, parameters.T_se), _ratio(1.0 - front_share, 1.0 - parameters.T_se))
+    top_speed = _own(own, "top_speed", parameters.longitudinal.v_max, vehicle.name)
+    accelerations, steers, slips = _measure(plant, min(TEST_SPEED, 0.5 * top_speed))
+    grip = _own(own, "grip", accelerations[-1], vehicle.name)
+    return Car(
+        name=vehicle.name,
+        wheelbase=plant.wheelbase,
+        width=parameters.w,
+        front_share=front_share,
+        grip=grip,
+        driving_share=min(TRACTION_SHARE * driven_axle, TRACTION_SHARE),
+        power_per_mass=_own(
+            own, "power_per_mass", POWER_SHARE * parameters.longitudinal.a_max * parameters.longitudinal.v_switch, vehicle.name
+        ),
+        top_speed=top_speed,
+        drag=0.5 * AIR_DENSITY / parameters.m * _own(own, "drag_area", DRAG_AREA * parameters.w**2, vehicle.name),
+        steering_rate=parameters.steering.v_max,
+        largest_steer=parameters.steering.max,
+        lateral_acceleration=accelerations,
+        excess_steer=steers,
+        rear_slip=slips,
+    )
+
+
+def _ratio(load: float, torque: float) -> float:
+    return load / torque if torque > 0.0 else math.inf
+
+
+def _own(own: Mapping[str, Any], name: str, default: float, vehicle_name: str) -> float:
+    value = float(own.get(name, default))
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigurationError(f"vehicle '{vehicle_name}': the driver's {name} must be positive, not {value}")
+    return value
+
+
+def _measure(plant: MultiBodyPlant, speed: float) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    """Lateral accelerations [m/s²] in steps of 0.25 from zero to the largest steady one; excess steer and rear slip [rad] there."""
+    ramp = ramp_steer(plant, speed)
+    steady = ramp.vx * ramp.yaw_rate
+    astray = np.flatnonzero((np.abs(ramp.ay - steady) > UNSTEADY) | (ramp.tyre_fz.min(axis=1) <= 0.0))
+    end = int(astray[0]) if len(astray) else len(steady) - 1
+    limit = int(np.argmax(steady >= USEFUL_SHARE * steady[: end + 1].max()))
+    grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
+    if grip < 1.0:
+        raise ConfigurationError(f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow")
+    ramp_values = (
+        ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,
+        (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx,
+    )
+    grid = np.append(np.arange(0.0, grip - 0.05, 0.25), grip)
+    rising = np.maximum.accumulate(steady[: limit + 1])
+    steers, slips = (np.interp(grid, rising, values[: limit + 1]).tolist() for values in ramp_values)
+    return tuple(grid.tolist()), tuple(steers), tuple(slips)

@@ -1,0 +1,195 @@
+"""Manoeuvres on a circle: steady-state circle (skidpad) and braking in the turn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+from vehest.simulation.driving.car import Car
+from vehest.simulation.driving.driver import Command, Driver, Observation, Plan
+from vehest.simulation.driving.manoeuvre import (
+    FASTEST_SHARE,
+    SETTLING_TIME,
+    SIDE_CHOICES,
+    SIDES,
+    Controller,
+    LineDriver,
+    Manoeuvre,
+    OpenArea,
+    Range,
+    as_range,
+    draw,
+    draw_driver,
+    draw_side,
+    generator_of,
+    plan_along,
+    require,
+    require_one_of,
+)
+from vehest.simulation.road.lines import circle
+from vehest.simulation.road.surface import Surface
+
+
+@dataclass(frozen=True)
+class SteadyCircle(Manoeuvre):
+    """Steady-state circle: constant radius, slowly increasing speed (ISO 4138, constant-radius test).
+
+    Args:
+        radius: [m]; the standard wants at least 30 m.
+        severity: share of the grip at which it ends.
+        ay_rate: by which the lateral acceleration grows [m/s³]; the standard's slow increase.
+        start_ay: at which the circle is entered [m/s²].
+        hold_time: at the final speed [s].
+        side: ``left``, ``right`` or ``either``.
+        half_width: distance from the circle beyond which the car has left it [m].
+    """
+
+    name: ClassVar[str] = "skidpad"
+    radius: Range = (35.0, 60.0)
+    severity: Range = (0.7, 0.95)
+    ay_rate: float = 0.25
+    start_ay: float = 2.0
+    hold_time: float = 2.0
+    side: str = "either"
+    half_width: float = 4.0
+
+    def __post_init__(self) -> None:
+        require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), ay_rate=(0.02, 3.0), start_ay=(0.2, 8.0), hold_time=(0.0, 120.0))
+        require(self, half_width=(0.5, 50.0))
+        require_one_of(self, "side", SIDE_CHOICES)
+
+    @property
+    def longest(self) -> float:
+        """The time in which two times 9.81 m/s² are reached."""
+        return 30.0 + self.hold_time + 2.0 * 9.81 / self.ay_rate
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the radius, the side and the habits of this seed."""
+        generator = generator_of(seed)
+        radius, severity, side = draw(self.radius, generator), draw(self.severity, generator), draw_side(self.side, generator)
+        driver = draw_driver(seed)
+        final_ay = min(severity * car.grip * OpenArea(surface, seed).lowest, (FASTEST_SHARE * car.top_speed) ** 2 / radius)
+        first_ay = min(self.start_ay, 0.5 * final_ay)
+        speed = math.sqrt(first_ay * radius)
+        run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
+        entered = (run_in + transition) / speed - SETTLING_TIME
+        growing = (final_ay - first_ay) / self.ay_rate
+
+        def speed_at(time: float) -> tuple[float, float]:
+            share = min(max((time - entered) / growing, 0.0), 1.0)
+            now = math.sqrt((first_ay + share * (final_ay - first_ay)) * radius)
+            return now, 0.5 * self.ay_rate * radius / now if 0.0 < share < 1.0 else 0.0
+
+        around = math.sqrt(final_ay * radius) * (growing + self.hold_time + 5.0)
+        line = circle(radius, side, run_in, around, transition)
+        plan = plan_along(line, speed, surface, seed)
+        drawn = {"radius": radius, "severity": severity, "side": SIDES[side], "driver": asdict(driver)}
+        return TimedLineDriver(plan, car, driver, drawn, entered + growing + self.hold_time, speed_at)
+
+
+class TimedLineDriver(LineDriver):
+    """Follows a line until a time [s]."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        drawn: dict[str, Any],
+        end_time: float,
+        speed_at: Callable[[float], tuple[float, float]] | None,
+    ) -> None:
+        super().__init__(plan, car, driver, drawn, speed_at=speed_at)
+        self._end_time = end_time
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """As planned, until the time."""
+        decision = super().command(time, seen)
+        return decision._replace(finished=True) if time >= self._end_time else decision
+
+
+@dataclass(frozen=True)
+class BrakingInTurn(Manoeuvre):
+    """Braking on a circle with the steering held (ISO 7975, open loop).
+
+    Args:
+        radius: of the circle [m]; 100 m in the standard.
+        severity: share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's.
+        deceleration: [m/s²].
+        turn_time: on the circle before the brakes [s].
+        steering: ``held`` or, for a driver who keeps to the circle, ``path``.
+        until_speed: at which the recording ends [m/s]; 0 is the stand.
+        side: ``left``, ``right`` or ``either``.
+        half_width: distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes.
+    """
+
+    name: ClassVar[str] = "braking_in_turn"
+    radius: Range = (60.0, 100.0)
+    severity: Range = (0.4, 0.7)
+    deceleration: Range = (2.0, 5.0)
+    turn_time: Range = (3.0, 5.0)
+    steering: str = "held"
+    until_speed: float = 0.0
+    side: str = "either"
+    half_width: float = 4.0
+
+    def __post_init__(self) -> None:
+        require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), deceleration=(0.5, 10.0), turn_time=(1.0, 60.0), until_speed=(0.0, 60.0))
+        require(self, half_width=(0.5, 50.0))
+        require_one_of(self, "side", SIDE_CHOICES)
+        require_one_of(self, "steering", ("held", "path"))
+
+    @property
+    def longest(self) -> float:
+        """More than any of it takes."""
+        return 60.0 + as_range(self.turn_time)[1]
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the radius, the speed, the brakes and the habits of this seed."""
+        generator = generator_of(seed)
+        radius, severity, side = draw(self.radius, generator), draw(self.severity, generator), draw_side(self.side, generator)
+        deceleration, turn_time = draw(self.deceleration, generator), draw(self.turn_time, generator)
+        driver = draw_driver(seed)
+        speed = min(math.sqrt(severity * car.grip * OpenArea(surface, seed).mean * radius), FASTEST_SHARE * car.top_speed)
+        run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed
+        brakes_at = (run_in + transition) / speed - SETTLING_TIME + turn_time
+        line = circle(radius, side, run_in, speed * (turn_time + 30.0), transition)
+        plan = plan_along(line, speed, surface, seed)
+        drawn = {
+            "radius": radius, "severity": severity, "speed": speed, "deceleration": deceleration, "brakes_at": brakes_at,
+            "side": SIDES[side], "driver": asdict(driver),
+        }  # fmt: skip
+        return TurnBraker(plan, car, driver, drawn, brakes_at, deceleration, self.steering == "held", self.until_speed)
+
+
+class TurnBraker(LineDriver):
+    """Follows a circle, then brakes until a speed [m/s] is reached or the car stands."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        drawn: dict[str, Any],
+        brakes_at: float,
+        deceleration: float,
+        held: bool,
+        until_speed: float,
+    ) -> None:
+        super().__init__(plan, car, driver, drawn)
+        self._brakes_at, self._deceleration, self._held, self._until_speed = brakes_at, deceleration, held, until_speed
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """Around the circle, then braking, with the steering held or not."""
+        decision = super().command(time, seen)
+        if time < self._brakes_at:
+            return decision
+        braking = -self._deceleration * min((time - self._brakes_at) / BRAKE_BUILD_UP, 1.0)
+        decision = decision._replace(acceleration=braking, finished=seen.speed < self._until_speed)
+        return decision._replace(steering_velocity=0.0, lateral_error=math.nan) if self._held else decision
+
+
+BRAKE_BUILD_UP = 0.2
+"""Time in which brakes come on [s]; assumed."""

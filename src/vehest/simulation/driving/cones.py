@@ -1,0 +1,172 @@
+"""Manoeuvres between cones: double lane change and slalom."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.car import Car
+from vehest.simulation.driving.driver import Driver
+from vehest.simulation.driving.manoeuvre import (
+    FASTEST_SHARE,
+    SETTLING_TIME,
+    SIDE_CHOICES,
+    SIDES,
+    Controller,
+    LineDriver,
+    Manoeuvre,
+    OpenArea,
+    Range,
+    draw,
+    draw_driver,
+    draw_side,
+    generator_of,
+    plan_along,
+    require,
+    require_one_of,
+)
+from vehest.simulation.road.lines import Gate, Line, line_through
+from vehest.simulation.road.surface import Surface
+
+
+@dataclass(frozen=True)
+class DoubleLaneChange(Manoeuvre):
+    """To the neighbouring lane and back between cones, at a constant speed.
+
+    Lengths and widths of the gates are those of ISO 3888-1 and ISO 3888-2; the offset of part 1 is taken between the lanes' middles.
+
+    Args:
+        layout: ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance).
+        severity: share of the grip that the sharpest bend of the line takes; decides the speed.
+        speed: [m/s], instead of the severity.
+        side: of the neighbouring lane: ``left``, ``right`` or ``either``.
+        half_width: distance from the line beyond which the car has left the road [m].
+    """
+
+    name: ClassVar[str] = "double_lane_change"
+    layout: str = "iso_3888_1"
+    severity: Range = (0.5, 0.9)
+    speed: Range | None = None
+    side: str = "either"
+    half_width: float = 1.5
+
+    def __post_init__(self) -> None:
+        _require_cone_values(self)
+        require_one_of(self, "layout", ("iso_3888_1", "iso_3888_2"))
+
+    @property
+    def longest(self) -> float:
+        """More than any speed takes."""
+        return 60.0
+
+    def gates(self, width: float) -> tuple[Gate, ...]:
+        """Gates for a car of a width [m], along the x axis from the first gate on, with the other lane on the left."""
+        first, last = 1.1 * width + 0.25, 1.3 * width + 0.25
+        if self.layout == "iso_3888_1":
+            second, offset = 1.2 * width + 0.25, 3.5
+            lanes = ((0.0, 15.0, first, 0.0), (45.0, 70.0, second, offset), (95.0, 125.0, last, 0.0))
+        else:
+            second, last = width + 1.0, max(last, 3.0)
+            offset = 0.5 * first + 1.0 + 0.5 * second  # one metre between the lanes
+            lanes = ((0.0, 12.0, first, 0.0), (25.5, 36.5, second, offset), (49.0, 61.0, last, 0.5 * (last - first)))
+        return tuple(Gate(begin, end, middle - 0.5 * wide, middle + 0.5 * wide) for begin, end, wide, middle in lanes)
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the speed, the side and the habits of this seed."""
+        return _between_cones(self, self.gates(car.width), car, surface, seed)
+
+
+@dataclass(frozen=True)
+class Slalom(Manoeuvre):
+    """Around cones in a row, at a constant speed.
+
+    Args:
+        spacing: of the cones [m]; 18 m and 30 m are customary.
+        cones: how many.
+        severity: share of the grip that the sharpest bend of the line takes; decides the speed.
+        speed: [m/s], instead of the severity.
+        side: on which the first cone is passed: ``left``, ``right`` or ``either``.
+        half_width: distance from the line beyond which the car has left the road [m].
+    """
+
+    name: ClassVar[str] = "slalom"
+    spacing: float = 18.0
+    cones: int = 8
+    severity: Range = (0.5, 0.9)
+    speed: Range | None = None
+    side: str = "either"
+    half_width: float = 2.0
+
+    def __post_init__(self) -> None:
+        _require_cone_values(self)
+        require(self, spacing=(8.0, 100.0), cones=(1, 30))
+        if not isinstance(self.cones, int):
+            raise ConfigurationError(f"manoeuvre 'slalom': cones must be a whole number, not {self.cones}")
+
+    @property
+    def longest(self) -> float:
+        """More than any speed takes."""
+        return 30.0 + self.cones * self.spacing / 2.0
+
+    def gates(self, width: float) -> tuple[Gate, ...]:
+        """Cones along the x axis from the first one on, which is passed on its left."""
+        places = [cone * self.spacing for cone in range(self.cones)]
+        sides = ((0.0, math.inf), (-math.inf, 0.0))
+        return tuple(Gate(place, place, *sides[cone % 2]) for cone, place in enumerate(places))
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the speed, the side and the habits of this seed."""
+        return _between_cones(self, self.gates(car.width), car, surface, seed)
+
+
+def _require_cone_values(manoeuvre: DoubleLaneChange | Slalom) -> None:
+    """Check what both have."""
+    require(manoeuvre, severity=(0.05, 1.3), half_width=(0.5, 50.0))
+    require_one_of(manoeuvre, "side", SIDE_CHOICES)
+    if manoeuvre.speed is not None:
+        require(manoeuvre, speed=(3.0, 70.0))
+
+
+def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...], car: Car, surface: Surface, seed: int) -> Controller:
+    generator = generator_of(seed)
+    severity, side = draw(manoeuvre.severity, generator), draw_side(manoeuvre.side, generator)
+    own_speed = draw(manoeuvre.speed, generator) if manoeuvre.speed is not None else None
+    driver = _quick(draw_driver(seed))
+    shape = line_through(gates, car.width, 40.0, 60.0)
+    grip = car.grip * OpenArea(surface, seed).mean
+    speed = own_speed or min(math.sqrt(severity * grip / shape.largest_curvature), FASTEST_SHARE * car.top_speed)
+    run_in = (SETTLING_TIME + 1.0) * speed
+    line = _beginning_at(shape, run_in - 40.0) if run_in > 40.0 else shape
+    if side < 0.0:
+        line = _mirrored(line)
+    plan = plan_along(line, speed, surface, seed)
+    drawn = {"severity": severity if own_speed is None else None, "speed": speed, "side": SIDES[side], "driver": asdict(driver)}
+    end = max(run_in, 40.0) + gates[-1].end - gates[0].begin + 40.0
+    return LineDriver(plan, car, driver, drawn, end=end)
+
+
+def _quick(driver: Driver) -> Driver:
+    """The same person between cones: looks less far ahead and steers faster."""
+    return replace(driver, preview_time=0.57 * driver.preview_time, steering_lag=0.5 * driver.steering_lag)
+
+
+def _mirrored(line: Line) -> Line:
+    return Line(line.distance, line.x, -line.y, -line.heading, -line.curvature)
+
+
+def _beginning_at(line: Line, earlier: float) -> Line:
+    """The line with a straight of this length [m] before it."""
+    n_more = math.ceil(earlier / line.distance[1])
+    before = np.arange(n_more) * line.distance[1]
+    nothing = np.zeros(n_more)
+    return Line(
+        distance=np.concatenate([before, before[-1] + line.distance[1] + line.distance]),
+        x=np.concatenate([line.x[0] - before[::-1] - line.distance[1], line.x]),
+        y=np.concatenate([nothing, line.y]),
+        heading=np.concatenate([nothing, line.heading]),
+        curvature=np.concatenate([nothing, line.curvature]),
+    )

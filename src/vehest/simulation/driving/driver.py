@@ -1,0 +1,390 @@
+"""The driver: a racing line, a speed profile at a fraction of the grip, and path following with preview.
+
+Steering follows the optimal-preview idea of Sharp, Casanova and Symonds 2000 in its simplest form: the steering of the steady turn ahead,
+the lateral error expected at one preview point, damping of the yaw rate, and countersteering once the rear slides. The speed profile is
+the usual quasi-steady pass forwards and backwards through the friction circle (e.g. Heilmeier et al. 2020).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.car import Car
+from vehest.simulation.road.course import Course
+
+DRIVER_RATE_HZ = 100.0
+"""How often a driver decides what to do [Hz]."""
+
+WAVELENGTHS = (310.0, 470.0, 1130.0)
+"""Of the variations along a drive [m]; assumed, and none divides a lap."""
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How a person drives; all values are assumed, chosen so that the shipped cars follow the shipped courses.
+
+    Args:
+        preview_time: how far ahead the driver looks for lateral errors [s].
+        steering_lag: time constant from the wanted to the actual steering angle [s].
+        response: by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the
+            one of steering.
+        yaw_damping: steering angle per error of the yaw rate [s].
+        countersteer: steering angle per sideslip beyond what the turn wants.
+        slide: sideslip beyond what the turn wants from which on the driver countersteers and lifts [rad].
+        speed_gain: wanted acceleration per speed error [1/s].
+        braking_share: share of the grip that is used for braking straight ahead.
+        saturation: share of the grip up to which the driver asks for more lateral acceleration when off the line.
+    """
+
+    preview_time: float = 0.7
+    steering_lag: float = 0.1
+    response: float = 3.5e-3
+    yaw_damping: float = 0.16
+    countersteer: float = 0.7
+    slide: float = 0.035
+    speed_gain: float = 1.5
+    braking_share: float = 0.75
+    saturation: float = 1.1
+
+
+@dataclass(frozen=True)
+class DrivingStyle:
+    """What differs from drive to drive and, slowly, along one drive.
+
+    Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
+
+    Args:
+        grip_fraction: mean share of the grip that the speed profile uses, 0 … 1.
+        grip_ripple: amplitude of its variation.
+        line_offset: amplitude of the lateral offset of the line [m].
+        wavelengths: of the sines [m].
+        grip_phases: phase of each sine of the grip [rad].
+        line_phases: phase of each sine of the line [rad].
+
+    Raises:
+        ConfigurationError: the grip used is not between 0 and 1 all along.
+    """
+
+    grip_fraction: float
+    grip_ripple: float = 0.05
+    line_offset: float = 0.5
+    wavelengths: tuple[float, ...] = WAVELENGTHS
+    grip_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
+    line_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
+        if not (low > 0.0 and high <= 1.0 + 1e-9):
+            raise ConfigurationError(f"grip fraction {self.grip_fraction} ± {self.grip_ripple} must stay above 0 and at most 1")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What the driver means to do, over the distance along the way; all arrays have shape (N,).
+
+    Args:
+        distance: [m], uniform from 0.
+        x, y: the line [m].
+        heading: of the line, not wrapped [rad].
+        curvature: of the line, positive to the left [1/m].
+        speed: [m/s].
+        friction: scale of the tyres' friction.
+        bank: positive with the left side higher [rad].
+        grade: positive downhill [rad].
+    """
+
+    distance: FloatArray
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+    curvature: FloatArray
+    speed: FloatArray
+    friction: FloatArray
+    bank: FloatArray
+    grade: FloatArray
+
+    @cached_property
+    def acceleration(self) -> FloatArray:
+        """Along the line [m/s²], shape (N,)."""
+        return self.speed * np.gradient(self.speed, self.distance)
+
+    @property
+    def length(self) -> float:
+        """From the start to the end [m]."""
+        return float(self.distance[-1])
+
+
+class Observation(NamedTuple):
+    """What the driver sees and feels of the car: place [m], heading [rad], velocity [m/s], yaw rate [rad/s], steering angle [rad]."""
+
+    x: float
+    y: float
+    yaw: float
+    vx: float
+    vy: float
+    yaw_rate: float
+    steer: float
+
+    @property
+    def speed(self) -> float:
+        """Of the car over the ground [m/s]."""
+        return math.hypot(self.vx, self.vy)
+
+    @property
+    def sideslip(self) -> float:
+        """atan2(vy, vx), zero below 1 m/s where it says nothing [rad]."""
+        return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
+
+
+class Command(NamedTuple):
+    """What the driver does now, and the road at the car.
+
+    Args:
+        steering_velocity: of the road wheels [rad/s].
+        acceleration: wanted [m/s²].
+        progress: distance along the way [m].
+        lateral_error: the car's place left of its line [m]; NaN where there is no line.
+        friction: scale of the tyres' friction at the car.
+        bank: of the road, positive with its left side higher [rad].
+        grade: of the road, positive downhill [rad].
+        heading: of the road, along which bank and grade are meant [rad].
+        finished: the manoeuvre is over.
+    """
+
+    steering_velocity: float
+    acceleration: float
+    progress: float = 0.0
+    lateral_error: float = math.nan
+    friction: float = 1.0
+    bank: float = 0.0
+    grade: float = 0.0
+    heading: float = 0.0
+    finished: bool = False
+
+
+def draw_style(seed: int, grip_range: tuple[float, float] = (0.65, 0.9), ripple: float = 0.05, line_offset: float = 0.5) -> DrivingStyle:
+    """The style that belongs to a seed: grip fraction uniform in ``grip_range`` (assumed), phases around the circle."""
+    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
+    grip_fraction = float(generator.uniform(*grip_range))
+    phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
+    return DrivingStyle(grip_fraction, ripple, line_offset, grip_phases=tuple(phases[0]), line_phases=tuple(phases[1]))
+
+
+def plan_laps(
+    course: Course, car: Car, driver: Driver, style: DrivingStyle, n_laps: int, *, friction: FloatArray, highest_speed: FloatArray | float
+) -> Plan:
+    """Line and speed profile over whole laps.
+
+    Args:
+        course: where.
+        car: whose limits are kept.
+        driver: who drives.
+        style: how.
+        n_laps: at least one.
+        friction: of one lap, on the course's samples, shape (N,).
+        highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
+    """
+    distance = _repeat(course.arc_length, n_laps, course.length)
+    heading = _repeat(course.heading, n_laps, course.turning)
+    bend, bank, grade = (_repeat(values, n_laps) for values in (course.curvature, course.bank, course.grade))
+    scale = _repeat(friction, n_laps)
+    offset, offset_slope, offset_bend = _sines(distance, style.wavelengths, style.line_phases, style.line_offset)
+    stretch = 1.0 - bend * offset  # length of the line per length of the centre line
+    curvature = bend / stretch + offset_bend
+    ripple, _, _ = _sines(distance, style.wavelengths, style.grip_phases, style.grip_ripple)
+    used = car.grip * scale * (style.grip_fraction + ripple)
+    return Plan(
+        distance=distance,
+        x=_repeat(course.x, n_laps) - offset * np.sin(heading),
+        y=_repeat(course.y, n_laps) + offset * np.cos(heading),
+        heading=heading + np.arctan2(offset_slope, stretch),
+        curvature=curvature,
+        speed=speed_profile(curvature, used, float(distance[1]), car, driver, highest_speed, bank, grade),
+        friction=scale,
+        bank=bank,
+        grade=grade,
+    )
+
+
+def speed_profile(
+    curvature: FloatArray,
+    used: FloatArray,
+    spacing: float,
+    car: Car,
+    driver: Driver,
+    highest_speed: FloatArray | float = math.inf,
+    bank: FloatArray | float = 0.0,
+    grade: FloatArray | float = 0.0,
+) -> FloatArray:
+    """Highest speeds [m/s] within friction circle, engine power and top speed; (N,).
+
+    Args:
+        curvature: (N,) [1/m].
+        used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
+        spacing: distance between samples [m].
+        car: whose power and top speed are used.
+        driver: who brakes.
+        highest_speed: that the driver wants [m/s].
+        bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
+        grade: of the road, positive downhill [rad].
+    """
+    lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
+    cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))
+    speed = np.minimum(cornering, np.minimum(highest_speed, car.top_speed)).tolist()
+    bend, limit, most = np.abs(curvature).tolist(), lateral.tolist(), used.tolist()
+    downhill = (GRAVITY * np.sin(grade) + np.zeros_like(used)).tolist()
+
+    def spare(i: int) -> float:
+        """Longitudinal share of the friction circle at sample i."""
+        return math.sqrt(max(1.0 - (speed[i] ** 2 * bend[i] / limit[i]) ** 2, 0.0))
+
+    for i in range(len(speed) - 2, -1, -1):
+        braking = driver.braking_share * most[i + 1] * spare(i + 1) - downhill[i + 1] + car.drag * speed[i + 1] ** 2
+        speed[i] = min(speed[i], math.sqrt(speed[i + 1] ** 2 + 2.0 * max(braking, 0.0) * spacing))
+    for i in range(len(speed) - 1):
+        driving = min(car.power_per_mass / speed[i], car.driving_share * most[i] * spare(i)) + downhill[i] - car.drag * speed[i] ** 2
+        speed[i + 1] = min(speed[i + 1], math.sqrt(max(speed[i] ** 2 + 2.0 * driving * spacing, 0.01)))
+    return np.array(speed)
+
+
+class Follower:
+    """Drives a car along a plan.
+
+    Args:
+        plan: line and speed.
+        car: what is driven.
+        driver: who drives.
+        progress: where on the plan the car starts [m].
+        speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
+    """
+
+    def __init__(
+        self, plan: Plan, car: Car, driver: Driver, progress: float = 0.0, speed_at: Callable[[float], tuple[float, float]] | None = None
+    ) -> None:
+        self.plan, self.car, self.driver, self.progress = plan, car, driver, progress
+        self._speed_at = speed_at
+        self._per_metre = 1.0 / float(plan.distance[1])
+        self._last_cell = len(plan.distance) - 2
+        self._x, self._y, self._heading, self._curvature, self._speed, self._acceleration, self._friction, self._bank, self._grade = (
+            values.tolist()
+            for values in (
+                plan.x, plan.y, plan.heading, plan.curvature, plan.speed, plan.acceleration, plan.friction, plan.bank, plan.grade
+            )
+        )  # fmt: skip
+
+    @property
+    def start(self) -> tuple[float, float, float, float]:
+        """Place [m], heading [rad] and speed [m/s] at which the car starts."""
+        cell, share = self._cell(self.progress)
+        x, y, heading, speed = (_between(values, cell, share) for values in (self._x, self._y, self._heading, self._speed))
+        return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """What the driver does at a time [s], given what is seen of the car."""
+        car, driver = self.car, self.driver
+        speed, sideslip = seen.speed, seen.sideslip
+        lateral_error, heading_error, here, share = self._locate(seen, sideslip)
+        ahead, share_ahead = self._cell(self.progress + speed * (driver.steering_lag + driver.response * speed))
+        friction = max(_between(self._friction, ahead, share_ahead), 0.05)
+        bank, grade = _between(self._bank, here, share), _between(self._grade, here, share)
+        grip = car.grip * friction
+
+        preview = max(speed * driver.preview_time, 3.0)
+        error_ahead = lateral_error + preview * math.sin(heading_error)
+        meant = _between(self._curvature, ahead, share_ahead)
+        most = driver.saturation * grip / max(speed, 1.0) ** 2
+        curvature = max(-most, min(most, meant - 2.0 * error_ahead / preview**2))
+        lateral = curvature * speed**2 + GRAVITY * math.sin(bank)
+        steer = self._steer(meant, curvature - meant, speed, bank, friction)
+        steer -= driver.yaw_damping * (seen.yaw_rate - speed * curvature)
+        sliding = sideslip - car.sideslip_for(curvature, lateral, friction)
+        beyond = max(abs(sliding) - driver.slide, 0.0)
+        steer += driver.countersteer * math.copysign(beyond, sliding)
+
+        target, feedforward = (
+            self._speed_at(time)
+            if self._speed_at
+            else (_between(self._speed, here, share), _between(self._acceleration, ahead, share_ahead))
+        )
+        resistance = car.resistance(speed, seen.yaw_rate, seen.steer, sideslip) - GRAVITY * math.sin(grade)
+        acceleration = feedforward + driver.speed_gain * (target - speed) + resistance
+        spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
+        highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0)) * max(1.0 - beyond / 0.1, 0.0)
+        lowest = -max(driver.braking_share * grip * spare, 0.1 * grip)
+        return Command(
+            steering_velocity=steering_velocity(car, driver, steer, seen.steer),
+            acceleration=max(lowest, min(highest, acceleration)),
+            progress=self.progress,
+            lateral_error=lateral_error,
+            friction=_between(self._friction, here, share),
+            bank=bank,
+            grade=grade,
+            heading=_between(self._heading, here, share),
+        )
+
+    def _steer(self, meant: float, more: float, speed: float, bank: float, friction: float) -> float:
+        """Steering angle [rad] of the curvature that is meant, and of ``more`` [1/m] to get back to the line.
+
+        The latter with no more steering than half of the grip takes: at the limit a car hardly answers, and a driver who asks it
+        ever harder weaves.
+        """
+        car = self.car
+        held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
+        moderate = 0.5 * car.grip * friction
+        per_curvature = car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
+        return held + per_curvature * more
+
+    def _locate(self, seen: Observation, sideslip: float) -> tuple[float, float, int, float]:
+        """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the last progress."""
+        for _ in range(2):
+            cell, share = self._cell(self.progress)
+            heading = _between(self._heading, cell, share)
+            dx, dy = seen.x - _between(self._x, cell, share), seen.y - _between(self._y, cell, share)
+            along, across = math.cos(heading), math.sin(heading)
+            self.progress = max(self.progress + dx * along + dy * across, 0.0)
+        error = dy * along - dx * across
+        cell, share = self._cell(self.progress)
+        return error, math.remainder(seen.yaw + sideslip - heading, 2.0 * math.pi), cell, share
+
+    def _cell(self, distance: float) -> tuple[int, float]:
+        """Sample before a distance and the share of the way to the next one, held at the plan's ends."""
+        position = distance * self._per_metre
+        before = min(max(int(position), 0), self._last_cell)
+        return before, min(max(position - before, 0.0), 1.0)
+
+
+def steering_velocity(car: Car, driver: Driver, wanted: float, steer: float) -> float:
+    """Of the road wheels towards a wanted angle [rad/s], within what the car allows."""
+    wanted = max(-car.largest_steer, min(car.largest_steer, wanted))
+    return max(-car.steering_rate, min(car.steering_rate, (wanted - steer) / driver.steering_lag))
+
+
+def _between(values: list[float], before: int, share: float) -> float:
+    low = values[before]
+    return low + share * (values[before + 1] - low)
+
+
+def _repeat(values: FloatArray, n_laps: int, per_lap: float = 0.0) -> FloatArray:
+    """Values along a lap laid end to end ``n_laps`` times, going on by ``per_lap``."""
+    laps = [values[:-1] + lap * per_lap for lap in range(n_laps)]
+    return np.concatenate([*laps, values[-1:] + (n_laps - 1) * per_lap])
+
+
+def _sines(
+    distance: FloatArray, wavelengths: tuple[float, ...], phases: tuple[float, ...], amplitude: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean of sines of the given amplitude with its first and second derivative, each (N,)."""
+    wave_numbers = 2.0 * math.pi / np.array(wavelengths)
+    angles = distance[:, None] * wave_numbers + np.array(phases)
+    value = amplitude * np.mean(np.sin(angles), axis=1)
+    slope = amplitude * np.mean(wave_numbers * np.cos(angles), axis=1)
+    bend = -amplitude * np.mean(wave_numbers**2 * np.sin(angles), axis=1)
+    return value, slope, bend

@@ -1,0 +1,143 @@
+"""Freestyle driving of a small car: drifts, doughnuts, wheel spin and hard braking, one after the other as they come to mind."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.driver import Observation
+from vehest.simulation.driving.manoeuvre import OpenArea, Range, as_range, draw, generator_of, require
+from vehest.simulation.plant.planar import Inputs
+from vehest.simulation.plant.planar_car import PlanarCar
+from vehest.simulation.road.surface import Surface
+
+COMMAND_RATE_HZ = 100.0
+"""Rate at which the driver's hands reach the car."""
+SLOW = 0.9
+"""Speed below which the driver always gives gas [m/s]."""
+FAST = 1.0
+"""Speed over the wanted one at which the driver brakes [m/s]."""
+CALM = 0.12
+"""Sideslip angle below which the driver brakes, and has caught a slide [rad]."""
+COUNTERSTEER = 1.5
+"""Road-wheel angle over sideslip angle in a slide that he catches."""
+
+
+@dataclass(frozen=True)
+class Freestyle:
+    """A remotely controlled car on an open area, thrown from turn to turn; all habits are assumed.
+
+    The driver holds the steering at a stop, half way or straight for a while, then goes on to the next; gives gas in bursts as long as the
+    car is slower than he wants it, coasts, brakes where it is much faster; and countersteers where it slides more than he likes.
+
+    Args:
+        duration: of the recording [s].
+        speed: lowest and highest speed that he wants now and then [m/s].
+        current: of a burst of gas, lowest and highest [A].
+        sideslip: beyond which he takes the gas away and countersteers, drawn anew for each slide [rad].
+        brakes: share of the decisions that are a full braking.
+        kicks: share of the decisions that are a burst with the largest current.
+        straights: share of the steering decisions that are straight ahead.
+    """
+
+    name: ClassVar[str] = "freestyle"
+    duration: Range = (20.0, 40.0)
+    speed: tuple[float, float] = (1.4, 4.0)
+    current: tuple[float, float] = (10.0, 45.0)
+    sideslip: tuple[float, float] = (0.15, 0.35)
+    brakes: float = 0.02
+    kicks: float = 0.03
+    straights: float = 0.15
+
+    def __post_init__(self) -> None:
+        require(self, duration=(1.0, 3600.0), speed=(0.5, 20.0), current=(0.0, 1000.0), sideslip=(0.05, math.pi))
+        require(self, brakes=(0.0, 1.0), kicks=(0.0, 1.0), straights=(0.0, 1.0))
+        if self.brakes + self.kicks > 1.0:
+            raise ConfigurationError(f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}")
+
+    @property
+    def longest(self) -> float:
+        """The longest that a recording may be drawn to be [s]."""
+        return as_range(self.duration)[1]
+
+    def description(self) -> dict[str, Any]:
+        """Name and parameters."""
+        return {"name": self.name, **asdict(self)}
+
+    def driver(self, car: PlanarCar, surface: Surface, seed: int) -> FreestyleDriver:
+        """The driver of this seed."""
+        return FreestyleDriver(self, car, OpenArea(surface, seed), generator_of(seed))
+
+
+class FreestyleDriver:
+    """Drives one car for the time of one recording.
+
+    Args:
+        style: how.
+        car: what is driven.
+        area: where.
+        generator: decides.
+    """
+
+    def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, generator: np.random.Generator) -> None:
+        self._style, self._car, self._area, self._generator = style, car, area, generator
+        self.duration = draw(style.duration, generator)
+        self.drawn = {"duration": self.duration}
+        self._progress = self._speed_until = self._steer_until = self._gas_until = 0.0
+        self._wanted = self._steer = self._gas = 0.0
+        self._side, self._held_sideslip, self._saves = 1.0, draw(style.sideslip, generator), False
+
+    def inputs(self, time: float, seen: Observation) -> Inputs:
+        """What the driver does at a time [s]; to be asked COMMAND_RATE_HZ times a second."""
+        self._progress += seen.speed / COMMAND_RATE_HZ
+        sideslip = math.atan2(seen.vy, seen.vx) if seen.speed > SLOW else 0.0
+        if not self._saves and abs(sideslip) > self._held_sideslip:
+            self._saves, self._held_sideslip = True, draw(self._style.sideslip, self._generator)
+        elif self._saves and abs(sideslip) < CALM:
+            self._saves = False
+        steer, gas = self._next_steer(time), self._next_gas(time, seen)
+        if self._saves:
+            steer, gas = COUNTERSTEER * sideslip, 0.0
+        elif gas < 0.0 and abs(sideslip) > CALM:
+            gas = 0.0
+        return Inputs(steer, gas, self._area.friction_at(self._progress))
+
+    def _next_steer(self, time: float) -> float:
+        """At a stop mostly, to one side and then to the other."""
+        if time >= self._steer_until:
+            generator, kind = self._generator, self._generator.uniform()
+            self._side = -self._side if generator.uniform() < 0.6 else self._side
+            self._steer = self._side * self._car.largest_steer
+            self._steer_until = time + float(generator.gamma(1.5, 1.0))
+            if kind < self._style.straights:
+                self._steer *= float(generator.uniform(-0.1, 0.1))
+            elif kind < 2.0 * self._style.straights:
+                self._steer *= float(generator.uniform(0.2, 0.9))
+            else:
+                self._steer_until += float(generator.gamma(1.5, 1.0))
+        return self._steer
+
+    def _next_gas(self, time: float, seen: Observation) -> float:
+        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast or for the fun of it."""
+        generator, style, largest = self._generator, self._style, self._car.largest_current
+        if time >= self._speed_until:
+            self._wanted = float(generator.uniform(*as_range(style.speed)))
+            self._speed_until = time + float(generator.uniform(1.0, 4.0))
+        if seen.vx < SLOW and self._gas <= 0.0:
+            self._gas_until = time
+        if time >= self._gas_until:
+            kind, current = generator.uniform(), float(generator.uniform(*style.current))
+            self._gas_until = time + float(generator.uniform(0.15, 0.6))
+            if seen.vx < SLOW:
+                self._gas = max(current, 0.4 * largest)
+            elif kind < style.brakes or seen.vx > self._wanted + FAST:
+                self._gas = -float(generator.uniform(0.3, 0.7)) * largest
+            elif kind > 1.0 - style.kicks:
+                self._gas = float(generator.uniform(0.8, 1.0)) * largest
+            else:
+                self._gas = current if seen.vx < self._wanted else 0.0
+        return self._gas

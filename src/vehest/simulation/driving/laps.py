@@ -1,0 +1,278 @@
+"""Laps of a course: at a share of the grip, at given speeds, and in a given time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.car import Car
+from vehest.simulation.driving.driver import Command, Driver, Follower, Observation, Plan, draw_style, plan_laps
+from vehest.simulation.driving.manoeuvre import (
+    SETTLING_TIME,
+    Controller,
+    Manoeuvre,
+    Range,
+    as_range,
+    draw,
+    draw_driver,
+    generator_of,
+    require,
+)
+from vehest.simulation.road.course import Course, course_by_name
+from vehest.simulation.road.surface import Surface
+
+
+@dataclass(frozen=True)
+class Laps(Manoeuvre):
+    """Laps of a course at a share of the grip that varies along the way.
+
+    Args:
+        course: name of the course.
+        duration: of the recording [s]; none where ``laps`` is given.
+        laps: whole laps to record.
+        severity: mean share of the grip.
+        ripple: by which the share varies along the way.
+        line_offset: by which the line varies about the road's middle [m].
+        top_speed: that the driver does not exceed [m/s]; by default the car's.
+        flat: leaves out the course's bank and grade.
+        half_width: of the road, beyond which the car has left it [m].
+    """
+
+    name: ClassVar[str] = "laps"
+    course: str = "handling"
+    duration: float | None = None
+    laps: int | None = None
+    severity: Range = (0.65, 0.9)
+    ripple: float = 0.05
+    line_offset: float = 0.5
+    top_speed: float | None = None
+    flat: bool = False
+    half_width: float = 5.0
+
+    def __post_init__(self) -> None:
+        require(self, severity=(0.05, 1.0), ripple=(0.0, 0.5), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
+        course_by_name(self.course)
+        if (self.duration is None) == (self.laps is None):
+            raise ConfigurationError("manoeuvre 'laps' needs either a duration [s] or a number of laps")
+        if self.duration is not None:
+            require(self, duration=(0.01, 36_000.0))
+        if self.laps is not None and not (isinstance(self.laps, int) and 1 <= self.laps <= 1000):
+            raise ConfigurationError(f"manoeuvre 'laps': laps must be a whole number from 1, not {self.laps}")
+        if self.top_speed is not None:
+            require(self, top_speed=(3.0, 100.0))
+
+    @property
+    def longest(self) -> float:
+        """The duration, or long enough for the laps."""
+        return self.duration if self.duration is not None else 1000.0 * (self.laps or 1)
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the style and the habits of this seed."""
+        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        low, high = as_range(self.severity)
+        room = 1.0 - self.ripple
+        style = draw_style(seed, (min(low, room), min(high, room)), self.ripple, self.line_offset)
+        friction = course.friction * surface.along(course.arc_length, seed, course.length)
+        highest = self.top_speed if self.top_speed is not None else math.inf
+
+        def plan(n_laps: int) -> Plan:
+            return plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=highest)
+
+        laps = self.laps if self.laps is not None else math.ceil((self.duration or 0.0) / _lap_time(plan(2), course.length)) + 1
+        end = (1 + self.laps) * course.length if self.laps is not None else math.inf
+        drawn = {"style": asdict(style), "driver": asdict(driver)}
+        end_time = self.duration if self.duration is not None else math.inf
+        return LapDriver(plan(laps + 2), car, driver, course.length, end, drawn, end_time=end_time)
+
+
+@dataclass(frozen=True)
+class SpeedLaps(Manoeuvre):
+    """A lap at each of several speeds, then a stop, as the truck of Di Biase et al. 2020 drove them.
+
+    Args:
+        course: name of the course.
+        speeds: of the laps, one after the other [m/s]; 30, 40 and 45 km/h in the paper.
+        stop_time: from the last lap's speed to the stand [s]; 5 s in the paper.
+        severity: share of the grip that corners get at most.
+        change_rate: acceleration by which the speed changes from lap to lap [m/s²].
+        line_offset: by which the line varies about the road's middle [m].
+        flat: leaves out the course's bank and grade.
+        half_width: of the road, beyond which the car has left it [m].
+    """
+
+    name: ClassVar[str] = "speed_laps"
+    course: str = "vairano_like"
+    speeds: tuple[float, ...] = (30.0 / 3.6, 40.0 / 3.6, 45.0 / 3.6)
+    stop_time: float = 5.0
+    severity: Range = 0.7
+    change_rate: float = 0.4
+    line_offset: float = 0.3
+    flat: bool = False
+    half_width: float = 5.0
+
+    def __post_init__(self) -> None:
+        require(self, severity=(0.05, 0.95), stop_time=(1.0, 60.0), change_rate=(0.05, 3.0), line_offset=(0.0, 3.0))
+        require(self, half_width=(0.5, 50.0))
+        course_by_name(self.course)
+        if not self.speeds or not all(2.0 <= speed <= 60.0 for speed in self.speeds):
+            raise ConfigurationError(f"manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not {list(self.speeds)}")
+
+    @property
+    def longest(self) -> float:
+        """Twice as long as the laps take at their speeds, and the stop."""
+        length = course_by_name(self.course).length
+        return 2.0 * sum(length / speed for speed in self.speeds) + self.stop_time
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the line and the habits of this seed."""
+        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        severity = draw(self.severity, generator_of(seed))
+        style = draw_style(seed, (severity, severity), 0.0, self.line_offset)
+        friction = course.friction * surface.along(course.arc_length, seed, course.length)
+        n_laps = len(self.speeds) + 2
+        cells = len(course.arc_length) - 1
+        lap_of = np.clip(np.arange(n_laps * cells + 1) // cells - 1, 0, len(self.speeds) - 1)
+        wanted = np.array(self.speeds)[lap_of]
+        plan = plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=_eased(wanted, course, self.change_rate))
+        end = (1 + len(self.speeds)) * course.length
+        drawn = {"severity": severity, "style": asdict(style), "driver": asdict(driver)}
+        return LapDriver(plan, car, driver, course.length, end, drawn, stop_time=self.stop_time)
+
+
+@dataclass(frozen=True)
+class FastLap(Manoeuvre):
+    """One lap of a given mean and top speed, as the truck of Di Biase et al. 2020 drove it.
+
+    Args:
+        course: name of the course.
+        mean_speed: length of the course over the time of the lap [m/s]; 76 km/h in the paper.
+        top_speed: that the driver does not exceed [m/s]; 115 km/h in the paper.
+        line_offset: by which the line varies about the road's middle [m].
+        flat: leaves out the course's bank and grade.
+        half_width: of the road, beyond which the car has left it [m].
+    """
+
+    name: ClassVar[str] = "fast_lap"
+    course: str = "vairano_like"
+    mean_speed: float = 76.0 / 3.6
+    top_speed: float = 115.0 / 3.6
+    line_offset: float = 0.3
+    flat: bool = False
+    half_width: float = 5.0
+
+    def __post_init__(self) -> None:
+        require(self, mean_speed=(2.0, 60.0), top_speed=(self.mean_speed, 100.0), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
+        course_by_name(self.course)
+
+    @property
+    def longest(self) -> float:
+        """Twice as long as the lap should take."""
+        return 2.0 * course_by_name(self.course).length / self.mean_speed
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver who uses as much of the grip as the mean speed takes.
+
+        Raises:
+            ConfigurationError: the car is too slow for the mean speed on this course.
+        """
+        course, driver = _course(self.course, self.flat), draw_driver(seed)
+        friction = course.friction * surface.along(course.arc_length, seed, course.length)
+
+        def plan(severity: float) -> Plan:
+            style = draw_style(seed, (severity, severity), 0.0, self.line_offset)
+            return plan_laps(course, car, driver, style, 3, friction=friction, highest_speed=self.top_speed)
+
+        def mean(severity: float) -> float:
+            return course.length / _lap_time(plan(severity), course.length)
+
+        low, high = 0.02, FASTEST_SEVERITY
+        if mean(high) < self.mean_speed:
+            raise ConfigurationError(
+                f"manoeuvre 'fast_lap': vehicle '{car.name}' laps '{course.name}' at {mean(high):.1f} m/s at most, "
+                f"not at {self.mean_speed:.1f} m/s: choose another car, or a lower mean_speed"
+            )
+        for _ in range(12):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if mean(middle) < self.mean_speed else (low, middle)
+        return LapDriver(plan(high), car, driver, course.length, 2.0 * course.length, {"severity": high, "driver": asdict(driver)})
+
+
+FASTEST_SEVERITY = 0.95
+"""Share of the grip that a fast lap may take."""
+
+
+class LapDriver(Follower):
+    """Follows a plan of laps from just before the second, so that the first sample is taken on the line, to an end.
+
+    Args:
+        plan: of one lap more than is recorded.
+        car: what is driven.
+        driver: who drives.
+        lap: length of a lap [m].
+        end: distance at which the drive is over, or the stop begins [m].
+        drawn: what the seed decided.
+        stop_time: time from the end to the stand [s]; by default the drive is over at the end.
+        end_time: at which the drive is over wherever the car is [s].
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        lap: float,
+        end: float,
+        drawn: dict[str, Any],
+        stop_time: float | None = None,
+        end_time: float = math.inf,
+    ) -> None:
+        times = np.concatenate([[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))])
+        on_line = np.interp(lap, plan.distance, times)
+        super().__init__(plan, car, driver, progress=float(np.interp(on_line - SETTLING_TIME, times, plan.distance)))
+        self.drawn, self._end, self._stop_time, self._end_time = drawn, end, stop_time, end_time
+        self._stop: tuple[float, float] | None = None  # when it began, and at which speed
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """As planned, and braking evenly once the end is reached."""
+        decision = super().command(time, seen)
+        if decision.progress < self._end:
+            return decision._replace(finished=time >= self._end_time - 1e-9)
+        if self._stop_time is None:
+            return decision._replace(finished=True)
+        if self._stop is None:
+            self._stop = (time, seen.speed)
+        begin, speed = self._stop
+        return decision._replace(acceleration=even_stop(time - begin, speed, self._stop_time, seen.speed))
+
+
+def even_stop(since: float, speed_before: float, stop_time: float, speed: float) -> float:
+    """Acceleration [m/s²] of a driver who brakes evenly from a speed to the stand within a time."""
+    rate = speed_before / stop_time
+    return -rate + 3.0 * min(speed_before - rate * since - speed, 0.0)
+
+
+def _course(name: str, flat: bool) -> Course:
+    course = course_by_name(name)
+    level = np.zeros_like(course.arc_length)
+    return replace(course, bank=level, grade=level) if flat else course
+
+
+def _lap_time(plan: Plan, length: float) -> float:
+    """Of the plan's second lap [s]."""
+    lap = (plan.distance >= length) & (plan.distance < 2.0 * length)
+    return float(np.sum(plan.distance[1] / plan.speed[lap]))
+
+
+def _eased(speed: FloatArray, course: Course, rate: float) -> FloatArray:
+    """Speeds [m/s] along the way without steps: they change by a constant acceleration around each step."""
+    spacing, eased = float(course.arc_length[1]), speed.copy()
+    for at in np.flatnonzero(np.diff(speed)).tolist():
+        before, after = speed[at], speed[at + 1]
+        cells = max(round(abs(after**2 - before**2) / (2.0 * rate) / spacing), 1)
+        eased[at + 1 : at + 1 + cells] = np.sqrt(np.linspace(before**2, after**2, cells + 1)[1:])[: len(eased) - at - 1]
+    return eased

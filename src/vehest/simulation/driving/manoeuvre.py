@@ -1,0 +1,188 @@
+"""What a manoeuvre is: its parameters, what a seed draws from them, and the controller it gives a drive."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.car import Car
+from vehest.simulation.driving.driver import Command, Driver, Follower, Observation, Plan
+from vehest.simulation.road.lines import Line
+from vehest.simulation.road.surface import Surface
+
+Range = float | tuple[float, float]
+
+SETTLING_TIME = 2.0
+"""Driven before the first sample [s]."""
+OPEN_AREA_LAP = 2000.0
+"""Distance after which an open area's patches of friction come again [m]."""
+
+_STREAM = 3  # of a drive's seed; 0 is the style's, 1 the sensors', 2 the surface's
+
+
+class Controller(Protocol):
+    """Drives one car through one manoeuvre."""
+
+    @property
+    def start(self) -> tuple[float, float, float, float]:
+        """Place x, y [m], heading [rad] and speed [m/s] at which the car starts."""
+        ...
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """What the seed decided, in words and numbers that JSON can hold."""
+        ...
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """What the driver does at a time [s]; called every hundredth of a second."""
+        ...
+
+
+@dataclass(frozen=True)
+class Manoeuvre(ABC):
+    """What all manoeuvres share."""
+
+    name: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def longest(self) -> float:
+        """Time after which the recording ends in any case, unless the car is coming to its stand [s]."""
+
+    @abstractmethod
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver for this car on this surface, as the seed wants it.
+
+        Raises:
+            ConfigurationError: the car cannot do this.
+        """
+
+    def description(self) -> dict[str, Any]:
+        """Name and parameters."""
+        return {"name": self.name, **asdict(self)}
+
+
+FASTEST_SHARE = 0.9
+"""Share of the top speed that a manoeuvre on an open area is driven at, at most."""
+
+
+class LineDriver(Follower):
+    """Follows a line until its end.
+
+    Args:
+        plan: line and speed.
+        car: what is driven.
+        driver: who drives.
+        drawn: what the seed decided.
+        end: distance at which the drive is over [m]; by default the plan's end.
+        speed_at: see Follower.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        drawn: dict[str, Any],
+        end: float | None = None,
+        speed_at: Callable[[float], tuple[float, float]] | None = None,
+    ) -> None:
+        super().__init__(plan, car, driver, speed_at=speed_at)
+        self.drawn, self._end = drawn, plan.length - 1.0 if end is None else end
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """As planned, until the end."""
+        decision = super().command(time, seen)
+        return decision._replace(finished=True) if decision.progress >= self._end else decision
+
+
+class OpenArea:
+    """Friction along the way on an open area.
+
+    Args:
+        surface: of the area.
+        seed: of the drive, for patches.
+    """
+
+    def __init__(self, surface: Surface, seed: int) -> None:
+        self._friction = surface.along(np.arange(0.0, OPEN_AREA_LAP), seed, OPEN_AREA_LAP).tolist()
+        self.mean, self.lowest = float(np.mean(self._friction)), min(self._friction)
+
+    def friction_at(self, distance: float) -> float:
+        """Scale of the tyres' friction after a distance [m]."""
+        return float(self._friction[int(distance) % len(self._friction)])
+
+
+SIDES = {1.0: "left", -1.0: "right"}
+"""Names of what draw_side gives."""
+
+
+SIDE_CHOICES = ("left", "right", "either")
+"""What a manoeuvre's ``side`` may be."""
+
+
+def require_one_of(manoeuvre: Any, key: str, choices: tuple[Any, ...]) -> None:
+    """Refuse a parameter that is none of its choices.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    value = getattr(manoeuvre, key)
+    if value not in choices:
+        raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} '{value}' is not one of: {', '.join(map(str, choices))}")
+
+
+def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
+    """Refuse parameters outside their limits, both ends of a range included.
+
+    Raises:
+        ConfigurationError: one of them is.
+    """
+    for key, (lowest, highest) in limits.items():
+        value = getattr(manoeuvre, key)
+        low, high = as_range(value)
+        if not (lowest <= low <= high <= highest):
+            raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, not {value}")
+
+
+def as_range(value: Range) -> tuple[float, float]:
+    """Lowest and highest value."""
+    low, high = value if isinstance(value, tuple) else (value, value)
+    return float(low), float(high)
+
+
+def generator_of(seed: int) -> np.random.Generator:
+    """Of what a manoeuvre draws, in the order in which it draws."""
+    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+
+
+def draw(value: Range, generator: np.random.Generator) -> float:
+    """A value of the range, uniformly; also a plain number takes one draw, so that later ones stay as they are."""
+    return float(generator.uniform(*as_range(value)))
+
+
+def draw_side(side: str, generator: np.random.Generator) -> float:
+    """1 for the left, -1 for the right."""
+    drawn = 1.0 if generator.uniform() < 0.5 else -1.0
+    return {"left": 1.0, "right": -1.0}.get(side, drawn)
+
+
+def draw_driver(seed: int) -> Driver:
+    """The habits of the person who drives; their spread is assumed."""
+    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
+    usual = Driver()
+    spread = {"preview_time": 0.1, "response": 0.1, "steering_lag": 0.15, "yaw_damping": 0.15, "countersteer": 0.2}
+    habits = {name: getattr(usual, name) * float(generator.uniform(1.0 - by, 1.0 + by)) for name, by in spread.items()}
+    return replace(usual, **habits)
+
+
+def plan_along(line: Line, speed: float, surface: Surface, seed: int) -> Plan:
+    """A plan for a level open area: along a line at a constant speed [m/s]."""
+    level = np.zeros_like(line.distance)
+    friction = surface.along(line.distance, seed, OPEN_AREA_LAP)
+    return Plan(line.distance, line.x, line.y, line.heading, line.curvature, level + speed, friction, level, level)

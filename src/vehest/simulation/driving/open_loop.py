@@ -1,0 +1,223 @@
+"""Manoeuvres steered by the clock on an open area: J-turn, spiral and random steer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.driving.car import Car
+from vehest.simulation.driving.driver import DRIVER_RATE_HZ, Command, Observation
+from vehest.simulation.driving.manoeuvre import (
+    FASTEST_SHARE,
+    SETTLING_TIME,
+    SIDE_CHOICES,
+    SIDES,
+    Controller,
+    Manoeuvre,
+    OpenArea,
+    Range,
+    as_range,
+    draw,
+    draw_side,
+    generator_of,
+    require,
+    require_one_of,
+)
+from vehest.simulation.road.surface import Surface
+
+
+@dataclass(frozen=True)
+class StepSteer(Manoeuvre):
+    """J-turn: straight ahead, then the steering wheel is turned quickly and held (ISO 7401, step input).
+
+    Args:
+        speed: [m/s]; the driver holds it as far as grip and power allow.
+        severity: share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square.
+        steer_time: in which the angle is reached, unless the steering is slower [s].
+        turn_time: after the step [s].
+        side: ``left``, ``right`` or ``either``.
+    """
+
+    name: ClassVar[str] = "j_turn"
+    speed: Range = (15.0, 28.0)
+    severity: Range = (0.4, 1.0)
+    steer_time: Range = (0.15, 0.6)
+    turn_time: Range = (5.0, 8.0)
+    side: str = "either"
+
+    def __post_init__(self) -> None:
+        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), steer_time=(0.02, 10.0), turn_time=(0.5, 600.0))
+        require_one_of(self, "side", SIDE_CHOICES)
+
+    @property
+    def longest(self) -> float:
+        """Run-in and turn."""
+        return 5.0 + as_range(self.steer_time)[1] + as_range(self.turn_time)[1]
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the speed, the angle and the side of this seed."""
+        generator = generator_of(seed)
+        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
+        severity, steer_time, turn_time = (draw(values, generator) for values in (self.severity, self.steer_time, self.turn_time))
+        side, begin = draw_side(self.side, generator), float(generator.uniform(1.0, 2.0))
+        area = OpenArea(surface, seed)
+        angle = side * _steer_at(car, severity, speed, area.mean)
+
+        def steer_at(time: float) -> float:
+            return angle * min(max((time - begin) / steer_time, 0.0), 1.0)
+
+        drawn = {"speed": speed, "severity": severity, "steer": angle, "begin": begin, "steer_time": steer_time, "side": SIDES[side]}
+        return OpenLoop(car, area, speed, steer_at, begin + steer_time + turn_time, drawn)
+
+
+@dataclass(frozen=True)
+class Spiral(Manoeuvre):
+    """Spiral: at constant speed the steering angle grows slowly, then, in a second turn, to the other side.
+
+    Args:
+        speed: [m/s]; the driver holds it as far as grip and power allow.
+        severity: share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square.
+        ramp_time: in which the angle is reached [s].
+        hold_time: at the angle [s].
+        turns: 1, or 2 for a second turn to the other side.
+        side: of the first turn: ``left``, ``right`` or ``either``.
+    """
+
+    name: ClassVar[str] = "spiral"
+    speed: Range = (14.0, 25.0)
+    severity: Range = (0.7, 1.0)
+    ramp_time: Range = (6.0, 12.0)
+    hold_time: Range = (1.0, 2.0)
+    turns: int = 2
+    side: str = "either"
+
+    def __post_init__(self) -> None:
+        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), ramp_time=(0.5, 300.0), hold_time=(0.0, 300.0))
+        require_one_of(self, "side", SIDE_CHOICES)
+        require_one_of(self, "turns", (1, 2))
+
+    @property
+    def longest(self) -> float:
+        """Run-in, ramps and holds."""
+        return 10.0 + 2.0 * (1.5 * as_range(self.ramp_time)[1] + as_range(self.hold_time)[1])
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the speed, the angle and the side of this seed."""
+        generator = generator_of(seed)
+        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
+        severity, ramp, hold = (draw(values, generator) for values in (self.severity, self.ramp_time, self.hold_time))
+        side, begin = draw_side(self.side, generator), float(generator.uniform(1.0, 2.0))
+        area = OpenArea(surface, seed)
+        angle = side * _steer_at(car, severity, speed, area.mean)
+        back = min(0.4 * ramp, 3.0)
+        times, angles = [begin, begin + ramp, begin + ramp + hold, begin + ramp + hold + back], [0.0, angle, angle, 0.0]
+        if self.turns == 2:
+            again = times[-1]
+            times, angles = [*times, again + ramp, again + ramp + hold, again + ramp + hold + back], [*angles, -angle, -angle, 0.0]
+
+        def steer_at(time: float) -> float:
+            return float(np.interp(time, times, angles))
+
+        drawn = {"speed": speed, "severity": severity, "steer": angle, "begin": begin, "ramp_time": ramp, "side": SIDES[side]}
+        return OpenLoop(car, area, speed, steer_at, times[-1] + 1.0, drawn)
+
+
+@dataclass(frozen=True)
+class RandomSteer(Manoeuvre):
+    """Random steering within a band of frequencies at roughly constant speed (in the manner of ISO 7401, random input).
+
+    Args:
+        speed: [m/s]; the driver holds it as far as grip and power allow.
+        severity: share of the grip that three standard deviations of the steering angle would take in a steady turn.
+        band: lowest and highest frequency [Hz].
+        duration: of the recording [s].
+    """
+
+    name: ClassVar[str] = "random_steer"
+    speed: Range = (14.0, 30.0)
+    severity: Range = (0.5, 1.0)
+    band: tuple[float, float] = (0.1, 1.2)
+    duration: float = 30.0
+
+    def __post_init__(self) -> None:
+        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), duration=(1.0, 3600.0))
+        if not 0.01 <= self.band[0] < self.band[1] <= 5.0:
+            raise ConfigurationError(f"manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not {self.band}")
+
+    @property
+    def longest(self) -> float:
+        """The duration."""
+        return self.duration
+
+    def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
+        """A driver with the speed and the noise of this seed."""
+        generator = generator_of(seed)
+        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
+        severity = draw(self.severity, generator)
+        area = OpenArea(surface, seed)
+        deviation = _steer_at(car, severity, speed, area.mean) / 3.0
+        edges = np.linspace(*self.band, N_SINES + 1)
+        rates = (2.0 * math.pi * generator.uniform(edges[:-1], edges[1:])).tolist()
+        phases = generator.uniform(0.0, 2.0 * math.pi, N_SINES).tolist()
+        amplitude = deviation * math.sqrt(2.0 / N_SINES)
+
+        def steer_at(time: float) -> float:
+            fade = min(max((time + 0.5) / 1.0, 0.0), 1.0)
+            return fade * amplitude * sum(math.sin(rate * time + phase) for rate, phase in zip(rates, phases, strict=True))
+
+        drawn = {"speed": speed, "severity": severity, "steer_deviation": deviation}
+        return OpenLoop(car, area, speed, steer_at, self.duration, drawn)
+
+
+N_SINES = 24
+"""Of which random steering is made, evenly spread over the band."""
+
+
+class OpenLoop:
+    """Steers by the clock on an open area and holds the speed.
+
+    Args:
+        car: what is driven.
+        area: where.
+        speed: [m/s].
+        steer_at: road-wheel angle [rad] at a time [s].
+        end_time: at which the drive is over [s].
+        drawn: what the seed decided.
+    """
+
+    def __init__(
+        self, car: Car, area: OpenArea, speed: float, steer_at: Callable[[float], float], end_time: float, drawn: dict[str, Any]
+    ) -> None:
+        self.drawn, self.start = drawn, (0.0, 0.0, 0.0, speed)
+        self._car, self._area, self._speed, self._steer_at, self._end_time = car, area, speed, steer_at, end_time
+        self._progress, self._before = 0.0, -SETTLING_TIME
+
+    def command(self, time: float, seen: Observation) -> Command:
+        """Steering by the clock; throttle or brakes as the speed wants them and the grip allows."""
+        car, speed = self._car, seen.speed
+        self._progress += speed * (time - self._before)
+        self._before = time
+        friction = self._area.friction_at(self._progress)
+        rate = (self._steer_at(time + 1.0 / DRIVER_RATE_HZ) - seen.steer) * DRIVER_RATE_HZ
+        grip = car.grip * friction
+        spare = math.sqrt(max(1.0 - (seen.yaw_rate * speed / grip) ** 2, 0.0))
+        wanted = 1.5 * (self._speed - speed) + car.resistance(speed, seen.yaw_rate, seen.steer, seen.sideslip)
+        highest = min(car.driving_share * grip * spare, car.power_per_mass / max(speed, 1.0))
+        return Command(
+            steering_velocity=max(-car.steering_rate, min(car.steering_rate, rate)),
+            acceleration=max(-0.2 * grip, min(highest, wanted)),
+            progress=self._progress,
+            friction=friction,
+            finished=time >= self._end_time,
+        )
+
+
+def _steer_at(car: Car, severity: float, speed: float, friction: float) -> float:
+    """Road-wheel angle [rad] of a steady turn that takes a share of the grip."""
+    lateral = min(severity, 1.0) * car.grip * friction
+    return min(car.steer_for(lateral / speed**2, lateral, friction) * max(severity, 1.0) ** 2, car.largest_steer)

@@ -1,0 +1,338 @@
+"""CommonRoad's multi-body equations and a fixed-step Runge-Kutta method, compiled.
+
+The library's functions are bound again to compiled versions of the functions they call; the equations of motion come
+with the changes of rewriting.py, and nothing of them is written here a second time. Regimes are those of regimes.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import inspect
+import math
+import types
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from vehiclemodels.utils import tire_model
+from vehiclemodels.utils.acceleration_constraints import acceleration_constraints
+from vehiclemodels.utils.steering_constraints import steering_constraints
+from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
+
+from vehest.simulation.plant import parameters as parameter_tuples
+from vehest.simulation.plant import regimes
+from vehest.simulation.plant.regimes import (
+    FIRST_WHEEL,
+    PITCH_RATE,
+    ROLL,
+    ROLL_RATE,
+    ROLLING,
+    SLIDING,
+    SLOW,
+    STEER,
+    VX,
+    VY,
+    VY_FRONT,
+    VY_REAR,
+    WHEEL_RELAXATION,
+    YAW,
+    YAW_RATE,
+    forces_of_contact,
+    next_regime,
+    slow_motion,
+    wheel_velocities,
+)
+from vehest.simulation.plant.rewriting import CONTACT_FORCES, SMALLEST_WHEEL_VELOCITY, rewritten_source
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+LIBRARY = "commonroad-vehicle-models"
+LIBRARY_VERSION = importlib.metadata.version(LIBRARY)
+
+N_STATES = 29
+N_INPUTS = 5
+N_FORCES = 12
+
+ROLLED_OVER = 0.6
+"""Roll angle beyond which the car has rolled over [rad]: no shipped car stands at it."""
+STABLE_RATE = 2.785
+"""The Runge-Kutta method is stable for eigenvalues down to -STABLE_RATE/step."""
+AT_REST = 1e-9
+"""Lateral velocity [m/s] and yaw rate [rad/s] of a standing car that count as none."""
+OVERSPEED = 1.1
+"""Speed of the driven wheels over the car's top speed at which the engine gives no more torque; assumed."""
+LARGEST_LOAD_FACTOR = 1.5
+"""Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
+
+_REWRITTEN = rewritten_source(vehicle_dynamics_mb, f"{LIBRARY} {LIBRARY_VERSION}")
+
+
+def _compile(function: Callable[..., Any]) -> Any:
+    # As in NumPy, a division by zero gives an infinite value, which the plant reports with the time it happened at.
+    return numba.njit(error_model="numpy")(function)
+
+
+def _compile_bound(function: Callable[..., Any], names: Mapping[str, Any]) -> Any:
+    """Compile a library function with some of the global names it uses bound to compiled objects."""
+    bindings = {**function.__globals__, **names}  # type: ignore[attr-defined]
+    return _compile(types.FunctionType(function.__code__, bindings, function.__name__))  # type: ignore[attr-defined]
+
+
+def _compile_source(source: str, name: str, names: Mapping[str, Any]) -> Any:
+    bindings = dict(names)
+    exec(compile(source, f"<{name}>", "exec"), bindings)
+    return _compile(bindings[name])
+
+
+def _compile_tyre_model() -> types.ModuleType:
+    compiled = types.ModuleType("compiled_tyre_model")
+    sign = _compile(tire_model.sign)
+    for name in (
+        "formula_longitudinal",
+        "formula_lateral",
+        "formula_longitudinal_comb",
+        "formula_lateral_comb",
+    ):
+        setattr(compiled, name, _compile_bound(getattr(tire_model, name), {"sign": sign}))
+    return compiled
+
+
+_tyre_model = _compile_tyre_model()
+_formula_lateral = _tyre_model.formula_lateral
+
+
+def _compile_multi_body() -> Any:
+    names = {
+        "steering_constraints": _compile(steering_constraints),
+        "acceleration_constraints": _compile(acceleration_constraints),
+        "tireModel": _tyre_model,
+        CONTACT_FORCES: forces_of_contact,
+    }
+    return _compile_source(_REWRITTEN, vehicle_dynamics_mb.__name__, {**vehicle_dynamics_mb.__globals__, **names})
+
+
+def _unpacking_source() -> str:
+    """Source of a function that makes MultiBodyValues of a vector of values, friction scaled."""
+    places = iter(range(10_000))
+
+    def expression(values_class: Any) -> str:
+        return f"{values_class.__name__}({', '.join(argument(values_class, name, places) for name in values_class._fields)})"
+
+    def argument(values_class: Any, name: str, places: Iterator[int]) -> str:
+        if values_class is parameter_tuples.MultiBodyValues and name in parameter_tuples.GROUPS:
+            return expression(parameter_tuples.GROUPS[name])
+        scale = " * friction" if name in ("p_dx1", "p_dy1") else ""
+        return f"vector[{next(places)}]{scale}"
+
+    return f"def unpack(vector, friction):\n    return {expression(parameter_tuples.MultiBodyValues)}"
+
+
+multi_body = _compile_multi_body()
+"""multi_body(x, (steering velocity, acceleration), p, contact) -> derivatives, twelve forces: see rewriting.py."""
+# Passed as a vector, because taking nested tuples apart at every call costs as much as ten evaluations.
+_unpack = _compile_source(_unpacking_source(), "unpack", vars(parameter_tuples))
+
+
+@_compile
+def _sliding_friction(tyre):  # type: ignore[no-untyped-def]
+    """Lateral force over load of an upright wheel that slips at a right angle."""
+    return abs(_formula_lateral(0.5 * math.pi, 0.0, 1.0, tyre)[0])
+
+
+@_compile
+def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def]
+    """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order and the wheels' axes."""
+    regime, inputs = contact[0], contact[1]
+    f, forces = multi_body(x, (inputs[0], _engine_limit(x, inputs[1], p)), p, contact)
+    for i in range(N_STATES):
+        derivatives[i] = f[i]
+    derivatives[VY_FRONT] += inputs[4]
+    derivatives[VY_REAR] += inputs[4]
+    if regime == ROLLING:
+        moment = _yaw_moment(inputs[2], forces, p)
+        brake = abs(moment) / _brake_arm(p)
+        derivatives[VX] += inputs[3] - brake / p.m
+        derivatives[VY] += inputs[4]
+        derivatives[PITCH_RATE] -= brake * p.h_s / p.I_y_s
+        derivatives[YAW_RATE] += moment / (p.I_z - p.I_xz_s**2 / p.I_Phi_s)
+        derivatives[ROLL_RATE] += moment * p.I_xz_s / p.I_z / (p.I_Phi_s - p.I_xz_s**2 / p.I_z)
+        return forces
+    sine, cosine = math.sin(x[YAW]), math.cos(x[YAW])
+    derivatives[0], derivatives[1] = x[VX] * cosine - x[VY] * sine, x[VX] * sine + x[VY] * cosine
+    if regime == SLOW:
+        acceleration = acceleration_limit(x[VX], inputs[1], p.longitudinal)
+        derivatives[VX], derivatives[VY], derivatives[YAW_RATE] = slow_motion(x, derivatives[STEER], acceleration, inputs, p)
+        velocities = wheel_velocities(x, p)
+        for i in range(4):
+            # With the slip that the force will need, so that ROLLING takes over where SLOW left.
+            stiffness = p.tire.p_kx1 if i < 2 else p.tire_rear.p_kx1
+            turning = (1.0 + forces[i] / (stiffness * forces[8 + i])) / p.R_w
+            lag = (velocities[i] * turning - x[FIRST_WHEEL + i]) / WHEEL_RELAXATION
+            derivatives[FIRST_WHEEL + i] = derivatives[VX] * turning + lag
+    else:
+        derivatives[VX] += inputs[3]
+        derivatives[VY] += inputs[4]
+        for i in range(4):
+            derivatives[FIRST_WHEEL + i] = -x[FIRST_WHEEL + i] / WHEEL_RELAXATION
+    return forces
+
+
+@_compile
+def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
+    """Wanted acceleration, within power at the speed of the driven wheels; the library's limit takes the car's speed."""
+    front, rear = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1], x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
+    velocity = 0.5 * p.R_w * (p.T_se * front + (1.0 - p.T_se) * rear)
+    if velocity > OVERSPEED * p.longitudinal.v_max:
+        return min(acceleration, 0.0)
+    return min(acceleration, p.longitudinal.a_max * p.longitudinal.v_switch / max(velocity, p.longitudinal.v_switch))
+
+
+@_compile
+def _brake_arm(p):  # type: ignore[no-untyped-def]
+    """Yaw moment per braking force on one side, shared equally by front and rear [m]."""
+    return 0.25 * (p.T_f + p.T_r)
+
+
+@_compile
+def _yaw_moment(wanted, forces, p):  # type: ignore[no-untyped-def]
+    """The wanted moment, within what the friction of the braked side's loads can give."""
+    left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
+    right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
+    # A positive moment, to the left of ISO 8855, brakes the wheels that the library calls right.
+    return min(max(wanted, -left * _brake_arm(p)), right * _brake_arm(p))
+
+
+acceleration_limit = _compile(acceleration_constraints)
+
+
+@_compile
+def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
+    """Parts of a step in which the slip of the slowest wheel is stable."""
+    if regime != ROLLING:
+        return 1
+    heavier = max(p.m_s * p.b / (p.a + p.b) + p.m_uf, p.m_s * p.a / (p.a + p.b) + p.m_ur)
+    load = LARGEST_LOAD_FACTOR * 0.5 * 9.81 * heavier
+    stiffness = max(p.tire.p_kx1, p.tire_rear.p_kx1) * load
+    per_velocity = STABLE_RATE * p.I_y_w / (p.R_w**2 * stiffness)
+    slowest = x[VX] - 0.5 * max(p.T_f, p.T_r) * abs(x[YAW_RATE])
+    return math.ceil(step / (per_velocity * max(slowest, SMALLEST_WHEEL_VELOCITY)))
+
+
+def _advance(state, regime, inputs, vector, friction, step, n_steps):  # type: ignore[no-untyped-def]
+    p = _unpack(vector, friction)
+    friction_front, friction_rear = _sliding_friction(p.tire), _sliding_friction(p.tire_rear)
+    x = state.copy()
+    stage = np.empty(N_STATES)
+    k1, k2, k3, k4 = np.empty(N_STATES), np.empty(N_STATES), np.empty(N_STATES), np.empty(N_STATES)
+    slid = False
+    for _ in range(n_steps):
+        regime = next_regime(regime, x, p)
+        slid = slid or regime == SLIDING
+        contact = (regime, inputs, friction_front, friction_rear)
+        n_parts = _n_substeps(regime, x, p, step)
+        part = step / n_parts
+        for _ in range(n_parts):
+            # The library sets a negative wheel speed to zero in the state it is given; that must reach x itself.
+            _right_hand_side(x, contact, p, k1)
+            for i in range(N_STATES):
+                stage[i] = x[i] + 0.5 * part * k1[i]
+            _right_hand_side(stage, contact, p, k2)
+            for i in range(N_STATES):
+                stage[i] = x[i] + 0.5 * part * k2[i]
+            _right_hand_side(stage, contact, p, k3)
+            for i in range(N_STATES):
+                stage[i] = x[i] + part * k3[i]
+            _right_hand_side(stage, contact, p, k4)
+            for i in range(N_STATES):
+                x[i] += part / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+            for i in range(FIRST_WHEEL, FIRST_WHEEL + 4):
+                x[i] = max(x[i], 0.0)
+        if regime == SLOW and x[VX] <= 0.0:
+            x[VX] = 0.0
+            for i in (VY, YAW_RATE):
+                if abs(x[i]) < AT_REST:
+                    x[i] = 0.0
+        if not abs(x[ROLL]) < ROLLED_OVER:
+            break
+    regime = next_regime(regime, x, p)
+    return x, regime, slid or regime == SLIDING
+
+
+def _evaluate(states, regimes, inputs, vector, frictions):  # type: ignore[no-untyped-def]
+    n_samples = len(states)
+    derivatives, forces = np.empty((n_samples, N_STATES)), np.empty((n_samples, N_FORCES))
+    for k in range(n_samples):
+        p = _unpack(vector, frictions[k])
+        contact = (regimes[k], inputs[k], _sliding_friction(p.tire), _sliding_friction(p.tire_rear))
+        wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
+        sine, cosine = math.sin(states[k, STEER]), math.cos(states[k, STEER])
+        for i in range(N_FORCES):
+            forces[k, i] = wheels[i]
+        for i in range(2):
+            forces[k, i] = wheels[i] * cosine - wheels[4 + i] * sine
+            forces[k, 4 + i] = wheels[4 + i] * cosine + wheels[i] * sine
+        if regimes[k] == ROLLING:
+            side = 1 if inputs[k, 2] > 0.0 else 0
+            brake = 0.5 * abs(_yaw_moment(inputs[k, 2], wheels, p)) / _brake_arm(p)
+            forces[k, side] -= brake
+            forces[k, 2 + side] -= brake
+    return derivatives, forces
+
+
+class _Kept:
+    """A function of this module whose machine code is kept on disk, where a writable place is found.
+
+    The first of several processes compiles, which takes some ten seconds; the others wait for it and load the code.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        # numba looks code up by the name, file and date of the outermost function; what else goes into it is in the digest.
+        function.__qualname__ = f"{function.__name__}_{_digest()}"
+        self._is_ready = False
+        self.lock: Path | None = None
+        try:
+            self.dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+            self.lock = Path(self.dispatcher.stats.cache_path) / f"{Path(__file__).stem}.lock"
+        except RuntimeError:  # no place for a cache
+            self.dispatcher = _compile(function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._is_ready:
+            return self.dispatcher(*arguments)
+        with _held(self.lock):
+            results = self.dispatcher(*arguments)
+        self._is_ready = True
+        return results
+
+
+@contextmanager
+def _held(lock: Path | None) -> Iterator[None]:
+    """Waits for other processes that hold the lock. Where there are no locks, as on Windows, every process compiles."""
+    with ExitStack() as stack:
+        if lock is not None and fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)  # goes with the file, also when the process is killed
+        yield
+
+
+def _digest() -> str:
+    sources = (_REWRITTEN, _unpacking_source(), inspect.getsource(regimes), inspect.getsource(tire_model), LIBRARY_VERSION)
+    return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
+
+
+advance = _Kept(_advance)
+"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps) -> state (29,), regime, whether it slid.
+
+Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a rollover or NaN."""
+
+evaluate = _Kept(_evaluate)
+"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,)) -> derivatives (T, 29), forces (T, 12).
+
+Forces: along and across in the level body's axes, then vertical, each for the library's four wheels [N]."""

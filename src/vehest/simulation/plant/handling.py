@@ -1,0 +1,55 @@
+"""Steady-state handling of a vehicle: what a slow ramp of the steering angle at constant speed shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.simulation.errors import SimulationError
+from vehest.simulation.plant.motion import Motion
+from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
+
+RATE_HZ = 50.0
+
+
+def ramp_steer(
+    plant: MultiBodyPlant, speed: float, *, ay_rate: float = 0.5, friction: float = 1.0, direction: float = 1.0, duration: float = 60.0
+) -> Motion:
+    """Constant speed, slowly growing steering angle, until the lateral acceleration falls by 3 % again; 50 Hz.
+
+    Towards the limit, where the lateral acceleration hardly grows any more, the steering angle grows up to ten times faster.
+
+    Args:
+        plant: the car.
+        speed: [m/s].
+        ay_rate: by which the lateral acceleration of a neutral car would grow [m/s³].
+        friction: scale of the tyres' friction.
+        direction: 1 to the left, -1 to the right.
+        duration: at most [s].
+    """
+    steering_velocity = direction * ay_rate * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
+    state, per_sample = plant.initial_state(0.0, 0.0, 0.0, speed), round(1.0 / (RATE_HZ * plant.step))
+    states: list[PlantState] = []
+    inputs: list[FloatArray] = []
+    integral = largest = 0.0
+    for _ in range(round(duration * RATE_HZ)):
+        now = abs(state.vx * state.yaw_rate)
+        error = speed - state.vx
+        integral += error / RATE_HZ
+        spare = max(1.0 - (now / (friction * plant.grip)) ** 2, 0.1)
+        command = np.array([steering_velocity / spare, 3.0 * error + 2.0 * integral, 0.0, 0.0, 0.0])
+        states.append(state)
+        inputs.append(command)
+        largest = max(largest, now)
+        if now < 0.97 * largest or state.spun:
+            break
+        try:
+            state = plant.advance(state, command, per_sample, friction)
+        except SimulationError:  # a rollover ends it too
+            break
+    return plant.motion(states, np.array(inputs), RATE_HZ, friction=friction)
+
+
+def understeer_angle(motion: Motion, wheelbase: float) -> FloatArray:
+    """Steering angle beyond what the path's curvature needs without slip, positive in understeer to the left (T,) [rad]."""
+    return motion.steer - np.arctan(wheelbase * motion.yaw_rate / motion.vx)

@@ -1,0 +1,281 @@
+"""The plant: CommonRoad's multi-body car, integrated with a fixed step, from standstill to 70 m/s and through a spin.
+
+Source of the equations: Althoff and Würsching, "CommonRoad: Vehicle Models", 2020, the multi-body model of 29 states
+with suspension, load transfer and combined-slip tyres. The library's vertical axis points down, so that a positive yaw
+rate speeds up the wheels it calls left. Read as a mirror image, the equations are those of a car in ISO 8855 axes:
+steering, yaw and lateral quantities keep their sign, left and right wheels change places, roll and pitch change sign.
+
+What the equations leave out, and so does the plant: aerodynamic drag and lift, rolling resistance, bump stops, a
+differential, anti-lock brakes. Longitudinal forces pitch the body as if all of the mass were the body's. Drag, and gravity
+along and across a road that is not level, come in as external accelerations (drive.py); wheel loads stay those of a level road.
+
+The published tyre has shifts that change sign with camber, so that its force jumps there by about 4 % of the wheel load.
+With them the integration converges to first order where that happens, and on a straight the lateral acceleration has
+small steps; the vehicles of conf/vehicle go without those shifts where their files say so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from vehiclemodels.init_mb import init_mb
+
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.errors import SimulationError
+from vehest.simulation.plant import compiled
+from vehest.simulation.plant.compiled import N_INPUTS
+from vehest.simulation.plant.motion import Motion
+from vehest.simulation.plant.parameters import Vehicle, compiled_parameters, library_parameters, parameter_vector
+from vehest.simulation.plant.regimes import (
+    FIRST_WHEEL,
+    HEAVE,
+    PITCH,
+    PITCH_RATE,
+    ROLL,
+    ROLL_RATE,
+    SLOW_BELOW,
+    STEER,
+    VX,
+    VY,
+    YAW,
+    YAW_RATE,
+    Regime,
+    X,
+    Y,
+)
+
+STEADY_SHARE = 0.93
+"""Lateral acceleration over friction in a steady turn at the limit: 0.91 to 0.98 for the shipped vehicles at 15 to 40 m/s.
+
+The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
+
+HEAVE_FRONT, HEAVE_REAR = 16, 21
+MIRRORED = (1, 0, 3, 2)
+"""The library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlantState:
+    """Where and how the car is.
+
+    Args:
+        values: the library's states, (29,).
+        regime: which equations hold.
+        spun: whether the car has been in a spin since its start.
+    """
+
+    values: FloatArray
+    regime: Regime
+    spun: bool = False
+
+    @property
+    def x(self) -> float:
+        """Position along the ground's first axis [m]."""
+        return float(self.values[X])
+
+    @property
+    def y(self) -> float:
+        """Position along the ground's second axis [m]."""
+        return float(self.values[Y])
+
+    @property
+    def yaw(self) -> float:
+        """Heading, not wrapped [rad]."""
+        return float(self.values[YAW])
+
+    @property
+    def vx(self) -> float:
+        """Forward velocity [m/s]."""
+        return float(self.values[VX])
+
+    @property
+    def vy(self) -> float:
+        """Lateral velocity, positive to the left [m/s]."""
+        return float(self.values[VY])
+
+    @property
+    def yaw_rate(self) -> float:
+        """Positive to the left [rad/s]."""
+        return float(self.values[YAW_RATE])
+
+    @property
+    def steer(self) -> float:
+        """Road-wheel angle of the front axle, positive to the left [rad]."""
+        return float(self.values[STEER])
+
+    @property
+    def stands(self) -> bool:
+        """Whether the car is at rest, but for the last of its suspension's swing."""
+        return bool(self.regime == Regime.SLOW and self.vx == 0.0)
+
+
+@dataclass(frozen=True)
+class MultiBodyPlant:
+    """A vehicle and the step it is integrated with.
+
+    Inputs are an array of shape (5,): steering velocity of the front wheels [rad/s], wanted longitudinal acceleration
+    [m/s²], both within the vehicle's limits, yaw moment by braking one side (positive turns left) [N m], and external
+    acceleration along and across the level body, as gravity gives on a slope (road_gravity) [m/s²].
+
+    The yaw moment brings its braking force |M|/(track/2) along. It does not use up the braked tyres' grip, and does
+    nothing below about 1 m/s and in a spin.
+
+    Args:
+        vehicle: the car.
+        step: integration step [s]; where slow wheels need it, a step is made in parts.
+
+    Raises:
+        ConfigurationError: the step is not positive.
+    """
+
+    vehicle: Vehicle
+    step: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not self.step > 0:
+            raise ConfigurationError(f"the plant's step must be positive, not {self.step} s")
+
+    @cached_property
+    def parameters(self) -> Any:
+        """The vehicle's values (MultiBodyValues), by the library's names."""
+        return compiled_parameters(self.vehicle)
+
+    @cached_property
+    def _vector(self) -> FloatArray:
+        return parameter_vector(self.parameters)
+
+    @property
+    def wheelbase(self) -> float:
+        """Distance between the axles [m]."""
+        return float(self.parameters.a + self.parameters.b)
+
+    @property
+    def grip(self) -> float:
+        """About the largest steady lateral acceleration [m/s²], from the lateral friction of the weaker axle."""
+        return float(STEADY_SHARE * GRAVITY * min(self.parameters.tire.p_dy1, self.parameters.tire_rear.p_dy1))
+
+    @cached_property
+    def _at_rest(self) -> FloatArray:
+        """The state in which the springs carry the car, at the origin; (29,)."""
+        values = np.array(init_mb([0.0] * 7, library_parameters(self.vehicle)), dtype=np.float64)
+        values[PITCH] = (values[HEAVE_REAR] - values[HEAVE_FRONT]) / self.wheelbase
+        values[HEAVE] = values[HEAVE_FRONT] + self.parameters.a * values[PITCH]
+        return values
+
+    def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
+        """In equilibrium, rolling straight ahead at the given place [m], heading [rad] and speed [m/s], or standing.
+
+        Raises:
+            ConfigurationError: the speed is negative.
+        """
+        if not vx >= 0:
+            raise ConfigurationError(f"a car starts forwards or standing, not at {vx} m/s")
+        values = self._at_rest.copy()
+        values[[X, Y, YAW, VX]] = x, y, yaw, vx
+        values[FIRST_WHEEL : FIRST_WHEEL + 4] = vx / self.parameters.R_w
+        return PlantState(values, Regime.SLOW if vx < SLOW_BELOW else Regime.ROLLING)
+
+    def advance(self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0) -> PlantState:
+        """The state ``n_steps`` steps later, with inputs (5,) and the scale of friction held.
+
+        Raises:
+            SimulationError: the car rolled over, or a state is not finite.
+        """
+        inputs = _writable(inputs)
+        values, regime, slid = compiled.advance(
+            state.values, int(state.regime), inputs, self._vector, float(friction), self.step, int(n_steps)
+        )
+        if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
+            raise SimulationError(
+                f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at {_describe(values)}; lower "
+                f"the grip that is asked of it or the centre of gravity (h_s), or stiffen roll (K_tsf, K_tsr)"
+            )
+        return PlantState(values, Regime(regime), state.spun or slid)
+
+    def evaluate(self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
+
+        Args:
+            states: T states.
+            inputs: (T, 5).
+            friction: scale of friction, (T,) or one for all.
+        """
+        values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
+        regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
+        inputs = _writable(inputs).reshape(-1, N_INPUTS)
+        derivatives, forces = compiled.evaluate(values, regimes, inputs, self._vector, _writable(np.broadcast_to(friction, len(states))))
+        return derivatives, forces.reshape(-1, 3, 4)[:, :, MIRRORED]
+
+    def motion(
+        self,
+        states: Sequence[PlantState],
+        inputs: FloatArray,
+        rate_hz: float,
+        *,
+        friction: ArrayLike = 1.0,
+        bank: ArrayLike = 0.0,
+        grade: ArrayLike = 0.0,
+    ) -> Motion:
+        """States sampled at ``rate_hz``, each with the inputs that hold from then on, as motion in ISO 8855 axes.
+
+        Args:
+            states: T states.
+            inputs: (T, 5).
+            rate_hz: [Hz].
+            friction: scale of friction, (T,) or one for all.
+            bank, grade: of the road, (T,) or one for all [rad]; kept with the motion, their gravity is in the inputs.
+        """
+        derivatives, forces = self.evaluate(states, inputs, friction)
+        values = np.array([state.values for state in states])
+        vx, vy, yaw_rate = values[:, VX], values[:, VY], values[:, YAW_RATE]
+
+        def per_sample(value: ArrayLike) -> FloatArray:
+            return np.broadcast_to(np.asarray(value, dtype=np.float64), len(values)).copy()
+
+        return Motion(
+            rate_hz=rate_hz,
+            x=values[:, X],
+            y=values[:, Y],
+            yaw=values[:, YAW],
+            vx=vx,
+            vy=vy,
+            yaw_rate=yaw_rate,
+            ax=derivatives[:, VX] - vy * yaw_rate,
+            ay=derivatives[:, VY] + vx * yaw_rate,
+            steer=values[:, STEER],
+            roll=-values[:, ROLL],
+            pitch=self._at_rest[PITCH] - values[:, PITCH],
+            roll_rate=-values[:, ROLL_RATE],
+            pitch_rate=-values[:, PITCH_RATE],
+            wheel_speed=values[:, FIRST_WHEEL : FIRST_WHEEL + 4][:, MIRRORED],
+            tyre_fx=forces[:, 0],
+            tyre_fy=forces[:, 1],
+            tyre_fz=forces[:, 2],
+            friction=per_sample(friction),
+            bank=per_sample(bank),
+            grade=per_sample(grade),
+        )
+
+
+def _writable(values: ArrayLike) -> FloatArray:
+    """The values as a contiguous, writable array: any other kind would be compiled for once more."""
+    return np.require(values, dtype=np.float64, requirements=["C", "W"])
+
+
+def road_gravity(bank: float, grade: float) -> tuple[float, float]:
+    """Acceleration along and across the body that gravity gives on a road [m/s²]; signs of Motion.bank and Motion.grade."""
+    return GRAVITY * math.sin(grade), -GRAVITY * math.sin(bank)
+
+
+def _describe(values: FloatArray) -> str:
+    return (
+        f"vx = {values[VX]:.3g} m/s, vy = {values[VY]:.3g} m/s, yaw rate = {values[YAW_RATE]:.3g} rad/s, "
+        f"roll = {-values[ROLL]:.3g} rad, steer = {values[STEER]:.3g} rad"
+    )

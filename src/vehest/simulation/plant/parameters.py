@@ -1,0 +1,189 @@
+"""Parameters of the multi-body plant: a set published by CommonRoad, with named values replaced.
+
+The library has one tyre for all wheels. Here the rear axle may have its own: ``tire_rear`` replaces values of ``tire``,
+which is then the front axle's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from vehiclemodels.utils.longitudinal_parameters import LongitudinalParameters
+from vehiclemodels.utils.steering_parameters import SteeringParameters
+from vehiclemodels.utils.tireParameters import TireParameters
+from vehiclemodels.vehicle_parameters import VehicleParameters, setup_vehicle_parameters
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+
+PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
+"""Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
+
+
+def _field_names(library_class: type) -> list[str]:
+    return [entry.name for entry in fields(library_class)]
+
+
+_FRONT_TYRE, REAR_TYRE = "tire", "tire_rear"
+
+# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre.
+SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
+LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
+TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
+MultiBodyValues = namedtuple(  # type: ignore[misc]
+    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name != "trailer"), REAR_TYRE]
+)
+
+GROUPS: Mapping[str, type] = MappingProxyType(
+    {"steering": SteeringValues, "longitudinal": LongitudinalValues, _FRONT_TYRE: TyreValues, REAR_TYRE: TyreValues}
+)
+"""Fields of MultiBodyValues that are named tuples themselves."""
+
+
+POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_y_w", "T_f", "T_r", "R_w", "K_zt", "K_sf", "K_sr", "w")
+"""Parameters without which a car does not exist."""
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A car that the multi-body plant can drive.
+
+    Args:
+        name: what recordings call it.
+        parameter_set: number of the published set it starts from.
+        overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
+            values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
+        driver: values of a driver who knows this car, by the driver's names; the plant does not read them.
+
+    Raises:
+        ConfigurationError: no such set, no such parameter, or a value that is not a finite number.
+    """
+
+    name: str
+    parameter_set: int
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    driver: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
+            if not isinstance(mapping, Mapping):
+                raise ConfigurationError(f"vehicle '{self.name}': {name} must be a mapping, not {mapping!r}")
+        parameters = library_parameters(self)
+        for name in POSITIVE:
+            if not getattr(parameters, name) > 0.0:
+                raise ConfigurationError(f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}")
+        rear_tyre(self)
+        for name, value in self.driver.items():
+            _require_number(f"vehicle '{self.name}': driver's value '{name}'", value)
+
+
+def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides`` and ``driver``.
+
+    Raises:
+        ConfigurationError: a key is missing or unknown, or see Vehicle.
+    """
+    known = {"name", "parameter_set", "overrides", "driver"}
+    unknown = sorted(set(configuration) - known)
+    missing = sorted({"name", "parameter_set"} - set(configuration))
+    if unknown or missing:
+        raise ConfigurationError(f"vehicle configuration: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
+    overrides, driver = configuration.get("overrides") or {}, configuration.get("driver") or {}
+    return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver))
+
+
+def library_parameters(vehicle: Vehicle) -> VehicleParameters:
+    """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh one at every call."""
+    number = vehicle.parameter_set
+    if isinstance(number, bool) or not isinstance(number, int) or number not in PUBLISHED_SETS:
+        known = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
+        raise ConfigurationError(
+            f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
+        )
+    parameters = deepcopy(_published(vehicle.parameter_set))
+    known_to_library = {name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE}
+    _override(parameters, known_to_library, vehicle.name, prefix="")
+    return parameters
+
+
+@cache
+def _published(parameter_set: int) -> VehicleParameters:
+    """Read from the library's files, which takes 20 ms."""
+    return setup_vehicle_parameters(parameter_set)
+
+
+def rear_tyre(vehicle: Vehicle) -> TireParameters:
+    """Parameters of the rear tyres: the front ones with the overrides of ``tire_rear`` in place."""
+    tyre = library_parameters(vehicle).tire
+    overrides = vehicle.overrides.get(REAR_TYRE, {})
+    if not isinstance(overrides, Mapping):
+        raise ConfigurationError(f"vehicle '{vehicle.name}': override '{REAR_TYRE}' must be a mapping, not {overrides!r}")
+    _override(tyre, overrides, vehicle.name, prefix=f"{REAR_TYRE}.")
+    return tyre
+
+
+def compiled_parameters(vehicle: Vehicle) -> Any:
+    """The same values as nested named tuples of floats (MultiBodyValues); absent ones are NaN."""
+    parameters = library_parameters(vehicle)
+    rear = _as_values(TyreValues, rear_tyre(vehicle))
+    return _as_values(MultiBodyValues, parameters, **{REAR_TYRE: rear})
+
+
+def parameter_vector(parameters: Any) -> FloatArray:
+    """The values of (nested) named tuples one after the other, in the order of their fields."""
+    values: list[float] = []
+    for value in parameters:
+        values.extend(parameter_vector(value) if isinstance(value, tuple) else [value])
+    return np.array(values)
+
+
+def _plain(value: Any) -> Any:
+    """Mappings as dictionaries, all else as it is."""
+    return {name: _plain(inner) for name, inner in value.items()} if isinstance(value, Mapping) else value
+
+
+def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str) -> None:
+    for name, value in overrides.items():
+        where = f"vehicle '{vehicle_name}': override '{prefix}{name}'"
+        if name not in _field_names(type(parameters)):
+            known = ", ".join(_field_names(type(parameters)))
+            raise ConfigurationError(f"{where} names no parameter of the plant; known ones: {known}")
+        is_group = is_dataclass(getattr(parameters, name))
+        if is_group != isinstance(value, Mapping):
+            raise ConfigurationError(f"{where} must be {'a mapping' if is_group else 'a number'}, not {value!r}")
+        if is_group:
+            _override(getattr(parameters, name), value, vehicle_name, prefix=f"{prefix}{name}.")
+            continue
+        _require_number(where, value)
+        setattr(parameters, name, float(value))
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _require_number(where: str, value: Any) -> None:
+    if not is_number(value):
+        raise ConfigurationError(f"{where} must be a finite number, not {value!r}")
+
+
+def _as_values(values_class: Any, parameters: Any, **others: Any) -> Any:
+    values = dict(others)
+    for name in values_class._fields:
+        if name in values:
+            continue
+        value = getattr(parameters, name)
+        if name in GROUPS:
+            values[name] = _as_values(GROUPS[name], value)
+        else:
+            values[name] = math.nan if value is None else float(value)
+    return values_class(**values)

@@ -1,0 +1,224 @@
+"""The planar plant: a small four-wheel-drive car on a level floor, from standstill through spins.
+
+A double track with four wheels that turn by themselves, combined slip and relaxation at each tyre, load transfer in both directions, and
+one electric motor that drives all wheels through three differentials. The multi-body plant of ``plant`` has no equations for a car that
+slides sideways and drives on; this one has no regimes.
+
+Tyres: magic formula without curvature of the combined slip, F = μ F_z sin(C atan(B s)) along the slip (Pacejka, Tire and Vehicle
+Dynamics, 2012, Sections 4.2 and 4.3, with the same slip stiffness in both directions). Slips are divided by
+V = max(|V_x|, |ω|R, SLOWEST): at a spinning, locked or standing wheel they stay finite. They follow their steady values over a relaxation
+length σ, ds/dt = V/σ (s_steady - s), which shortens with the slip as force over slip does, since a sliding tyre's carcass bends no further;
+a share of the difference acts at once, as a carcass's damping does.
+
+Motor: J dω/dt = K I - b0 sign(ω) - b1 ω - R ΣF_x on the mean speed of the wheels, the powertrain of Eq. 2 of Węgrzynowski et al. 2024.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.errors import SimulationError
+from vehest.simulation.plant.motion import WHEELS, Motion
+from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
+
+SLOWEST = 0.3
+"""Speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper, not a spring."""
+STICTION_SPEED = 1.0
+"""Speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]."""
+
+SHORTEST = 0.2
+"""Share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step."""
+
+X, Y, YAW, VX, VY, YAW_RATE = range(6)
+FIRST_WHEEL, FIRST_SLIP_X, FIRST_SLIP_Y = 6, 10, 14
+LOAD_AX, LOAD_AY, STEER, CURRENT = 18, 19, 20, 21
+N_STATES = 22
+
+PlanarValues = namedtuple("PlanarValues", PARAMETERS)  # type: ignore[misc]
+PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _per_slip(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+    """sin(C atan(B s))/s."""
+    return math.sin(shape * math.atan(stiffness * slip)) / slip if slip > 1e-9 else shape * stiffness
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _derivative(state, wanted_steer, wanted_current, scale, p, forces):  # type: ignore[no-untyped-def]
+    """dstate/dt (22,); forces (4, 3) receives each tyre's force along and across the body and its load."""
+    rate = np.empty(N_STATES)
+    vx, vy, yaw_rate, steer, current = state[VX], state[VY], state[YAW_RATE], state[STEER], state[CURRENT]
+    wheelbase = p.cg_to_front_axle + p.cg_to_rear_axle
+    along = 0.5 * p.mass * state[LOAD_AX] * p.cg_height / wheelbase
+    across = p.mass * state[LOAD_AY] * p.cg_height / p.track
+    mean_speed = 0.25 * (state[FIRST_WHEEL] + state[FIRST_WHEEL + 1] + state[FIRST_WHEEL + 2] + state[FIRST_WHEEL + 3])
+    sum_x = sum_y = moment = traction = 0.0
+    rolling = np.empty(4)
+    for wheel in range(4):
+        front, left = wheel < 2, wheel % 2 == 0
+        x, y = (p.cg_to_front_axle if front else -p.cg_to_rear_axle), (0.5 if left else -0.5) * p.track
+        angle = steer if front else 0.0
+        static = 0.5 * p.mass * GRAVITY * (p.cg_to_rear_axle if front else p.cg_to_front_axle) / wheelbase
+        share = p.roll_share_front if front else 1.0 - p.roll_share_front
+        load = max(static + (-along if front else along) + (-across if left else across) * share, 0.0)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        point_x, point_y = vx - yaw_rate * y, vy + yaw_rate * x
+        wheel_x, wheel_y = point_x * cosine + point_y * sine, point_y * cosine - point_x * sine
+        rim = p.wheel_radius * state[FIRST_WHEEL + wheel]
+        reference = max(abs(wheel_x), abs(rim), SLOWEST)
+        missing_x = (rim - wheel_x) / reference - state[FIRST_SLIP_X + wheel]
+        missing_y = -wheel_y / reference - state[FIRST_SLIP_Y + wheel]
+        stiffness = p.stiffness_factor_front if front else p.stiffness_factor_rear
+        stored = math.hypot(state[FIRST_SLIP_X + wheel], state[FIRST_SLIP_Y + wheel])
+        length = p.relaxation_length * max(_per_slip(stored, stiffness, p.shape_factor) / (p.shape_factor * stiffness), SHORTEST)
+        rate[FIRST_SLIP_X + wheel] = missing_x * reference / length
+        rate[FIRST_SLIP_Y + wheel] = missing_y * reference / length
+        slip_x = state[FIRST_SLIP_X + wheel] + p.carcass_damping * missing_x
+        slip_y = state[FIRST_SLIP_Y + wheel] + p.carcass_damping * missing_y
+        per_slip = _per_slip(math.hypot(slip_x, slip_y), stiffness, p.shape_factor)
+        relative = load / (0.25 * p.mass * GRAVITY) - 1.0
+        grip = scale * p.friction * max(1.0 - p.load_sensitivity * relative, 0.1) * load
+        force_x, force_y = grip * per_slip * slip_x, grip * per_slip * slip_y
+        rolling[wheel] = p.wheel_radius * force_x
+        traction += rolling[wheel]
+        forces[wheel, 0], forces[wheel, 1] = force_x * cosine - force_y * sine, force_x * sine + force_y * cosine
+        forces[wheel, 2] = load
+        sum_x += forces[wheel, 0]
+        sum_y += forces[wheel, 1]
+        moment += x * forces[wheel, 1] - y * forces[wheel, 0]
+    losses = p.coulomb_torque * math.tanh(mean_speed / STICTION_SPEED) + p.viscous_torque * mean_speed
+    motor = p.torque_constant * current - losses
+    drive = motor - p.motor_inertia * (motor - traction) / (p.motor_inertia + 4.0 * p.wheel_inertia)
+    for axle in range(2):
+        first = FIRST_WHEEL + 2 * axle
+        axle_speed = 0.5 * (state[first] + state[first + 1])
+        for side in range(2):
+            wheel = 2 * axle + side
+            lock = p.axle_lock * (axle_speed - state[first + side]) + p.centre_lock * (mean_speed - axle_speed)
+            rate[first + side] = (0.25 * drive + lock - rolling[wheel]) / p.wheel_inertia
+    drag = p.air_drag * math.hypot(vx, vy)
+    ax, ay = (sum_x - drag * vx) / p.mass, (sum_y - drag * vy) / p.mass
+    rate[X], rate[Y] = vx * math.cos(state[YAW]) - vy * math.sin(state[YAW]), vx * math.sin(state[YAW]) + vy * math.cos(state[YAW])
+    rate[YAW], rate[YAW_RATE] = yaw_rate, moment / p.yaw_inertia
+    rate[VX], rate[VY] = ax + vy * yaw_rate, ay - vx * yaw_rate
+    rate[LOAD_AX], rate[LOAD_AY] = (ax - state[LOAD_AX]) / p.load_time, (ay - state[LOAD_AY]) / p.load_time
+    turning = (min(max(wanted_steer, -p.largest_steer), p.largest_steer) - steer) / p.steering_time
+    rate[STEER] = min(max(turning, -p.steering_rate), p.steering_rate)
+    rate[CURRENT] = (min(max(wanted_current, -p.largest_current), p.largest_current) - current) / p.current_time
+    return rate
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # type: ignore[no-untyped-def]
+    """The state (22,) after n_steps steps of a Runge-Kutta method of fourth order with constant inputs."""
+    forces = np.empty((4, 3))
+    for _ in range(n_steps):
+        first = _derivative(state, wanted_steer, wanted_current, scale, p, forces)
+        second = _derivative(state + 0.5 * step * first, wanted_steer, wanted_current, scale, p, forces)
+        third = _derivative(state + 0.5 * step * second, wanted_steer, wanted_current, scale, p, forces)
+        fourth = _derivative(state + step * third, wanted_steer, wanted_current, scale, p, forces)
+        state = state + step / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
+    return state
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What acts on the car from outside.
+
+    Args:
+        steer: wanted road-wheel angle [rad].
+        current: wanted motor current [A].
+        friction: scale of the tyres' friction.
+    """
+
+    steer: float = 0.0
+    current: float = 0.0
+    friction: float = 1.0
+
+
+class PlanarPlant:
+    """A car and its equations of motion.
+
+    Args:
+        car: what is driven.
+        step: of the integration [s].
+
+    Raises:
+        ConfigurationError: the step is not positive.
+    """
+
+    def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
+        if not step > 0.0:
+            raise ConfigurationError(f"vehicle '{car.name}': the plant's step must be positive, not {step}")
+        self.car, self.step = car, step
+        self._values = PlanarValues(**car.parameters)
+
+    def initial_state(self, speed: float = 0.0, yaw: float = 0.0) -> FloatArray:
+        """Rolling straight ahead from the origin at a speed [m/s] and heading [rad], (22,)."""
+        state = np.zeros(N_STATES)
+        state[YAW], state[VX] = yaw, speed
+        state[FIRST_WHEEL : FIRST_WHEEL + 4] = speed / self.car.wheel_radius
+        return state
+
+    def derivative(self, state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
+        """Rate of change of the state, (22,), and each tyre's force along and across the body and its load [N], (4, 3)."""
+        forces = np.empty((4, 3))
+        return _derivative(state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, forces), forces
+
+    def advance(self, state: FloatArray, inputs: Inputs, n_steps: int) -> FloatArray:
+        """The state after some steps with constant inputs, (22,).
+
+        Raises:
+            SimulationError: a state is not finite.
+        """
+        after: FloatArray = _advance(
+            state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, self.step, n_steps
+        )
+        if not np.isfinite(after).all():
+            raise SimulationError(
+                f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = {state[VX]:.3g} m/s, "
+                f"vy = {state[VY]:.3g} m/s, yaw rate = {state[YAW_RATE]:.3g} rad/s; use a smaller step than {self.step:g} s"
+            )
+        return after
+
+    def motion(self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float) -> Motion:
+        """What the car did, from its states (22,) and what acted on it at each sample."""
+        values, car = np.array(states), self.car
+        found = [self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)]
+        rates, forces = np.array([rate for rate, _ in found]), np.array([force for _, force in found])
+        level = np.zeros(len(values))
+        wheel_speed = values[:, FIRST_WHEEL : FIRST_WHEEL + len(WHEELS)]
+        return Motion(
+            rate_hz=rate_hz,
+            x=values[:, X],
+            y=values[:, Y],
+            yaw=values[:, YAW],
+            vx=values[:, VX],
+            vy=values[:, VY],
+            yaw_rate=values[:, YAW_RATE],
+            ax=rates[:, VX] - values[:, VY] * values[:, YAW_RATE],
+            ay=rates[:, VY] + values[:, VX] * values[:, YAW_RATE],
+            steer=values[:, STEER],
+            roll=car.roll_gradient * values[:, LOAD_AY],
+            pitch=-car.pitch_gradient * values[:, LOAD_AX],
+            roll_rate=car.roll_gradient * rates[:, LOAD_AY],
+            pitch_rate=-car.pitch_gradient * rates[:, LOAD_AX],
+            wheel_speed=wheel_speed,
+            tyre_fx=forces[:, :, 0],
+            tyre_fy=forces[:, :, 1],
+            tyre_fz=forces[:, :, 2],
+            friction=np.array([acting.friction for acting in inputs]),
+            bank=level,
+            grade=level,
+            motor_speed=wheel_speed.mean(axis=1),
+            motor_current=values[:, CURRENT],
+        )

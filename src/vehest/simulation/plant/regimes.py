@@ -1,0 +1,177 @@
+"""Where the multi-body equations do not hold: near standstill, and in a spin.
+
+Three regimes share one state vector and one set of suspension equations; what differs is where the forces of the tyres
+come from, and how the planar motion follows.
+
+- ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with 1/vx.
+- SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels (kinematic single track).
+  The tyres' forces are those that this motion needs, so that springs and compliant joints go on undisturbed.
+- SLIDING: after a spin the wheels are locked, and every contact patch slides against its velocity with the friction
+  that the lateral tyre formula has at a right angle. It ends at standstill.
+
+All functions are compiled (compiled.py) and use the library's axes, whose vertical axis points down. In them a positive
+quantity to the right is what a positive quantity to the left is in ISO 8855 axes; see plant.py.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numba
+
+from vehest.constants import GRAVITY
+
+
+class Regime(IntEnum):
+    """Which equations of planar motion hold."""
+
+    ROLLING = 0
+    SLOW = 1
+    SLIDING = 2
+
+
+ROLLING, SLOW, SLIDING = (int(regime) for regime in Regime)
+
+SLOW_BELOW = 1.0
+"""Forward speed below which the car no longer slips [m/s]; assumed. The lateral dynamics are faster than 5 ms there."""
+ROLLING_ABOVE = 1.2
+"""Forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime does not flutter."""
+SLOW_TOLERANCE = 0.5
+"""How far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to follow; assumed."""
+SPUN_SIDESLIP = math.radians(60.0)
+"""Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to far smaller angles."""
+STANDING = 0.02
+"""Speed [m/s] and yaw rate [rad/s] below which a slide has ended; assumed."""
+SLIDING_SMOOTHING = 0.05
+"""Speed over which Coulomb friction changes sign [m/s]; assumed."""
+RELAXATION = 0.05
+"""Time constant with which SLOW takes over the lateral motion that ROLLING left [s]; assumed."""
+WHEEL_RELAXATION = 0.02
+"""Time constant of wheels that start to roll freely, or lock [s]; assumed."""
+SLOW_ADHESION = 0.9
+"""Share of the tyres' longitudinal friction that SLOW makes use of; assumed."""
+
+
+X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
+VY_FRONT, VY_REAR = 15, 20
+FIRST_WHEEL = 23
+"""Places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names."""
+
+_kernel = numba.njit(error_model="numpy")
+
+
+@_kernel
+def next_regime(regime, x, p):  # type: ignore[no-untyped-def]
+    """The regime that holds from the state x on."""
+    vx, vy, yaw_rate = x[VX], x[VY], x[YAW_RATE]
+    if regime == ROLLING:
+        if abs(vy) > math.tan(SPUN_SIDESLIP) * vx:
+            return SLIDING
+        if vx < SLOW_BELOW:
+            rolling_yaw_rate = vx * math.tan(x[STEER]) / (p.a + p.b)
+            off = max(abs(yaw_rate - rolling_yaw_rate), abs(vy - p.b * rolling_yaw_rate))
+            return SLOW if off < SLOW_TOLERANCE else SLIDING
+    elif regime == SLOW:
+        if vx > ROLLING_ABOVE:
+            return ROLLING
+    elif math.sqrt(vx**2 + vy**2) < STANDING and abs(yaw_rate) < STANDING:
+        return SLOW
+    return regime
+
+
+@_kernel
+def slow_motion(x, steering_velocity, acceleration, inputs, p):  # type: ignore[no-untyped-def]
+    """Derivatives of vx, vy and yaw rate of a car that rolls without slip; it stands where brakes or a slope hold it."""
+    wheelbase = p.a + p.b
+    least, most = _adhesion(p, p.T_sb), _adhesion(p, p.T_se)
+    wanted = min(max(acceleration, -least), most) + inputs[3]
+    change = wanted * p.m / (p.m + 4.0 * p.I_y_w / p.R_w**2)
+    if x[VX] <= 0.0 and change <= 0.0:
+        change = 0.0
+    tangent = math.tan(x[STEER])
+    yaw_rate = x[VX] * tangent / wheelbase
+    yaw_acceleration = (change * tangent + x[VX] * steering_velocity * (1.0 + tangent**2)) / wheelbase
+    return (
+        change,
+        p.b * yaw_acceleration + (p.b * yaw_rate - x[VY]) / RELAXATION,
+        yaw_acceleration + (yaw_rate - x[YAW_RATE]) / RELAXATION,
+    )
+
+
+@_kernel
+def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
+    """Velocity of the four wheels along their own planes, in the library's order [m/s]."""
+    sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
+    sideways = (x[VY] + p.a * x[YAW_RATE]) * sine
+    front, rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
+    return (x[VX] + front) * cosine + sideways, (x[VX] - front) * cosine + sideways, x[VX] + rear, x[VX] - rear
+
+
+@_kernel
+def forces_of_contact(contact, x, u, p, fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, fz0, fz1, fz2, fz3):  # type: ignore[no-untyped-def]
+    """Longitudinal and lateral forces of the four tyres in the wheels' axes, where the tyre formulas gave fx and fy.
+
+    Args:
+        contact: regime, inputs of the plant, friction of sliding front and rear tyres.
+        x: state.
+        u: steering velocity and acceleration within the vehicle's limits.
+        p: parameters.
+        fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, fz0, fz1, fz2, fz3: forces, in the library's order of wheels.
+    """
+    regime, inputs, friction_front, friction_rear = contact
+    if regime == ROLLING:
+        return fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3
+    sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
+    if regime == SLOW:
+        front_x, rear_x, front_y, rear_y = _forces_needed(x, u, inputs, p)
+        front_x, front_y = 0.5 * (front_x * cosine + front_y * sine), 0.5 * (front_y * cosine - front_x * sine)
+        rear_x, rear_y = 0.5 * rear_x, 0.5 * rear_y
+        return front_x, front_x, rear_x, rear_x, front_y, front_y, rear_y, rear_y
+    half_front, half_rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
+    front_vy, rear_vy = x[VY] + p.a * x[YAW_RATE], x[VY] - p.b * x[YAW_RATE]
+    x0, y0 = _coulomb(friction_front * fz0, x[VX] + half_front, front_vy)
+    x1, y1 = _coulomb(friction_front * fz1, x[VX] - half_front, front_vy)
+    x2, y2 = _coulomb(friction_rear * fz2, x[VX] + half_rear, rear_vy)
+    x3, y3 = _coulomb(friction_rear * fz3, x[VX] - half_rear, rear_vy)
+    return (
+        x0 * cosine + y0 * sine,
+        x1 * cosine + y1 * sine,
+        x2,
+        x3,
+        y0 * cosine - x0 * sine,
+        y1 * cosine - x1 * sine,
+        y2,
+        y3,
+    )
+
+
+@_kernel
+def _adhesion(p, front_share):  # type: ignore[no-untyped-def]
+    """Largest acceleration [m/s²] whose torque, split in this way, neither axle's static load fails to carry."""
+    wheelbase = p.a + p.b
+    front = p.tire.p_dx1 * p.b / wheelbase / max(front_share, 1e-9)
+    rear = p.tire_rear.p_dx1 * p.a / wheelbase / max(1.0 - front_share, 1e-9)
+    return SLOW_ADHESION * GRAVITY * min(front, rear)
+
+
+@_kernel
+def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
+    """Forces on front and rear axle in the body's axes, along and across, that slow_motion needs."""
+    vx_change, vy_change, yaw_acceleration = slow_motion(x, u[0], u[1], inputs, p)
+    along = p.m * (vx_change - x[VY] * x[YAW_RATE] - inputs[3])
+    across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
+    moment, wheelbase = p.I_z * yaw_acceleration, p.a + p.b
+    front_share = p.T_sb if along < 0.0 else p.T_se
+    return (
+        front_share * along,
+        (1.0 - front_share) * along,
+        (across * p.b + moment) / wheelbase,
+        (across * p.a - moment) / wheelbase,
+    )
+
+
+@_kernel
+def _coulomb(limit, vx, vy):  # type: ignore[no-untyped-def]
+    scale = -limit / math.sqrt(vx**2 + vy**2 + SLIDING_SMOOTHING**2)
+    return scale * vx, scale * vy

@@ -1,0 +1,153 @@
+"""Lines across an open area: through cones and gates, and around a circle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from vehest.constants import FloatArray
+
+SPACING = 0.5
+"""Of the samples of a line [m]."""
+CLEARANCE = 0.15
+"""Room that a driver means to leave between the car and a cone [m]; assumed."""
+_KNOTS = 1.5
+"""Spacing of the points that are sought for the smoothest line [m]."""
+_SMOOTH = 6.0
+"""Length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A stretch along the x axis between two rows of cones.
+
+    Args:
+        begin, end: of the stretch [m].
+        right, left: lateral places of the rows [m]; infinite where there is none.
+    """
+
+    begin: float
+    end: float
+    right: float = -math.inf
+    left: float = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line, sampled every ``SPACING`` of its length; arrays of shape (N,): place [m], heading [rad], curvature [1/m]."""
+
+    distance: FloatArray
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+    curvature: FloatArray
+
+    @property
+    def largest_curvature(self) -> float:
+        """Of either sign [1/m]."""
+        return float(np.abs(self.curvature).max())
+
+
+@lru_cache(maxsize=64)
+def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: float) -> Line:
+    """The smoothest line along the x axis that takes a car between the cones.
+
+    It makes the sum of the squares of the curvature, and of its change, as small as the gates allow; in and out it runs straight along the
+    axis. The length of the car, whose ends swing out a little where the line turns, is covered by the clearance.
+
+    Args:
+        gates: in the order of the x axis.
+        width: of the car [m].
+        run_in: straight before the first gate [m].
+        run_out: after the last gate, of which the last two thirds run along the axis [m].
+    """
+    begin, end = gates[0].begin - run_in, gates[-1].end + run_out
+    straight_until, straight_from = gates[0].begin - min(run_in, 40.0), gates[-1].end + run_out / 3.0
+    places = np.linspace(straight_until, straight_from, max(round((straight_from - straight_until) / _KNOTS), 8) + 1)
+    room = 0.5 * width + CLEARANCE
+    lower, upper = np.full(len(places), -np.inf), np.full(len(places), np.inf)
+    for gate in gates:
+        # A gate holds at its ends too, which lie between two points: the nearest points outside them count as inside.
+        inside = (places > gate.begin - 0.75 * _KNOTS) & (places < gate.end + 0.75 * _KNOTS)
+        lower[inside] = np.maximum(lower[inside], gate.right + room)
+        upper[inside] = np.minimum(upper[inside], gate.left - room)
+    tight = lower > upper - 1e-3  # the gate is hardly wider than the car: right through the middle
+    middle = 0.5 * (lower[tight] + upper[tight])
+    lower[tight], upper[tight] = middle - 5e-4, middle + 5e-4
+    step = places[1] - places[0]
+    padded = np.eye(len(places) + 6)[:, 3:-3]  # straight on both sides
+    bends = np.diff(padded, 2, axis=0) / step**2
+    changes = _SMOOTH * np.diff(padded, 3, axis=0) / step**3
+    lateral = least_within(bends.T @ bends + changes.T @ changes, lower, upper)
+    around = np.concatenate([places[0] + step * np.arange(-3, 0), places, places[-1] + step * np.arange(1, 4)])
+    return _sampled(around, np.pad(lateral, 3), begin, end)
+
+
+def least_within(stiffness: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """The vector y (N,) within bounds (N,) for which yᵀ·stiffness·y is least, by the alternating direction method of multipliers.
+
+    Args:
+        stiffness: (N, N), positive definite with at most three diagonals beside the main one.
+        lower, upper: (N,), infinite where y is free. They may be exceeded by ``_TOLERANCE``.
+    """
+    bounded = (np.isfinite(lower) | np.isfinite(upper)).astype(np.float64)
+    system = stiffness + _PENALTY * np.diag(bounded)
+    bands = np.array([np.pad(np.diagonal(system, above), (above, 0)) for above in (3, 2, 1, 0)])
+    factor = cholesky_banded(bands)
+    y = allowed = np.clip(np.zeros(len(lower)), lower, upper)
+    multiplier = np.zeros(len(lower))
+    for _ in range(_MOST_ITERATIONS):
+        before = allowed
+        y = cho_solve_banded((factor, False), _PENALTY * bounded * (allowed - multiplier), check_finite=False)
+        allowed = np.clip(y + multiplier, lower, upper)
+        multiplier = bounded * (multiplier + y - allowed)
+        if max(np.abs(bounded * (y - allowed)).max(), np.abs(bounded * (allowed - before)).max()) < _TOLERANCE:
+            break
+    return np.asarray(y)
+
+
+_PENALTY = 0.03
+_TOLERANCE = 1e-4
+_MOST_ITERATIONS = 3000
+
+
+def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) -> Line:
+    """A line at equal distances along itself, straight outside ``places``."""
+    offset = CubicSpline(places, lateral, bc_type="clamped")
+    x = np.arange(begin, end, 0.1)
+    inside = np.clip(x, places[0], places[-1])
+    slope = np.where(inside == x, offset(inside, 1), 0.0)
+    along = np.concatenate([[0.0], np.cumsum(0.1 * np.sqrt(1.0 + (0.5 * (slope[1:] + slope[:-1])) ** 2))])
+    distance = np.arange(0.0, along[-1], SPACING)
+    x = np.interp(distance, along, x)
+    inside = np.clip(x, places[0], places[-1])
+    slope, bend = (np.where(inside == x, offset(inside, order), 0.0) for order in (1, 2))
+    y = np.where(inside == x, offset(inside), 0.0)
+    return Line(distance, x, y, np.arctan(slope), bend / (1.0 + slope**2) ** 1.5)
+
+
+def circle(radius: float, side: float, run_in: float, length: float, transition: float) -> Line:
+    """A straight along the x axis, a clothoid, and a circle for the rest of ``length``.
+
+    Args:
+        radius: [m].
+        side: 1 for a circle to the left, -1 to the right.
+        run_in: length of the straight [m].
+        length: of the circle [m].
+        transition: length of the clothoid [m].
+    """
+    distance = np.arange(0.0, run_in + transition + length, SPACING)
+    curvature = side / radius * np.clip((distance - run_in) / transition, 0.0, 1.0)
+    beyond = np.clip(distance - run_in, 0.0, transition)
+    heading = side / radius * (0.5 * beyond**2 / transition + np.maximum(distance - run_in - transition, 0.0))
+    # Simpson's rule over each sample; the heading between two samples is taken as linear, as good as exact at this spacing.
+    half = 0.5 * (heading[1:] + heading[:-1])
+    x, y = (
+        np.concatenate([[0.0], np.cumsum(SPACING / 6.0 * (f(heading[:-1]) + 4.0 * f(half) + f(heading[1:])))]) for f in (np.cos, np.sin)
+    )
+    return Line(distance, x, y, heading, curvature)

@@ -1,0 +1,116 @@
+"""Surfaces: how slippery the road is, as a scale of the tyres' friction along the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.plant.parameters import is_number
+
+_STREAM = 2  # of a drive's seed; 0 is the driver's, 1 the sensors'
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Friction of a road.
+
+    Either one scale all along or, with ``patches``, patches of which each has a scale drawn between ``patches`` and ``friction``,
+    uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
+
+    Args:
+        name: what recordings call it.
+        friction: scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data.
+        patches: lowest scale of a patch.
+        patch_length: shortest and longest patch [m].
+        seed: of the patches; by default the drive's.
+
+    Raises:
+        ConfigurationError: a scale is outside 0.05 … 1.5 or a length makes no sense.
+    """
+
+    name: str = "dry"
+    friction: float = 1.0
+    patches: float | None = None
+    patch_length: tuple[float, float] = (20.0, 80.0)
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        lowest = self.friction if self.patches is None else self.patches
+        if not 0.05 <= lowest <= self.friction <= 1.5:
+            raise ConfigurationError(
+                f"surface '{self.name}': friction must lie between 0.05 and 1.5 and its patches below it, not {self.friction} and {lowest}"
+            )
+        if not 5.0 <= self.patch_length[0] <= self.patch_length[1] < math.inf:
+            raise ConfigurationError(f"surface '{self.name}': patches are at least 5 m long, not {self.patch_length}")
+
+    def along(self, distance: FloatArray, drive_seed: int, length: float | None = None) -> FloatArray:
+        """Scale at each distance along the way, shape (N,).
+
+        Args:
+            distance: (N,) [m], zero or positive, uniform.
+            drive_seed: draws the patches if the surface has no seed of its own.
+            length: of a lap, after which the same patches come again [m]; by default they never do.
+        """
+        if self.patches is None:
+            return np.full(distance.shape, self.friction)
+        around = length if length is not None else float(distance[-1]) + 1.0
+        ends, scales = self._draw(around, self.seed if self.seed is not None else drive_seed)
+        nodes = np.concatenate([[0.0], np.repeat(ends[:-1], 2) + np.tile([-1.0, 1.0], len(ends) - 1), [around]])
+        return np.interp(np.mod(distance, around), nodes, np.repeat(scales, 2))
+
+    def _draw(self, around: float, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Ends [m] and scales of the patches of one lap; the last one is as long as it must be."""
+        generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM,)))
+        low = self.friction if self.patches is None else self.patches
+        ends = np.cumsum(generator.uniform(*self.patch_length, math.ceil(around / self.patch_length[0]) + 1))
+        scales = generator.uniform(low, self.friction, len(ends))
+        inside = ends < around - self.patch_length[0]
+        return np.append(ends[inside], around), scales[: int(inside.sum()) + 1]
+
+
+SURFACES: dict[str, Surface] = {
+    "dry": Surface(),
+    "wet": Surface("wet", 0.7),
+    "patchy": Surface("patchy", 1.0, patches=0.5),
+}
+"""Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's friction, puddles or gravel half."""
+
+
+def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surface:
+    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road.
+
+    Raises:
+        ConfigurationError: no such surface or argument, or see Surface.
+    """
+    if configuration is None:
+        return SURFACES["dry"]
+    if isinstance(configuration, str):
+        if configuration not in SURFACES:
+            raise ConfigurationError(f"there is no surface '{configuration}'; there are {', '.join(SURFACES)}")
+        return SURFACES[configuration]
+    if not isinstance(configuration, Mapping):
+        raise ConfigurationError(
+            f"a surface is one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not {configuration!r}"
+        )
+    known = {entry.name for entry in fields(Surface)}
+    unknown = sorted(set(configuration) - known)
+    if unknown:
+        raise ConfigurationError(f"surface: unknown keys {unknown}; it has {sorted(known)}")
+    values: dict[str, Any] = {"name": "own", **configuration}
+    name, seed, length = str(values["name"]), values.get("seed"), values.get("patch_length")
+    for key in ("friction", "patches"):
+        if key in values and not is_number(values[key]):
+            raise ConfigurationError(f"surface '{name}': {key} must be a number, not {values[key]!r}")
+    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
+        raise ConfigurationError(f"surface '{name}': seed must be a whole number, zero or positive, not {seed!r}")
+    if length is not None:
+        if not isinstance(length, list | tuple) or len(length) != 2 or not all(is_number(end) for end in length):
+            raise ConfigurationError(f"surface '{name}': patch_length is a pair [shortest, longest] in metres, not {length!r}")
+        values["patch_length"] = (float(length[0]), float(length[1]))
+    return Surface(**values)

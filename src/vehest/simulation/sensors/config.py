@@ -1,0 +1,137 @@
+"""How a configuration or a study changes the presets of simulated sensors, down to one error of one sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.sensors.levels import (
+    NO_ERRORS,
+    PRESETS,
+    REFERENCES,
+    Reference,
+    SensorLevel,
+    SensorLevels,
+    without_errors,
+)
+
+OFF = "off"
+"""How a configuration says so; YAML makes False of it, a command line leaves it as it is."""
+
+
+def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
+    """The same levels with some errors off; all other samples stay what they were, bit by bit.
+
+    >>> levels = switched_off(SensorLevels(), "ay.noise", "tilt.bank", "reference", "*.drift")
+
+    Args:
+        levels: to begin with.
+        names: an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
+            ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
+
+    Raises:
+        ConfigurationError: there is no such sensor or error.
+    """
+    for name in names:
+        path = str(name).split(".")
+        if path[0] == "*":
+            every = [entry.name for entry in fields(levels) if isinstance(getattr(levels, entry.name), SensorLevel)]
+            for sensor in every:
+                levels = _off_at(levels, [sensor, *path[1:]], name)
+        else:
+            levels = _off_at(levels, path, name)
+    return levels
+
+
+def sensor_levels_from_config(value: Any) -> SensorLevels:
+    """Levels as a data set's ``sensors`` spells them.
+
+    ``race``, or a mapping that starts from a ``preset`` (by default ``default``) and changes some of it::
+
+        {preset: race, reference: optical, ay: {noise: 0, offset: 0.05}, steer: off, tilt: {bank: off}, switched_off: ["*.drift"]}
+
+    A sensor, ``imu``, ``tilt`` and ``reference`` take a mapping of what changes, or ``off``; ``reference`` also takes a kind, or a
+    mapping with one.
+
+    Raises:
+        ConfigurationError: an unknown name, with those there are, or a value that makes no sense.
+    """
+    if value is None:
+        return PRESETS["default"]
+    if isinstance(value, str):
+        return _preset(value)
+    if not isinstance(value, Mapping):
+        raise ConfigurationError(f"sensors is the name of a preset ({', '.join(PRESETS)}) or a mapping, not {value!r}")
+    changes = {str(key): change for key, change in value.items()}
+    levels = _preset(str(changes.pop("preset", "default")))
+    off = changes.pop("switched_off", ())
+    if isinstance(off, str):
+        off = [off]
+    if not isinstance(off, Iterable) or isinstance(off, Mapping):
+        raise ConfigurationError(f"sensors: switched_off is a list of names such as ay.noise, not {off!r}")
+    levels = _changed(levels, changes, "sensors", also=("preset", "switched_off"))
+    return switched_off(levels, *off)
+
+
+def _preset(name: str) -> SensorLevels:
+    if name not in PRESETS:
+        raise ConfigurationError(f"sensors '{name}' is not one of: {', '.join(PRESETS)}")
+    return PRESETS[name]
+
+
+def _reference(kind: Any) -> Reference:
+    if str(kind) not in REFERENCES:
+        raise ConfigurationError(f"sensors: reference '{kind}' is not one of: {', '.join(REFERENCES)}")
+    return REFERENCES[str(kind)]
+
+
+def _changed(current: Any, changes: Mapping[str, Any], where: str, also: tuple[str, ...] = ()) -> Any:
+    """A dataclass of levels with some of its fields changed, or all of them off."""
+    known = [entry.name for entry in fields(current)]
+    new = {}
+    for key, change in changes.items():
+        if key not in known:
+            raise ConfigurationError(f"{where}: '{key}' is not one of: {', '.join([*known, *also])}")
+        new[key] = _changed_value(getattr(current, key), change, f"{where}: {key}" if where == "sensors" else f"{where}.{key}")
+    try:
+        return replace(current, **new)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
+
+
+def _changed_value(old: Any, change: Any, where: str) -> Any:
+    if is_dataclass(old):
+        if change is False or change == OFF:
+            return without_errors(old)
+        if isinstance(old, Reference) and isinstance(change, str):
+            return _reference(change)
+        if not isinstance(change, Mapping):
+            raise ConfigurationError(f"{where} is a mapping of what changes, or off, not {change!r}")
+        rest = {str(key): value for key, value in change.items()}
+        if isinstance(old, Reference) and "kind" in rest:
+            old = _reference(rest.pop("kind"))
+        return _changed(old, rest, where)
+    if isinstance(old, bool):
+        change = {"on": True, OFF: False}.get(change, change) if isinstance(change, str) else change
+        if not isinstance(change, bool):
+            raise ConfigurationError(f"{where} is on or off, not {change!r}")
+        return change
+    if isinstance(change, bool) or not isinstance(change, int | float):
+        raise ConfigurationError(f"{where} is a number, not {change!r}")
+    return float(change)
+
+
+def _off_at(levels: Any, path: list[str], name: str) -> Any:
+    """Levels with what stands at a path off; ``name`` is the whole path, for complaints."""
+    key, rest = path[0], path[1:]
+    choices = [entry.name for entry in fields(levels) if entry.name not in NO_ERRORS]
+    if key not in choices:
+        raise ConfigurationError(f"sensors: cannot switch off '{name}': '{key}' is not one of: {', '.join(choices)}")
+    old = getattr(levels, key)
+    if not rest:
+        return replace(levels, **{key: without_errors(old)})
+    if not is_dataclass(old):
+        raise ConfigurationError(f"sensors: cannot switch off '{name}': '{key}' has no parts")
+    return replace(levels, **{key: _off_at(old, rest, name)})

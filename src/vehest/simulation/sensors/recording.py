@@ -1,0 +1,168 @@
+"""Simulated sensors: what they show of a true motion, with errors that can be switched off one by one.
+
+How large the errors are stands in ``sensor_levels``, how they are changed in ``sensor_config``, how they arise in ``sensor_errors``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import GRAVITY, FloatArray
+from vehest.simulation.plant.motion import WHEELS, Motion
+from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
+from vehest.simulation.sensors.errors import shown, stream
+from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
+
+__all__ = [
+    "GRAVITY",
+    "PRESETS",
+    "Mounting",
+    "Reference",
+    "SensorLevel",
+    "SensorLevels",
+    "Tilt",
+    "Vibration",
+    "body_rates",
+    "described",
+    "ideal_sensors",
+    "measure",
+    "sensor_levels_from_config",
+    "specific_force",
+    "switched_off",
+]
+
+
+def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
+    """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
+
+    Args:
+        motion: what the car really did.
+        levels: of the sensors' errors.
+        seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
+    """
+    true = {"vx": motion.vx, "steer": motion.steer, **_inertial(motion, levels, seed)}
+    sensor_of = {name: name for name in true}
+    for sensor, values in (
+        ("wheel_speed", motion.wheel_speed),
+        ("fx", motion.tyre_fx),
+        ("fy", motion.tyre_fy),
+        ("fz", motion.tyre_fz),
+    ):
+        for place, wheel in enumerate(WHEELS):
+            true[f"{sensor}_{wheel}"] = values[:, place]
+            sensor_of[f"{sensor}_{wheel}"] = sensor
+    for name, of_motor in (("motor_speed", motion.motor_speed), ("motor_current", motion.motor_current)):
+        if of_motor is not None:
+            true[name], sensor_of[name] = of_motor, name
+    channels = {name: shown(values, getattr(levels, sensor_of[name]), motion.rate_hz, seed, name) for name, values in true.items()}
+    return channels | _reference(motion, levels.reference, seed)
+
+
+def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
+    """What provenance says of the sensors that measured a motion: all but those of a motor, and a vibration, that are not there."""
+    absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
+    if levels.vibration == Vibration():
+        absent.add("vibration")
+    return {name: value for name, value in asdict(levels).items() if name not in absent}
+
+
+def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
+    """Specific force at the centre of gravity in the axes of the tilted body, forward, left and up [m/s²], (3, T).
+
+    The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
+    along its vertical axis are left out.
+
+    Args:
+        motion: whose ax and ay are those in the road's plane.
+        tilt: which angles count; by default all.
+    """
+    tilt = tilt or Tilt()
+    grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
+    road = np.stack(
+        [
+            motion.ax - GRAVITY * np.sin(grade),
+            motion.ay + GRAVITY * np.cos(grade) * np.sin(bank),
+            GRAVITY * np.cos(grade) * np.cos(bank),
+        ]
+    )
+    return _turned(road, motion.roll * tilt.roll, motion.pitch * tilt.pitch)
+
+
+def body_rates(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
+    """Angular velocity about the body's forward, left and upward axes [rad/s], (3, T).
+
+    ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
+
+    Args:
+        motion: whose yaw rate is that about the road's normal.
+        tilt: which angles count, roll and pitch; by default all.
+    """
+    tilt = tilt or Tilt()
+    roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch
+    sin_roll, cos_roll, sin_pitch, cos_pitch = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
+    return np.stack(
+        [
+            motion.roll_rate - motion.yaw_rate * sin_pitch,
+            motion.pitch_rate * cos_roll + motion.yaw_rate * cos_pitch * sin_roll,
+            motion.yaw_rate * cos_pitch * cos_roll - motion.pitch_rate * sin_roll,
+        ]
+    )
+
+
+def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
+    """True angular velocities and specific forces where the inertial unit sits, along its axes."""
+    mounting = levels.imu
+    rates, force = body_rates(motion, levels.tilt), specific_force(motion, levels.tilt)
+    lever = np.array([mounting.lever_x, mounting.lever_y, mounting.lever_z])
+    if lever.any():
+        force = force + _lever_acceleration(rates, lever, motion.rate_hz)
+    angles = np.array([mounting.roll, mounting.pitch, mounting.yaw])
+    if mounting.misalignment:
+        angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(3)
+    roll_rate, pitch_rate, yaw_rate = _turned(rates, *angles)
+    ax, ay, _ = _turned(force, *angles)
+    felt = {"yaw_rate": yaw_rate, "roll_rate": roll_rate, "pitch_rate": pitch_rate, "ax": ax, "ay": ay}
+    for name in ("yaw_rate", "ax", "ay"):
+        by_speed = getattr(levels.vibration, name)
+        if by_speed:
+            shaking = stream(seed, f"vibration.{name}").standard_normal(len(motion))
+            felt[name] = felt[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
+    return felt
+
+
+def _lever_acceleration(rates: FloatArray, lever: FloatArray, rate_hz: float) -> FloatArray:
+    """dω/dt × l + ω × (ω × l) of a point at ``lever`` (3,) of a rigid body that turns with ``rates`` (3, T), shape (3, T)."""
+    angular = np.gradient(rates, axis=1) * rate_hz if rates.shape[1] > 1 else np.zeros_like(rates)
+    arm = lever[:, None]
+    turning = np.cross(rates, arm, axis=0)
+    return np.cross(angular, arm, axis=0) + np.cross(rates, turning, axis=0)
+
+
+def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | float, yaw: FloatArray | float = 0.0) -> FloatArray:
+    """A vector (3, T) along axes that are turned by yaw, then pitch, then roll; the angles are numbers or (T,)."""
+    x, y, z = vector
+    x, y = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
+    x, z = x * np.cos(pitch) - z * np.sin(pitch), z * np.cos(pitch) + x * np.sin(pitch)
+    y, z = y * np.cos(roll) + z * np.sin(roll), z * np.cos(roll) - y * np.sin(roll)
+    return np.stack([x, y, z])
+
+
+def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, FloatArray]:
+    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity with what it knows."""
+    rate_hz = motion.rate_hz
+    forward = motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
+    left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
+    heading = shown(np.zeros(len(motion)), reference.heading, rate_hz, seed, "heading_ref")
+    cosine, sine = np.cos(heading), np.sin(heading)
+    yaw_rate = shown(motion.yaw_rate, reference.yaw_rate, rate_hz, seed, "yaw_rate_ref")
+    seen_forward = shown(forward * cosine + left * sine, reference.vx, rate_hz, seed, "vx_ref")
+    seen_left = shown(left * cosine - forward * sine, reference.vy, rate_hz, seed, "vy_ref")
+    lever_x, lever_y = reference.lever_x, reference.lever_y
+    if reference.lever_error:
+        error_x, error_y = reference.lever_error * stream(seed, "reference.lever_error").standard_normal(2)
+        lever_x, lever_y = lever_x + error_x, lever_y + error_y
+    vx, vy = seen_forward + yaw_rate * lever_y, seen_left - yaw_rate * lever_x
+    return {"vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate, "sideslip_ref": np.arctan2(vy, vx)}

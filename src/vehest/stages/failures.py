@@ -1,0 +1,61 @@
+"""What a failure is told as: one line, the exit code, and the traceback where it is a defect."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from dataclasses import dataclass
+
+from vehest.data.errors import MissingError, VehestError
+from vehest.data.files import no_room
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job or command that failed.
+
+    Args:
+        message: one line.
+        detail: traceback, where it was a defect rather than an expected error.
+        exit_code: what a command that runs this job alone leaves with.
+    """
+
+    message: str
+    detail: str = ""
+    exit_code: int = 1
+
+
+def failure_of(error: Exception) -> Failure:
+    """How to tell of an error: what the user or the machine can change in words, anything else as a defect."""
+    known = error if isinstance(error, VehestError) else _of_machine(error)
+    if known is not None:
+        return Failure(str(known), exit_code=known.exit_code)
+    message = f"{type(error).__name__}: {error}"
+    if isinstance(error, RecursionError):
+        message += "; something that was read nests too deeply: make it flatter"
+    return Failure(message, detail="".join(traceback.format_exception(error)))
+
+
+def _of_machine(error: Exception) -> VehestError | None:
+    """The error as what it is where the machine is short of something, or a file cannot be reached."""
+    full = no_room(error)
+    if full is not None:
+        where = f"'{full.filename}'" if full.filename else "where results and temporary files go"
+        return MissingError(f"no room left to write {where} ({full.strerror}); free some space and run again")
+    if isinstance(error, FileNotFoundError) and not _has_working_folder():
+        return MissingError("the working folder has been removed; change to another")
+    if isinstance(error, OSError) and error.filename is not None:
+        return MissingError(f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions")
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        return MissingError(
+            "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter recordings, smaller networks"
+        )
+    return None
+
+
+def _has_working_folder() -> bool:
+    try:
+        os.getcwd()
+    except OSError:
+        return False
+    return True

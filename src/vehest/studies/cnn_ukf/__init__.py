@@ -1,9 +1,0 @@
-"""Tables and figures of Bertipaglia, Alirezaei, Happee and Shyrokau 2024, on the parts of a pipeline such as ``cnn_ukf``.
-
-Parts it knows: ``full``, which it needs, with one test set ``test`` of manoeuvres, and, which it goes on without, ``limited``,
-``limited_alone``, ``causal`` on the same test set, and ``ferrari``.
-"""
-
-from vehest.studies.cnn_ukf.document import build_parts
-
-__all__ = ["build_parts"]

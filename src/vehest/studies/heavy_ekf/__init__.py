@@ -1,8 +1,0 @@
-"""Tables and figures of Di Biase, Lenzo and Timpone 2020, on the parts of a pipeline such as ``heavy_ekf``.
-
-Parts it knows: ``truck``, which it needs, with test sets ``TYRES_laps`` and ``TYRES_fast``, and ``ferrari``, which it goes on without.
-"""
-
-from vehest.studies.heavy_ekf.document import build_parts
-
-__all__ = ["build_parts"]

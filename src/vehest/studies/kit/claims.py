@@ -1,0 +1,96 @@
+"""What a paper claims, held against what came out: the table on the first page of a study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import pandas as pd
+
+from vehest.evaluation.ranking import Name, Ranking
+from vehest.report.document import Column, Table, as_text
+from vehest.report.style import fixed
+
+Verdict = Literal["reproduced", "not reproduced", "undecided", "not testable on this data"]
+
+_COLUMNS = {"claim": "claim", "paper": "paper", "ours": "ours, with 95 % interval", "data": "data", "verdict": "verdict", "why": "why"}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim and what became of it.
+
+    Args:
+        claim: what is claimed, of what, in a few words.
+        paper: the paper's figure, in words.
+        ours: our figure with its interval, in words.
+        data: what ours comes from: ``real`` or ``simulated``, and which test.
+        verdict: whether the claim came out.
+        why: what decided, in a clause.
+    """
+
+    claim: str
+    paper: str
+    ours: str
+    data: str
+    verdict: Verdict
+    why: str
+
+
+def claims_table(claims: Sequence[Claim], note: str = "") -> Table:
+    """Table ``claims``: claim, paper, ours with interval, data, verdict."""
+    rows = pd.DataFrame([asdict(own) for own in claims], columns=list(_COLUMNS)).map(as_text)
+    number = {verdict: sum(own.verdict == verdict for own in claims) for verdict in _VERDICTS}
+    counts = ", ".join(f"{n} {verdict}" for verdict, n in number.items() if n) or "nothing to compare"
+    caption = f"What the paper claims and what came out here: {counts}. {_RULE} {note}".strip()
+    return Table("claims", caption, rows, {name: Column(title) for name, title in _COLUMNS.items()})
+
+
+def order_claim(ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Name, str], paper: str, data: str) -> Claim:
+    """The claim that one estimator has the lower RMSE(β) of two, by the corrected interval of their difference.
+
+    Args:
+        ranking: of the test set, with the two among its pairs (`vehest.evaluation.ranking.rank`).
+        lower: estimator and variant that the paper has below the other one.
+        higher: the other one.
+        titles: what both are called.
+        paper: the paper's figures, in words.
+        data: what the test set is.
+    """
+    claim = f"{titles[lower]} below {titles[higher]}"
+    own = ranking.pairs.get((lower, higher))
+    if own is None:
+        missing = [titles[name] for name in (lower, higher) if name not in ranking.rmse]
+        why = f"no finite error of {' and '.join(missing)}" if missing else f"the test has {ranking.n_blocks} blocks only"
+        return Claim(claim, paper, "–", data, "not testable on this data", why)
+    figures = (
+        f"{fixed(ranking.rmse[lower], 3)}° and {fixed(ranking.rmse[higher], 3)}°; difference {_interval(own.difference, own.low, own.high)}"
+    )
+    verdict, why = _OF_ORDER[own.verdict]
+    return Claim(claim, paper, figures, data, verdict, why)
+
+
+def bound_claim(ranking: Ranking, name: Name, title: str, limit: float, paper: str, data: str) -> Claim:
+    """The claim that an estimator's RMSE(β) lies below a limit [deg], by the 95 % interval of its RMSE over blocks and seeds."""
+    claim = f"{title} below {fixed(limit, 2)}°"
+    if name not in ranking.intervals:
+        return Claim(claim, paper, "–", data, "not testable on this data", f"the test has {ranking.n_blocks} blocks only")
+    low, high = ranking.intervals[name]
+    verdict: Verdict = "reproduced" if high < limit else "not reproduced" if low > limit else "undecided"
+    why = {"reproduced": "the interval lies below", "not reproduced": "the interval lies above"}
+    words = why.get(verdict, "the interval holds the limit")
+    return Claim(claim, paper, _interval(ranking.rmse[name], low, high), data, verdict, words)
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    return f"{fixed(value, 3)}° [{fixed(low, 3)}, {fixed(high, 3)}]"
+
+
+_VERDICTS: tuple[Verdict, ...] = ("reproduced", "not reproduced", "undecided", "not testable on this data")
+_OF_ORDER: dict[str, tuple[Verdict, str]] = {
+    "lower": ("reproduced", "the corrected interval of the difference lies below zero"),
+    "higher": ("not reproduced", "the corrected interval of the difference lies above zero"),
+    "not told apart": ("undecided", "the corrected interval of the difference holds zero"),
+}
+_RULE = "Intervals: paired block bootstrap; those of differences are corrected by Holm within their test."

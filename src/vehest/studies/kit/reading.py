@@ -1,0 +1,63 @@
+"""Recordings and metrics of a part of a study, and what its data are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.data.store import read_recording
+from vehest.report.document import as_text
+from vehest.report.style import MISSING, fixed
+from vehest.studies.artefacts import StudyArtefacts
+
+MOST_NAMED = 12
+
+
+def recordings_of(part: StudyArtefacts, spans: Iterable[Span]) -> list[Recording]:
+    """Scored ranges at the evaluation rate, references included."""
+    return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
+
+
+def words_of_kinds(part: StudyArtefacts) -> str:
+    """``real``, ``simulated`` or both, of all that a part draws on."""
+    return " and ".join(sorted({part.kinds[name] for name in part.split.datasets}))
+
+
+def spans_in_words(spans: Sequence[Span]) -> str:
+    """Recordings, with their times where they are not used whole; many of them are counted."""
+    if not spans:
+        return MISSING
+    words = []
+    for span in spans:
+        whole = span.start == -math.inf and span.stop == math.inf
+        words.append(as_text(span.recording) if whole else f"{as_text(span.recording)} ({_times(span)})")
+    return ", ".join(words) if len(words) <= MOST_NAMED else f"{len(words)} ranges of {len({span.recording for span in spans})} recordings"
+
+
+def _times(span: Span) -> str:
+    if span.start == -math.inf:
+        return f"up to {span.stop:g} s"
+    return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
+
+
+def metric_values(part: StudyArtefacts) -> dict[tuple[str, str, int, str, str], float]:
+    """(estimator, variant, seed, test set, metric) -> value, over all samples under nominal conditions."""
+    metrics = part.metrics[(part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")]
+    return {
+        (str(row["estimator"]), str(row["variant"]), int(row["seed"]), str(row["test_set"]), str(row["metric"])): float(row["value"])
+        for row in metrics.to_dict("records")
+    }
+
+
+def median_and_range(values: FloatArray, decimals: int) -> str:
+    """Median, lowest and highest of some seeds: ``0.0135 [0.0130, 0.0141]``; a single value alone."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return MISSING
+    words = fixed(float(np.median(finite)), decimals)
+    return words if len(finite) == 1 else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"

@@ -1,0 +1,84 @@
+"""Metrics of a comparison by run, and the seed that stands for an estimator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.splits import VALIDATION
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+
+Name = tuple[str, str]
+"""Estimator and variant."""
+
+Runs = dict[tuple[str, str, int, str], dict[str, float]]
+"""(estimator, variant, seed, test set) -> metric -> value."""
+
+
+def runs_of(artefacts: StudyArtefacts, column: str = "value") -> Runs:
+    """The metrics of all samples under nominal conditions, by run and test set.
+
+    Args:
+        artefacts: of a comparison.
+        column: ``value``, or ``low`` or ``high`` for the ends of intervals.
+
+    Raises:
+        DataError: two different values for one metric of one run.
+    """
+    metrics = artefacts.metrics
+    nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
+    columns = (nominal[name].tolist() for name in ("estimator", "variant", "seed", "test_set", "metric", column))
+    runs: Runs = {}
+    for estimator, variant, seed, test_set, metric, value in zip(*columns, strict=True):
+        run = runs.setdefault((_text(estimator), _text(variant), int(seed), _text(test_set)), {})
+        number = float(value)
+        if not (math.isnan(number) or math.isnan(run.get(metric, math.nan)) or run[metric] == number):
+            raise DataError(
+                f"study '{artefacts.study}': {metric} of {estimator}/{variant}, seed {seed}, on '{test_set}' is both {run[metric]:g} and "
+                f"{number:g}; give models that differ in more than the seed different variants"
+            )
+        if not math.isnan(number):
+            run[metric] = number
+    return runs
+
+
+def values_of(runs: Runs, name: Name, seeds: Sequence[int], test_set: str, metric: str) -> FloatArray:
+    """Values of a metric, one a seed; NaN where there is none."""
+    return np.array([runs.get((*name, seed, test_set), {}).get(metric, math.nan) for seed in seeds])
+
+
+def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
+    """A metric of the model itself, under whatever test set it was noted."""
+    known = (run[metric] for (*key, _), run in runs.items() if (*key,) == (*name, seed) and metric in run)
+    return next(known, math.nan)
+
+
+def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs, metric: str = "rmse_vy") -> int:
+    """The seed with the lowest figure on the validation range, the lower one of equals: test data choose nothing.
+
+    Raises:
+        DataError: several seeds and no figures on the validation range.
+    """
+    if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
+        raise DataError(
+            f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"
+        )
+    validation = values_of(runs, name, seeds, VALIDATION, metric)
+    return seeds[int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))]
+
+
+def by_name(models: Iterable[EvaluatedModel]) -> dict[Name, list[EvaluatedModel]]:
+    """Models by estimator and variant, in their order."""
+    groups: dict[Name, list[EvaluatedModel]] = {}
+    for model in models:
+        groups.setdefault((model.estimator, model.variant), []).append(model)
+    return groups
+
+
+def _text(value: object) -> str:
+    """Empty for the NaN that pandas reads an empty field as."""
+    return value if isinstance(value, str) else ""

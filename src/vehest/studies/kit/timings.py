@@ -1,0 +1,58 @@
+"""What trainings and online steps took, for the page alone: a time is never the same twice, and so no published file holds one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+
+from vehest.report.document import Column, Table
+
+NAME = ("estimator", "variant")
+CAPTION = (
+    "Medians over seeds, wall time on the machine that `provenance.json` names, where others may have worked at the same time; an online "
+    "step is one sample through `step()`. Every figure is in `timings.csv` beside this page, in seconds."
+)
+
+
+def timings_of_study(parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]]) -> list[str | Table]:
+    """A section with what each estimator took; nothing where no times are known.
+
+    Args:
+        parts: of each its title, empty where there is only one; its times [s], with `vehest.studies.artefacts.METRIC_COLUMNS`; and
+            (estimator, variant) -> title.
+    """
+    rows = [row for part in parts for row in _rows(*part)]
+    if not rows:
+        return []
+    frame = pd.DataFrame(rows)
+    known = {
+        "part": Column("part"),
+        "title": Column("estimator"),
+        "fits": Column("fits", decimals=0),
+        "train_seconds": Column("training of a seed [s]", digits=2),
+        "all_seconds": Column("of all seeds [s]", decimals=0),
+        "step_seconds": Column("online step [ms]", digits=2),
+    }
+    phases = [str(name) for name in frame if name not in known]
+    columns = {name: column for name, column in known.items() if name in frame}
+    columns |= {name: Column(f"of a training: {name.removesuffix('_seconds').replace('_', ' ')} [s]", digits=2) for name in phases}
+    if not any(title for title, *_ in parts):
+        del columns["part"]
+    return ["## Times", Table("timings", CAPTION, frame, columns)]
+
+
+def _rows(part: str, table: pd.DataFrame, titles: Mapping[tuple[str, str], str]) -> list[dict[str, object]]:
+    seeds = table.drop_duplicates(subset=[*NAME, "seed", "metric"])  # a time of the fit is noted under every test set
+    rows = []
+    for name, title in titles.items():
+        own = seeds[(seeds["estimator"] == name[0]) & (seeds["variant"].fillna("") == name[1])]
+        if own.empty:
+            continue
+        medians = {str(metric): float(value) for metric, value in own.groupby("metric")["value"].median().items()}
+        row: dict[str, object] = {"part": part, "title": title, "fits": own["seed"].nunique()}
+        row |= {"train_seconds": medians.pop("train_seconds", float("nan"))}
+        row |= {"all_seconds": float(own.loc[own["metric"] == "train_seconds", "value"].sum())}
+        row |= {"step_seconds": 1e3 * medians.pop("step_seconds", float("nan"))}
+        rows.append(row | medians)
+    return rows

@@ -1,0 +1,97 @@
+"""What a reader has to know before trusting a comparison: tests without sideslip, trainings cut short, ranges of another kind."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.splits import Span
+from vehest.data.store import read_recording
+from vehest.report.document import as_text
+from vehest.report.style import listed
+from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.kit.runs import by_name, of_model, runs_of
+
+LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
+DIFFERENT = 1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
+
+
+def warnings_of(artefacts: StudyArtefacts) -> list[str]:
+    """Sentences, each about one test set or one estimator; none where there is nothing to warn of."""
+    return [*_excitation(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
+
+
+def _excitation(artefacts: StudyArtefacts) -> list[str]:
+    found = []
+    for test_set, spans in artefacts.split.tests.items():
+        sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
+        level = float(np.sqrt(np.mean(np.square(sideslip))))
+        if level < LITTLE_SIDESLIP:
+            found.append(
+                f"Test set `{test_set}` hardly excites sideslip: {level:.2g}° (rms), 99 % of the time below "
+                f"{np.quantile(np.abs(sideslip), 0.99):.2g}°; offsets of the reference may decide who is first."
+            )
+    return found
+
+
+def _kinds(artefacts: StudyArtefacts) -> list[str]:
+    """Where a test goes beyond what was learnt from, in lateral acceleration, sideslip or speed."""
+    if not artefacts.split.train:
+        return []
+    learnt, found = _reference(artefacts, artefacts.split.train), []
+    words = {"ay": "lateral acceleration", "sideslip": "sideslip", "vx": "speed"}
+    for test_set, spans in artefacts.split.tests.items():
+        tested = _reference(artefacts, spans)
+        beyond, short = [], []
+        for name, word in words.items():
+            own, other = (float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt))
+            if other > 0 and own > DIFFERENT * other:
+                beyond.append(f"{word} ({own / other:.2g} times at the 99th percentile)")
+            elif own > 0 and other > DIFFERENT * own:
+                short.append(f"{word} ({own / other:.2g} times)")
+        if beyond:
+            found.append(f"Test set `{test_set}` goes beyond the training ranges in {listed(beyond)}: estimators extrapolate there.")
+        if short:
+            found.append(
+                f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than what was learnt."
+            )
+        kinds = {artefacts.kinds[span.dataset] for span in spans}, {artefacts.kinds[span.dataset] for span in artefacts.split.train}
+        if kinds[0] != kinds[1]:
+            found.append(
+                f"Test set `{test_set}` is {' and '.join(sorted(kinds[0]))}, the training ranges are {' and '.join(sorted(kinds[1]))}."
+            )
+    return found
+
+
+def _epoch_limits(artefacts: StudyArtefacts) -> list[str]:
+    runs, found = runs_of(artefacts), []
+    for name, models in by_name(artefacts.models).items():
+        ended = 0
+        for model in models:
+            epochs = of_model(runs, name, model.seed, "epochs")
+            limit = model.training.get("max_epochs")
+            ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
+        if ended:
+            found.append(
+                f"Training of {as_text(models[0].title)} ended at its limit of {models[0].training['max_epochs']:g} epochs in {ended} of "
+                f"{len(models)} seeds: longer training may lower its error."
+            )
+    return found
+
+
+def _reference(artefacts: StudyArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
+    """ay [m/s²], sideslip [rad] and vx [m/s] of ranges, end to end, samples without reference left out."""
+    parts: dict[str, list[FloatArray]] = {"ay": [], "sideslip": [], "vx": []}
+    for span in spans:
+        if (span.dataset, span.recording) not in artefacts.references:
+            continue
+        recording = read_recording(artefacts.references[span.dataset, span.recording])
+        own = recording.cut(max(span.start, -math.inf), span.stop)
+        known = np.isfinite(own["vy_ref"]) & np.isfinite(own["ay"]) & np.isfinite(own["vx"])
+        parts["ay"].append(own["ay"][known])
+        parts["vx"].append(own["vx"][known])
+        parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
+    return {name: np.concatenate(values) if values else np.zeros(1) for name, values in parts.items()}

@@ -1,8 +1,0 @@
-"""The study of the simulated cars: what they do, beside what papers say of real ones and beside a real recording.
-
-Used by the pipeline ``proving_ground``. `documents` makes an index and a page a vehicle.
-"""
-
-from vehest.studies.proving_ground.pages import documents
-
-__all__ = ["documents"]

@@ -1,0 +1,50 @@
+"""Names of the modules that draw studies.
+
+A study called ``name`` is the module ``vehest.studies.name`` with a function that builds its report, or an entry point of another package
+in the group ``vehest.studies``; those that re-create papers come so, from ``vehest_papers``.
+"""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from types import ModuleType
+
+from vehest.data.errors import ConfigurationError
+
+ENTRY_POINTS = "vehest.studies"
+OWN = ("drive", "sweep")
+
+
+@cache
+def study_names() -> list[str]:
+    """Every known name: vehest's own, then those that other packages installed."""
+    return [*OWN, *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - set(OWN))]
+
+
+def study_module_name(name: str) -> str:
+    """Import path of the module behind a name.
+
+    Raises:
+        ConfigurationError: the name is unknown.
+    """
+    if name in OWN:
+        return f"{ENTRY_POINTS}.{name}"
+    point = _entry_point(name)
+    if point is None:
+        raise ConfigurationError(f"there is no study module '{name}'; there are: {', '.join(study_names())}")
+    return point.module
+
+
+def study_module(name: str) -> ModuleType:
+    """The module behind a name.
+
+    Raises:
+        ConfigurationError: the name is unknown.
+    """
+    return importlib.import_module(study_module_name(name))
+
+
+def _entry_point(name: str) -> EntryPoint | None:
+    return next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)

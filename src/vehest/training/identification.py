@@ -1,0 +1,42 @@
+"""How a filter's tyres and noise levels are identified, as conf/training/identification.yaml states it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vehest.data.errors import ConfigurationError
+from vehest.training.noise_tuning import NoiseTuningSettings
+
+
+@dataclass(frozen=True)
+class IdentificationSettings(NoiseTuningSettings):
+    """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section III-B).
+
+    Args:
+        method: as in `NoiseTuningSettings`; ``data`` searches nothing and takes process noise as the paper has it.
+        trials: evaluations of Optuna in all stages together.
+        stages: of Optuna; after the first, the box shrinks around the best so far.
+        shrink: width of the box of a stage, relative to that of the stage before.
+        tyres_from: pattern of the names of those training recordings that tyres are identified on.
+        restarts: genetic searches for the tyres, of which the best counts.
+        generations: of each, at most.
+    """
+
+    method: Literal["data", "nelder_mead", "optuna"] = "optuna"
+    trials: int = 60
+    stages: int = 2
+    shrink: float = 0.3
+    tyres_from: str = "*skidpad*"
+    restarts: int = 5
+    generations: int = 200
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("stages", "restarts", "generations"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} of an identification must be at least 1, not {getattr(self, name)}")
+        if self.stages > self.trials:
+            raise ConfigurationError(f"stages of an identification must be at most its trials ({self.trials}), not {self.stages}")
+        if not 0.0 < self.shrink <= 1.0:
+            raise ConfigurationError(f"shrink of an identification must lie between 0 and 1, not at {self.shrink}")

@@ -1,0 +1,135 @@
+"""Figures 4, 5, 6 and 11: what the drives are made of, and how errors are distributed, over sizes and over groups of manoeuvres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from vehest.constants import FloatArray
+from vehest.evaluation.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
+from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.kit.reading import median_and_range
+from vehest_papers.cnn_ukf.subjects import LINES, Prepared, Run, Runs, chosen
+
+SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
+
+
+def figure_4(parts: Mapping[str, StudyArtefacts], prepared: Mapping[str, Prepared], titles: Mapping[str, str], data: str) -> Figure:
+    """How often which sideslip angle and lateral acceleration is driven: training, validation and test of each part together."""
+    driven = {name: _driven(part, prepared[name]) for name, part in parts.items()}
+    labels = ("sideslip angle [deg]", "lateral acceleration [m/s²]")
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.6)
+        panels = figure.subplots(1, 2)
+        for (name, columns), colour in zip(driven.items(), SETS_COLOURS, strict=False):
+            for axes, values, label in zip(panels, columns, labels, strict=True):
+                edges = np.arange(np.floor(values.min()), np.ceil(values.max()) + 1.5)
+                filled = {"alpha": 0.55, "histtype": "stepfilled"} if name == next(iter(driven)) else {"histtype": "step", "linewidth": 1.3}
+                axes.hist(values, edges, color=colour, label=titles[name], **filled)
+                axes.set_yscale("log")
+                axes.set_xlabel(label)
+        panels[0].set_ylabel("samples")
+        legend_above(figure, panels[0], columns=2)
+    sentences = []
+    for name, (sideslip, ay) in driven.items():
+        inside = 100.0 * float(np.mean(np.abs(sideslip) <= 3.0))
+        sentences.append(
+            f"{titles[name]}: {len(ay) / (60.0 * parts[name].protocol.rate_hz):.0f} min, |β| ≤ 3° in {fixed(inside, 1)} % of samples, |β| "
+            f"up to {fixed(float(np.abs(sideslip).max()), 0)}°, |ay| up to {fixed(float(np.abs(ay).max()), 1)} m/s²"
+        )
+    caption = (
+        "Distribution of sideslip angle and lateral acceleration (Figure 4 of the paper), bins of 1° and 1 m/s², training, validation and "
+        f"test together; the test is the same in both, and has all lateral accelerations. {'. '.join(sentences)}. Data: {data}."
+    )
+    return Figure("figure_4", caption, figure)
+
+
+def _driven(part: StudyArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatArray]:
+    """Sideslip angle [deg] and lateral acceleration [m/s²] of all samples."""
+    spans = [*part.split.train, *part.split.validation, *(span for own in part.split.tests.values() for span in own)]
+    pieces = [prepared.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
+    sideslip = [np.degrees(np.arctan2(piece["vy_ref"], piece["vx"])) for piece in pieces]
+    return np.concatenate(sideslip), np.concatenate([piece["ay"] for piece in pieces])
+
+
+def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
+    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation.
+
+    Returns:
+        The figure and its values.
+    """
+    picked = {candidate: chosen(own) for candidate, own in runs.items()}
+    found = {candidate: _distribution(run) for candidate, run in picked.items()}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.4)
+        upper, axes = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 3.2))
+        for place, (candidate, own) in enumerate(found.items()):
+            line = LINES[candidate]
+            axes.stairs(np.maximum(own.counts, 0.5), own.edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=candidate)
+            upper.errorbar(own.mean, -place, xerr=own.deviation, color=line.colour, fmt="x", capsize=3)
+        axes.set_yscale("log")
+        axes.set_ylim(bottom=0.5)
+        axes.set_ylabel("samples")
+        axes.set_xlabel("error of the sideslip angle [deg]")
+        upper.set_yticks([])
+        upper.set_ylabel("mean, s.d.")
+        upper.margins(y=0.25)
+        legend_above(figure, axes, columns=5)
+    shown = "; ".join(
+        f"{candidate} (seed {run.model.seed}) {fixed(found[candidate].mean, 3)} ± {fixed(found[candidate].deviation, 3)}°"
+        for candidate, run in picked.items()
+    )
+    caption = (
+        f"Distribution of the sideslip angle's error where |ay| ≥ 4 m/s² (Figure {number} of the paper), {title}, bins of {BIN:g}°; of "
+        f"each method the seed that validation chooses. Above: mean and standard deviation: {shown}. Data: {data}."
+    )
+    rows = [
+        {"candidate": candidate, "from_deg": low, "samples": count}
+        for candidate, own in found.items()
+        for low, count in zip(own.edges[:-1].tolist(), own.counts.tolist(), strict=True)
+    ]
+    return Figure(name, caption, figure), pd.DataFrame(rows)
+
+
+def _distribution(run: Run) -> ErrorDistribution:
+    return error_distribution([part for parts in run.test.values() for part in parts])
+
+
+def groups(runs: Runs, name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:
+    """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
+    of_run = {candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()}
+    known = list(next(iter(of_run.values()))[0])
+    values = {
+        (candidate, group): np.array([seed[group].mse_nonlinear for seed in seeds])
+        for candidate, seeds in of_run.items()
+        for group in known
+    }
+    counted = {group: next(iter(of_run.values()))[0][group].manoeuvres for group in known}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.9)
+        axes = figure.subplots()
+        width = 0.84 / len(of_run)
+        for place, candidate in enumerate(of_run):
+            middle = np.array([np.median(values[candidate, group]) for group in known])
+            low, high = (np.array([limit(values[candidate, group]) for group in known]) for limit in (np.min, np.max))
+            at = np.arange(len(known)) + (place - 0.5 * (len(of_run) - 1)) * width
+            axes.bar(at, middle, width, color=LINES[candidate].colour, alpha=0.8, label=candidate)
+            axes.errorbar(at, middle, yerr=[middle - low, high - middle], fmt="none", ecolor="#222222", elinewidth=0.8, capsize=1.5)
+        axes.set_xticks(range(len(known)), [f"{group}\n({counted[group]})" for group in known])
+        axes.set_ylabel("MSE$_{nl}$ [deg²]")
+        axes.set_yscale("log")
+        legend_above(figure, axes, columns=5)
+    paper_figure = f" (Figure {number} of the paper)" if number else ""
+    rows = [
+        {"group": group, "n": counted[group]}
+        | {candidate: median_and_range(values[candidate, group], 3) for candidate in of_run}
+        | {f"{candidate}_median": float(np.median(values[candidate, group])) for candidate in of_run}
+        for group in known
+    ]
+    columns = {"group": Column("manoeuvres"), "n": Column("of them", decimals=0), **{candidate: Column(candidate) for candidate in of_run}}
+    caption = f"MSE_nl [deg²] by group of manoeuvres{paper_figure}, {title}: median of seeds, lowest and highest. Data: {data}."
+    return Figure(name, caption, figure), Table(name, caption, pd.DataFrame(rows), columns)

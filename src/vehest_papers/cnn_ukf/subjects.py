@@ -1,0 +1,206 @@
+"""What the study looks at: trainings, what they make of each manoeuvre, and manoeuvres as the paper prepares them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.splits import VALIDATION, Span
+from vehest.data.store import read_recording
+from vehest.data.transforms import LowPass, RemoveOutliers
+from vehest.estimators.base import Estimator
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.network_ukf import NetworkUkf
+from vehest.evaluation.manoeuvres import Kpis, is_nonlinear, kpis, manoeuvres_of, sideslip_error
+from vehest.evaluation.metrics import Scored, score_all
+from vehest.evaluation.significance import sequence_labels
+from vehest.report.style import Line
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest_papers.cnn_ukf import paper
+
+TEST = "test"
+CUTOFF_HZ = 5.0
+OFFLINE = (RemoveOutliers(), LowPass(CUTOFF_HZ, design="fir"), LowPass(CUTOFF_HZ, channels=("vy_ref",), design="fir"))
+"""Preprocessing of the paper (Section IV-A), of measurements and of the reference."""
+
+LINES = {
+    paper.MODEL: Line("#0b4f9c", "dashed", "s"),
+    paper.SMOOTH: Line("#4aa5e0", "dotted", "P"),
+    paper.DATA: Line("#b8480b", "dashdot", "o"),
+    paper.DEEP: Line("#00876c", "solid", "D"),
+    paper.CNN: Line("#d6336c", "solid", "^"),
+}
+KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
+"""Attribute of `Kpis` and of `paper.Published` -> header."""
+
+Manoeuvres = Mapping[str, Sequence[Scored]]
+"""Recording -> what was scored of it: one range."""
+
+_NAMES = {
+    ("dugoff_ukf", False): paper.MODEL,
+    ("dugoff_ukf", True): paper.SMOOTH,
+    ("sideslip_ffnn", False): paper.DATA,
+    ("ensemble_ukf", False): paper.DEEP,
+    ("cnn_ukf", False): paper.CNN,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One training and what it makes of the validation and the test manoeuvres.
+
+    Args:
+        candidate: what the report calls it.
+        model: where it comes from.
+        validation: what was scored of each manoeuvre that stopped it.
+        test: what was scored of each manoeuvre it is tested on.
+    """
+
+    candidate: str
+    model: EvaluatedModel
+    validation: Manoeuvres
+    test: Manoeuvres
+
+    @property
+    def kpis(self) -> Kpis:
+        """Of the test."""
+        return kpis(self.test)
+
+
+Runs = Mapping[str, Sequence[Run]]
+"""Candidate -> its seeds."""
+
+
+def candidate_of(model: EvaluatedModel) -> str:
+    """What the paper calls a model.
+
+    Raises:
+        DataError: it has none like it.
+    """
+    name = model.estimator, model.variant.endswith("_smooth")
+    if name not in _NAMES:
+        raise DataError(f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study")
+    return _NAMES[name]
+
+
+def filter_of(fitted: Estimator) -> DugoffUkf | None:
+    """The filter of a fitted method; none if it has none."""
+    of_filter = fitted.model if isinstance(fitted, NetworkUkf) else fitted
+    return of_filter if isinstance(of_filter, DugoffUkf) else None
+
+
+def runs_of(part: StudyArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
+    """Candidate -> its seeds, in the order of Table II.
+
+    Args:
+        part: of the study.
+        prepared: its recordings.
+
+    Raises:
+        DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
+    """
+    recordings = [span.recording for span in prepared.spans(TEST)]
+    if len(set(recordings)) != len(recordings):
+        raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")
+    groups: dict[str, list[Run]] = {}
+    for model in part.models:
+        validation, test = (manoeuvres_of(prepared.spans(name), prepared.scored(model, name)) for name in (VALIDATION, TEST))
+        groups.setdefault(candidate_of(model), []).append(Run(candidate_of(model), model, validation, test))
+    for name, runs in groups.items():
+        if len({run.model.seed for run in runs}) != len(runs):
+            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
+    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in paper.CANDIDATES if name in groups}
+
+
+def chosen(runs: Sequence[Run]) -> Run:
+    """The seed with the lowest mean squared error on the validation manoeuvres. Test manoeuvres choose nothing."""
+    return min(runs, key=lambda run: kpis(run.validation).mse)
+
+
+def losses(runs: Runs, *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
+    """Squared errors of the test [deg²] of every seed at every sample that counts, and the manoeuvre that each sample belongs to.
+
+    Returns:
+        Candidate -> (seeds, K); and (K,).
+    """
+    table, lengths = {}, [0]
+    for candidate, own in runs.items():
+        seeds = []
+        for run in own:
+            pieces = []
+            for parts in run.test.values():
+                squares = np.square(np.concatenate([sideslip_error(part) for part in parts]))
+                kept = np.concatenate([is_nonlinear(part) for part in parts])
+                pieces.append(squares[kept] if nonlinear_only else squares)
+            lengths = [len(piece) for piece in pieces]
+            seeds.append(np.concatenate(pieces))
+        table[candidate] = np.stack(seeds)
+    return table, sequence_labels(lengths)
+
+
+def kpi_table(runs: Runs) -> pd.DataFrame:
+    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse``; a row a run."""
+    rows = [
+        {"candidate": candidate, "seed": run.model.seed}
+        | {name: getattr(run.kpis, name) for name in KPIS}
+        | {"validation_mse": kpis(run.validation).mse}
+        for candidate, own in runs.items()
+        for run in own
+    ]
+    return pd.DataFrame(rows)
+
+
+class Prepared:
+    """Recordings of a part as the paper prepares them, at the evaluation rate; what they were scored against here.
+
+    The evaluation scores against the reference as it was measured. The paper's is low-passed as the measurements are, and whether a
+    sample counts as non-linear is a matter of the low-passed lateral acceleration.
+    """
+
+    def __init__(self, part: StudyArtefacts) -> None:
+        self._part = part
+        self._read: dict[tuple[str, str], Recording] = {}
+
+    def spans(self, test: str) -> Sequence[Span]:
+        """Ranges of a test set, or of the validation."""
+        return self._part.split.validation if test == VALIDATION else self._part.split.tests[test]
+
+    def recording(self, dataset: str, recording: str) -> Recording:
+        """All of a recording."""
+        key = dataset, recording
+        if key not in self._read:
+            prepared = read_recording(self._part.references[key])
+            for transform in OFFLINE:
+                prepared = transform(prepared)
+            self._read[key] = prepared
+        return self._read[key]
+
+    def seen(self, test: str) -> list[Recording]:
+        """What an estimator saw of each range of a test set, if it was prepared offline: with its warm-up, without references."""
+        return [
+            self.recording(span.dataset, span.recording)
+            .cut(span.start - self._part.protocol.warm_up_seconds, span.stop)
+            .without_references()
+            for span in self.spans(test)
+        ]
+
+    def learnt(self) -> list[Recording]:
+        """The ranges of the training, references included."""
+        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.train]
+
+    def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
+        """Estimates of a model and prepared references, range by range."""
+        return self.score([model.estimate(test, position) for position in range(len(self.spans(test)))], test)
+
+    def score(self, estimates: Sequence[Estimate], test: str) -> list[Scored]:
+        """Estimates, one a range, and prepared references."""
+        spans = self.spans(test)
+        return score_all(estimates.__getitem__, spans, lambda span: self.recording(span.dataset, span.recording), self._part.protocol)

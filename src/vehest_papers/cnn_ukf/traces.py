@@ -1,0 +1,244 @@
+"""Figures 7 to 10, 12 and 13: single manoeuvres, as estimated, and what the hybrids' networks say meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.estimators.filtering.network_ukf import NetworkUkf, Word
+from vehest.estimators.model_files import load_model
+from vehest.evaluation.manoeuvres import group_of, sideslip_error
+from vehest.evaluation.metrics import Scored
+from vehest.report.document import Figure, as_code
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
+from vehest.studies.artefacts import StudyArtefacts
+from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.subjects import LINES, TEST, Prepared, Run
+
+HYBRIDS = (paper.DEEP, paper.CNN)
+LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
+
+
+def manoeuvre_of(part: StudyArtefacts, prepared: Prepared, group: str) -> Span:
+    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin.
+
+    Raises:
+        DataError: there is none.
+    """
+    peaks = {}
+    for span in part.split.tests[TEST]:
+        drive = prepared.recording(span.dataset, span.recording)
+        if group_of(span.recording) == group and not dict(drive.provenance.get("flags") or {}).get("spun"):
+            piece = drive.cut(span.start, span.stop)
+            peaks[span] = float(np.abs(np.arctan2(piece["vy_ref"], piece["vx"])).max())
+    if not peaks:
+        raise DataError(f"study '{part.study}': no test manoeuvre is a {group} without a spin")
+    return max(peaks, key=peaks.__getitem__)
+
+
+def hybrid_of(run: Run) -> NetworkUkf:
+    """The fitted hybrid of a run.
+
+    Raises:
+        DataError: it is another estimator's.
+    """
+    fitted = load_model(run.model.model_folder)
+    if not isinstance(fitted, NetworkUkf):
+        raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")
+    return fitted
+
+
+def words_of(run: Run, drives: Sequence[Recording]) -> list[Word]:
+    """What a hybrid's network says of drives."""
+    fitted = hybrid_of(run)
+    return [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
+
+
+def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
+    """Reference and all estimates of one manoeuvre.
+
+    Args:
+        runs: candidate -> the seed that validation chooses.
+        span: the manoeuvre, one of the test set's.
+        name: of the file.
+        number: of the paper's figure.
+        what: title of it.
+        data: real or simulated.
+    """
+    parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.9)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
+        _angles(upper, parts)
+        for candidate, part in parts.items():
+            line = LINES[candidate]
+            lower.plot(_from_start(part), sideslip_error(part), color=line.colour, linestyle=line.dash, linewidth=0.9)
+        lower.set_ylabel("error [deg]")
+        lower.set_xlabel("time [s]")
+        for axes in (upper, lower):
+            axes.margins(x=0.0)
+        legend_above(figure, upper, columns=6)
+    caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. {_squares(runs, parts)} Data: {data}."
+    return Figure(name, caption, figure)
+
+
+def inner_life(
+    runs: Mapping[str, Run],
+    prepared: Prepared,
+    warm_up: float,
+    span: Span,
+    name: str,
+    number: int,
+    what: str,
+    constant: FloatArray,
+    data: str,
+) -> Figure:
+    """What hybrids' networks say in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
+
+    Args:
+        runs: candidate -> the seed that validation chooses.
+        prepared: recordings.
+        warm_up: of the estimates [s].
+        span: the manoeuvre.
+        name: of the file.
+        number: of the paper's figure.
+        what: title of it.
+        constant: deviations of the filter's process noise where no network says them, (2,).
+        data: real or simulated.
+    """
+    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    said = _said(hybrids, prepared, warm_up, span)
+    parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 4.4)
+        grid = figure.subplots(2, 2, sharex=True)
+        _angles(grid[0, 0], parts)
+        for candidate, (time, word) in said.items():
+            line = LINES[candidate]
+            label = f"{candidate}, its network's"
+            grid[0, 0].plot(time, np.degrees(word.sideslip), color=line.colour, linewidth=0.7, alpha=0.55, label=label)
+            grid[1, 0].plot(time, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+            if word.process is not None:
+                for axes, deviation in zip(grid[:, 1], np.sqrt(word.process).T, strict=True):
+                    axes.plot(time, deviation, color=line.colour, linestyle=line.dash, linewidth=1.0)
+        for axes, level in zip(grid[:, 1], constant.tolist(), strict=True):
+            axes.axhline(level, color=LINES[paper.DEEP].colour, linestyle=LINES[paper.DEEP].dash, linewidth=1.0)
+        labels = ("β [deg]", r"$\sigma_{V_y}$ [m/s]", r"$\sigma_{DD}$ [deg]", r"$\sigma_{\dot\psi}$ [rad/s]")
+        for axes, label, letter in zip(grid.flat, labels, "abcd", strict=True):
+            axes.set_ylabel(label)
+            axes.set_title(f"({letter})", loc="left")
+            axes.margins(x=0.0)
+            if letter != "a":
+                axes.set_yscale("log")
+        for axes in grid[1]:
+            axes.set_xlabel("time [s]")
+        legend_above(figure, grid[0, 0], columns=3)
+    caption = (
+        f"{what} (Figure {number} of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, (b) and (d) "
+        "deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a measurement. "
+        f"DE-UKF's process noise is constant. Data: {data}."
+    )
+    return Figure(name, caption, figure)
+
+
+def angles_of_networks(
+    runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, name: str, number: int, what: str, data: str
+) -> Figure:
+    """β of both hybrids and β_DD of their networks (Figure 13)."""
+    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.7)
+        axes = figure.subplots()
+        _angles(axes, parts)
+        for candidate, (time, word) in _said(hybrids, prepared, warm_up, span).items():
+            label = f"{candidate}, its network's"
+            axes.plot(time, np.degrees(word.sideslip), color=LINES[candidate].colour, linewidth=0.8, alpha=0.6, label=label)
+        axes.set_xlabel("time [s]")
+        axes.margins(x=0.0)
+        legend_above(figure, axes, columns=5)
+    return Figure(name, f"{what} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}.", figure)
+
+
+def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
+    """Figure 10: the stretch of a lap with the largest mean |ay|: angles, accelerations, distrust."""
+    whole = next(iter(runs.values())).test[span.recording][0]
+    length = min(round(LAP_SECONDS / float(whole.time[1] - whole.time[0])), len(whole.time))
+    first = int(np.convolve(np.abs(whole.ay), np.ones(length), "valid").argmax())
+    window = (float(whole.time[first]), float(whole.time[first + length - 1]))
+    parts = {candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()}
+    drive = prepared.recording(span.dataset, span.recording).cut(*window)
+    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 4.9)
+        grid = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
+        _angles(grid[0], parts)
+        time = drive.time - window[0]
+        grid[1].plot(time, drive["ay"], color="#444444", label="$a_y$")
+        grid[1].plot(time, drive["ax"], color="#999999", linestyle="dashed", label="$a_x$")
+        grid[1].set_ylabel("acceleration [m/s²]")
+        for candidate, (at, word) in _said(hybrids, prepared, warm_up, span, window).items():
+            line = LINES[candidate]
+            grid[2].plot(at, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+        grid[2].set_yscale("log")
+        grid[2].set_ylabel(r"$\sigma_{DD}$ [deg]")
+        grid[2].set_xlabel("time [s]")
+        for axes in grid:
+            axes.margins(x=0.0)
+        legend_above(figure, grid[0], grid[1], columns=6)
+    caption = (
+        f"Part of a lap (Figure 10 of the paper), the {fixed(window[1] - window[0], 0)} s of {as_code(span.recording)} with the largest "
+        "mean |ay|: sideslip angle, accelerations (full and dashed: lateral and longitudinal), and the deviation of the networks' angle as "
+        f"filters take it. {_squares(runs, parts)} Data: {data}."
+    )
+    return Figure("figure_10", caption, figure)
+
+
+def _said(
+    hybrids: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, window: tuple[float, float] | None = None
+) -> dict[str, tuple[FloatArray, Word]]:
+    """Candidate -> times from the start of what is scored [s], and what its network says there."""
+    drive = prepared.recording(span.dataset, span.recording).cut(span.start - warm_up, span.stop).without_references()
+    found = {}
+    for candidate, run in hybrids.items():
+        scored = _within(run.test[span.recording][0], window)
+        (word,) = words_of(run, [drive])
+        kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
+        process = None if word.process is None else word.process[kept]
+        found[candidate] = drive.time[kept] - scored.time[0], Word(word.sideslip[kept], word.variance[kept], process)
+    return found
+
+
+def _within(part: Scored, window: tuple[float, float] | None) -> Scored:
+    if window is None:
+        return part
+    kept = (part.time >= window[0]) & (part.time <= window[1])
+    return Scored(part.time[kept], part.vy[kept], part.vy_ref[kept], part.sideslip[kept], part.sideslip_ref[kept], part.ay[kept])
+
+
+def _from_start(part: Scored) -> FloatArray:
+    return part.time - part.time[0]
+
+
+def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
+    """Reference and estimates."""
+    first = next(iter(parts.values()))
+    axes.plot(_from_start(first), np.degrees(first.sideslip_ref), color=REFERENCE.colour, linewidth=1.5, label="reference")
+    for candidate, part in parts.items():
+        line = LINES[candidate]
+        axes.plot(_from_start(part), np.degrees(part.sideslip), color=line.colour, linestyle=line.dash, linewidth=1.0, label=candidate)
+    axes.set_ylabel("sideslip angle [deg]")
+
+
+def _squares(runs: Mapping[str, Run], parts: Mapping[str, Scored]) -> str:
+    shown = [
+        f"{candidate} (seed {runs[candidate].model.seed}) {fixed(float(np.mean(np.square(sideslip_error(part)))), 3)}"
+        for candidate, part in parts.items()
+    ]
+    return f"MSE of what is drawn [deg²], of each method the seed that validation chooses: {'; '.join(shown)}."

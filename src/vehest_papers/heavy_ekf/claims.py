@@ -1,0 +1,72 @@
+"""The first page: what the paper claims of its filters, what came out here, and what the filters have to beat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from vehest.evaluation.ranking import Name, Ranking
+from vehest.report.document import Block, as_text
+from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.kit.claims import Claim, bound_claim, claims_table, order_claim
+from vehest.studies.kit.reading import words_of_kinds
+from vehest.studies.kit.standing import ranking_of, verdict_sentences
+from vehest.studies.kit.warnings import warnings_of
+from vehest_papers.heavy_ekf import paper
+
+FAMILY = "rational_ekf"
+BASELINE_TITLES = {"zero": "zero", "static_map": "static map", "kinematic": "kinematic", "data_sheet": "data sheet"}
+"""Estimators that the filters have to beat -> what they are called in tables."""
+LAPS, FAST, REAL = "nominal_laps", "nominal_fast", "test"
+ASKED = [(better, worse) for better, worse in paper.GAINS]
+
+
+def titles_of(part: StudyArtefacts) -> dict[Name, str]:
+    """Estimator and variant -> what it is called in this report, for all models of a part."""
+    names = {(model.estimator, model.variant) for model in part.models}
+    return {name: paper.VARIANTS[name[1]] if name[0] == FAMILY else BASELINE_TITLES.get(name[0], ": ".join(name)) for name in names}
+
+
+def rankings_of(part: StudyArtefacts) -> dict[str, Ranking]:
+    """Test set -> its ranking, with the pairs whose order the paper claims among those compared."""
+    variant_of = {title: variant for variant, title in paper.VARIANTS.items()}
+    asked = [((FAMILY, variant_of[better]), (FAMILY, variant_of[worse])) for better, worse in ASKED]
+    return {test: ranking_of(part, test, asked=asked) for test in part.split.tests}
+
+
+def claims_blocks(truck: StudyArtefacts, ferrari: StudyArtefacts | None, part_titles: Sequence[str]) -> list[Block]:
+    """The table of claims, then a sentence a test on who may be called best, then what to mind."""
+    variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
+    titles, found = titles_of(truck), rankings_of(truck)
+    data = words_of_kinds(truck)
+    claims: list[Claim] = [
+        bound_claim(found[LAPS], variant_of[paper.RATTE], paper.RATTE, 0.5, f"{paper.LAPS[paper.RATTE]}°", f"{data}, three laps"),
+        bound_claim(found[FAST], variant_of[paper.RATTE], paper.RATTE, 0.62, f"{paper.FAST[paper.RATTE]}°", f"{data}, fast lap"),
+    ]
+    tests = [(test, f"{data}, {test.replace('_', ' ')}", titles, found[test]) for test in found]
+    if ferrari is not None:
+        real = rankings_of(ferrari)
+        tests.append((REAL, f"{words_of_kinds(ferrari)}, the Ferrari", titles_of(ferrari), real[REAL]))
+    for test, words, own, ranking in tests:
+        for better, worse in ASKED:
+            known = f"{paper.GAINS[better, worse]:.0f} % below on its three laps" if test != FAST else _on_the_fast_lap(better, worse)
+            claims.append(order_claim(ranking, variant_of[better], variant_of[worse], own, known, words))
+    sentences = [verdict_sentences(ranking, own, words) for _, words, own, ranking in tests]
+    blocks: list[Block] = [claims_table(claims, "The paper's recordings are real, of another vehicle."), "\n\n".join(sentences)]
+    parts = [part for part in (truck, ferrari) if part is not None]
+    warned = [f"{as_text(title)}: {line}" for title, part in zip(part_titles, parts, strict=False) for line in warnings_of(part)]
+    if warned:
+        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
+    return blocks
+
+
+def _on_the_fast_lap(better: str, worse: str) -> str:
+    return f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
+
+
+def baseline_errors(part: StudyArtefacts) -> Mapping[tuple[str, str], float]:
+    """(baseline's title, test set) -> RMSE(β) [deg], as evaluated."""
+    metrics = part.metrics
+    chosen = metrics[
+        (metrics["metric"] == "rmse_sideslip") & (metrics["subset"] == "all") & metrics["estimator"].isin(list(BASELINE_TITLES))
+    ]
+    return {(BASELINE_TITLES[str(row["estimator"])], str(row["test_set"])): float(row["value"]) for row in chosen.to_dict("records")}

@@ -1,0 +1,117 @@
+"""Candidates of a part: every run with its metrics, by what the paper calls it, and its losses sample by sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.splits import VALIDATION
+from vehest.evaluation.metrics import weighted_squared_errors
+from vehest.evaluation.significance import sequence_labels
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.kit.reading import metric_values
+from vehest_papers.learned_ukf import paper
+
+SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}
+"""Test set -> tyre."""
+
+ACCURACY = ("mse_weighted", "mae_weighted", "ae99_weighted", "rmse_vx", "rmse_vy", "rmse_yaw_rate")
+CONSISTENCY = ("nees", "nis", "coverage_1sigma", "coverage_2sigma")
+OF_MODEL = ("n_parameters", "epochs")
+
+_FILTERS = {
+    "pc": paper.PC,
+    "pcr": paper.PCR,
+    "nn": paper.NN,
+    "nn_u": paper.NN_U,
+    "nnt": paper.NNT,
+    "nnt_u": paper.NNT_U,
+    "nntf": paper.NNTF,
+    "nntf_u": paper.NNTF_U,
+    "nntf_uh": paper.NNTF_UH,
+    "nntf_uh_mu0.4": paper.NNTF_UH_LOW,
+}
+_NETWORKS = {"velocity_gru": paper.GRU, "velocity_lstm": paper.LSTM}
+
+
+def candidate_of(model: EvaluatedModel) -> str:
+    """What the paper calls a model; its own title if the paper has none like it."""
+    if model.estimator == "learned_ukf":
+        return _FILTERS.get(model.variant, model.title)
+    return _NETWORKS.get(model.estimator, model.title)
+
+
+def models_by_candidate(part: StudyArtefacts) -> dict[str, list[EvaluatedModel]]:
+    """Candidate -> its seeds, in the order of Table II; others come last.
+
+    Raises:
+        DataError: two models of one candidate have the same seed.
+    """
+    groups: dict[str, list[EvaluatedModel]] = {}
+    for model in part.models:
+        groups.setdefault(candidate_of(model), []).append(model)
+    for name, models in groups.items():
+        if len({model.seed for model in models}) != len(models):
+            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
+    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
+    return {name: sorted(groups[name], key=lambda model: model.seed) for name in order}
+
+
+def runs_of(part: StudyArtefacts) -> pd.DataFrame:
+    """One row a run, candidates in the order of Table II.
+
+    Columns: candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and for each test set ``METRIC.SET`` of
+    `ACCURACY` and `CONSISTENCY`; the latter are NaN for methods without.
+
+    Raises:
+        DataError: a metric is missing.
+    """
+    known = metric_values(part)
+    rows = []
+    for candidate, models in models_by_candidate(part).items():
+        for model in models:
+            own = (model.estimator, model.variant, model.seed)
+            needed = {f"{metric}.{test}": (*own, test, metric) for test in part.split.tests for metric in ACCURACY}
+            needed |= {f"mse_weighted.{VALIDATION}": (*own, VALIDATION, "mse_weighted")}
+            needed |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
+            missing = [column for column, key in needed.items() if key not in known]
+            if missing:
+                raise DataError(f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again")
+            wanted = needed | {f"{metric}.{test}": (*own, test, metric) for test in part.split.tests for metric in CONSISTENCY}
+            row = {"candidate": candidate, "estimator": own[0], "variant": own[1], "seed": own[2]}
+            rows.append(row | {column: known.get(key, math.nan) for column, key in wanted.items()})
+    return pd.DataFrame(rows)
+
+
+def of_candidate(runs: pd.DataFrame, candidate: str, column: str) -> FloatArray:
+    """Values of a column, one a seed."""
+    return runs[runs["candidate"] == candidate][column].to_numpy(dtype=np.float64)
+
+
+def chosen(part: StudyArtefacts, runs: pd.DataFrame, candidate: str) -> EvaluatedModel:
+    """The seed with the lowest weighted MSE on the validation range. Test sets choose nothing."""
+    own = of_candidate(runs, candidate, f"mse_weighted.{VALIDATION}")
+    return models_by_candidate(part)[candidate][int(np.argmin(np.where(np.isfinite(own), own, np.inf)))]
+
+
+def losses(part: StudyArtefacts, test: str) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
+    """Weighted squared errors of every seed at every scored sample, and the sequence that each sample belongs to.
+
+    Returns:
+        Candidate -> (seeds, K); and (K,).
+    """
+    table, lengths = {}, [0]
+    for candidate, models in models_by_candidate(part).items():
+        seeds = []
+        for model in models:
+            pieces = [weighted_squared_errors(scored) for scored in part.scored(model, test)]
+            lengths = [len(piece) for piece in pieces]
+            seeds.append(np.concatenate(pieces))
+        table[candidate] = np.stack(seeds)
+    return table, sequence_labels(lengths)

@@ -1,0 +1,160 @@
+"""Trained filters at work on the sequences of a test set, beyond their stored estimates: unrepaired, as predictors, with swapped models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.store import read_recording
+from vehest.estimators.learned_ukf import LearnedUkf
+from vehest.estimators.model_files import load_model
+from vehest.evaluation.metrics import WEIGHTS, sequences
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.nonlinear import NonlinearFiltered
+from vehest.filters.unscented_scan import Array, PointModel
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.training.through_filter import Drive
+from vehest.vehicle.dynamics import STATES
+
+MOVING = STATES[:4]
+"""States that are measured or referenced: all but the friction."""
+
+
+@dataclass(frozen=True)
+class Definiteness:
+    """What became of covariances on a test set.
+
+    Args:
+        sequences: how many there are.
+        lost: of them without repair, those that lose definiteness.
+        lost_steps: with repair, steps that needed one.
+        steps: all steps of all sequences.
+    """
+
+    sequences: int
+    lost: int
+    lost_steps: int
+    steps: int
+
+
+class Swapped(PointModel):
+    """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained.
+
+    Args:
+        predicting: its transition and its limits are taken.
+        observing: its observation is taken.
+    """
+
+    def __init__(self, predicting: PointModel, observing: PointModel) -> None:
+        self._predicting, self._observing = predicting, observing
+        self.lower = predicting.lower
+
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """Of the one that predicts."""
+        return self._predicting.transition(points, inputs)
+
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """Of the one that observes."""
+        return self._observing.observation(points, inputs)
+
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """Refused."""
+        raise NotImplementedError("a swapped model has no adjoints")
+
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """Refused."""
+        raise NotImplementedError("a swapped model has no adjoints")
+
+
+def loaded(model: EvaluatedModel) -> LearnedUkf:
+    """The filter of an evaluated model.
+
+    Raises:
+        MissingError: there is no model.
+        DataError: a file is damaged, or it is another estimator's.
+    """
+    estimator = load_model(model.model_folder)
+    if not isinstance(estimator, LearnedUkf):
+        raise DataError(f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'")
+    return estimator
+
+
+def drives_of(part: StudyArtefacts, estimator: LearnedUkf, test: str) -> Drive:
+    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...).
+
+    Raises:
+        ConfigurationError: the protocol cuts no sequences, or has another rate than the filter.
+        DataError: a channel is missing or has gaps.
+    """
+    if part.protocol.sequence_seconds is None or part.protocol.rate_hz != estimator.settings.rate_hz:
+        raise ConfigurationError(
+            f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "
+            f"have it, not {part.protocol.rate_hz:g}"
+        )
+    wanted = dict.fromkeys((span.dataset, span.recording) for span in part.split.tests[test])
+    recordings = {key: read_recording(part.references[key]) for key in wanted}
+    pieces = sequences(part.split.tests[test], lambda span: recordings[span.dataset, span.recording], part.protocol)
+    dtype = next(estimator.filter.parameters()).dtype
+    drives = [estimator.drive(recordings[piece.dataset, piece.recording].cut(piece.start, piece.stop), dtype) for piece in pieces]
+    return Drive(*(torch.stack([drive[position] for drive in drives]) for position in range(3)))
+
+
+def filtered(estimator: LearnedUkf, drives: Drive, model: PointModel | None = None, *, repair: bool = True) -> NonlinearFiltered:
+    """All sequences filtered together from the true state of their first sample, as the protocol has it.
+
+    Args:
+        estimator: its noise is used, and its models unless another is given.
+        drives: from `drives_of`.
+        model: that moves and observes points instead.
+        repair: whether covariances that lose definiteness are repaired; otherwise their sequences become NaN.
+    """
+    s = estimator.settings
+    start = drives.states[:, 0].clone()
+    start[:, -1] = s.friction if s.start_friction is None else s.start_friction
+    own = estimator.filter
+    kept, own.repair = own.repair, repair
+    try:
+        with torch.no_grad():
+            return own.filtered(drives.measurements, drives.inputs, Gaussian(start, own.initial_covariance()), model=model)
+    finally:
+        own.repair = kept
+
+
+def definiteness(estimator: LearnedUkf, drives: Drive) -> Definiteness:
+    """Filter with and without repair, and count."""
+    repaired = filtered(estimator, drives).repaired
+    means = filtered(estimator, drives, repair=False).steps.filtered.mean
+    lost = int(torch.isnan(means).flatten(1).any(1).sum())
+    return Definiteness(len(means), lost, int(repaired.sum()), repaired.numel())
+
+
+def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> NonlinearFiltered:
+    """Predict with one filter's model and noise, observe with the other's model."""
+    with torch.no_grad():
+        model = Swapped(predicting.filter.point_model(), observing.filter.point_model())
+    return filtered(predicting, drives, model)
+
+
+def mean_squares(means: torch.Tensor, drives: Drive, skip: int) -> FloatArray:
+    """Mean squared error of each of `MOVING`, the first steps of each sequence left out; (4,)."""
+    errors = (means - drives.states)[:, skip:, : len(MOVING)].double()
+    return errors.square().mean(dim=(0, 1)).numpy()
+
+
+def weighted(squares: FloatArray) -> float:
+    """The weighted MSE of mean squares in the order of `MOVING`."""
+    return float(sum(weight * squares[MOVING.index(name)] for name, weight in WEIGHTS.items()))
+
+
+def one_step_squares(estimator: LearnedUkf, drives: Drive) -> FloatArray:
+    """Mean squared error of the prediction of the next sample from each true state; of `MOVING`, (4,)."""
+    states, inputs = (part[:, :-1].reshape(-1, part.shape[-1]) for part in (drives.states, drives.inputs))
+    with torch.no_grad():
+        after = estimator.filter.moved(states, inputs)
+    errors = (after - drives.states[:, 1:].reshape(-1, drives.states.shape[-1]))[:, : len(MOVING)].double()
+    return np.asarray(errors.square().mean(0).numpy(), dtype=np.float64)

@@ -1,0 +1,187 @@
+"""Figures 5 and 6: what learning through the filter changes about the model, and in which half of the filter that matters."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from vehest.estimators.learned_ukf import LearnedUkf
+from vehest.evaluation.metrics import Protocol
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
+from vehest.training.through_filter import Drive
+from vehest_papers.learned_ukf import paper
+from vehest_papers.learned_ukf.candidates import SETS
+from vehest_papers.learned_ukf.filtering import MOVING, filtered, mean_squares, one_step_squares, swapped, weighted
+
+BEFORE, AFTER = paper.NNTF, paper.NNTF_U
+PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
+UNITS = {"vx": "(m/s)²", "vy": "(m/s)²", "yaw_rate": "(rad/s)²", "rim_speed": "(m/s)²"}
+TASKS = {"one_step": "one-step prediction", "estimation": "estimation"}
+
+Pair = tuple[LearnedUkf, LearnedUkf]
+"""NNTF and NNTF_U of one seed."""
+
+
+def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Errors of both models as predictors and in their filters, and of all four filters that can be put together of them.
+
+    Args:
+        pairs: seed -> NNTF and NNTF_U.
+        drives: test set -> its sequences.
+        protocol: how much of each sequence is not scored.
+
+    Returns:
+        One row a test set, seed, state and task: ``before``, ``after`` (mean squared errors of NNTF and NNTF_U), ``decrease`` [%].
+        One row a test set, seed, ``predicts`` and ``observes``: ``mse`` (weighted).
+    """
+    skip = round(protocol.skip_seconds * protocol.rate_hz)
+    states, swaps = [], []
+    for test, own in drives.items():
+        for seed, pair in pairs.items():
+            predicted = [one_step_squares(estimator, own) for estimator in pair]
+            squares = {(0, 0): filtered(pair[0], own), (1, 1): filtered(pair[1], own)}
+            squares |= {(a, b): swapped(pair[a], pair[b], own) for a, b in ((0, 1), (1, 0))}
+            errors = {key: mean_squares(result.steps.filtered.mean, own, skip) for key, result in squares.items()}
+            for task, (before, after) in (("one_step", predicted), ("estimation", (errors[0, 0], errors[1, 1]))):
+                for state, first, second in zip(MOVING, before, after, strict=True):
+                    row = {"test_set": test, "seed": seed, "task": task, "state": state, "before": first, "after": second}
+                    states.append(row | {"decrease": 100.0 * (1.0 - second / first)})
+            names = (BEFORE, AFTER)
+            swaps += [
+                {"test_set": test, "seed": seed, "predicts": names[a], "observes": names[b], "mse": weighted(own_errors)}
+                for (a, b), own_errors in errors.items()
+            ]
+    return pd.DataFrame(states), pd.DataFrame(swaps)
+
+
+def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, str]:
+    """By how much learning through the filter lowers each state's error, as a predictor and as an estimator."""
+    tests = list(dict.fromkeys(states["test_set"]))
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.7)
+        grid = figure.subplots(1, len(tests), sharey=True, squeeze=False)[0]
+        for axes, test in zip(grid, tests, strict=True):
+            for offset, (task, label), colour in zip((-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True):
+                own = states[(states["test_set"] == test) & (states["task"] == task)]
+                for place, state in enumerate(MOVING):
+                    values = own[own["state"] == state]["decrease"].to_numpy()
+                    axes.bar(place + offset, np.median(values), 0.36, color=colour, alpha=0.75, label=label if not place else None)
+                    axes.scatter(np.full(len(values), place + offset), values, s=7, color="black", zorder=3, linewidths=0)
+            axes.axhline(0.0, color="#444444", linewidth=0.7)
+            axes.set_xticks(range(len(MOVING)), ["$v_x$", "$v_y$", "yaw rate", "rim speed"])
+            axes.set_title(SETS[test], loc="left")
+            axes.grid(visible=False, axis="x")
+            if states["decrease"].min() < -100.0:
+                axes.set_yscale("symlog", linthresh=100.0)
+                axes.set_yticks(_ticks(states["decrease"].to_numpy()))
+                axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+                axes.minorticks_off()
+        grid[0].set_ylabel(f"decrease of the MSE, {BEFORE} to {AFTER} [%]")
+        figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    caption = (
+        f"By how much the mean squared error is lower with {AFTER} than with {BEFORE}, Figure 5 of the paper; negative: higher. Prediction "
+        f"of the next sample from the true state, and estimation by the filter. Bars: median of seeds, dots: seeds; where values go below "
+        f"−100 %, the axis is logarithmic beyond. The paper draws differences; here they are divided by the error of {BEFORE}. "
+        f"Data: {data}."
+    )
+    rows = []
+    for test, state in itertools.product(tests, MOVING):
+        own = states[(states["test_set"] == test) & (states["state"] == state)]
+        row: dict[str, object] = {"test": SETS[test], "state": state, "unit": UNITS[state]}
+        for task in TASKS:
+            part = own[own["task"] == task]
+            row |= {f"{task}_{column}": float(part[column].median()) for column in ("before", "after", "decrease")}
+        rows.append(row)
+    columns = {"test": Column("test"), "state": Column("state"), "unit": Column("unit of MSE")}
+    for task, label in TASKS.items():
+        columns |= {f"{task}_before": Column(f"{label}, {BEFORE}", each=True), f"{task}_after": Column(f"{label}, {AFTER}", each=True)}
+        columns |= {f"{task}_decrease": Column("decrease [%]", decimals=1)}
+    table = Table(f"one_step_{name}", "Mean squared errors behind the figure, medians of seeds.", pd.DataFrame(rows), columns)
+    return Figure(f"figure_5_{name}", caption, figure), table, _figure_5_in_words(states, tests)
+
+
+def _figure_5_in_words(states: pd.DataFrame, tests: Sequence[str]) -> str:
+    sentences = [
+        "The paper: as a predictor a little better for vx, as before for vy, worse for the others; as an estimator better for all."
+    ]
+    for test in tests:
+        own = states[states["test_set"] == test]
+        lower = {
+            task: [state for state in MOVING if own[(own["task"] == task) & (own["state"] == state)]["decrease"].median() > 0]
+            for task in TASKS
+        }
+        listed = [
+            f"as {'a predictor' if task == 'one_step' else 'an estimator'} lower errors for {_names(names)}"
+            for task, names in lower.items()
+        ]
+        sentences.append(f"Here, on {SETS[test]}: {'; '.join(listed)} (medians of seeds).")
+    return " ".join(sentences)
+
+
+def figure_6(swaps: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, str]:
+    """MSE of the four filters that can be put together of two models."""
+    tests = list(dict.fromkeys(swaps["test_set"]))
+    combinations = [(a, b) for a in (BEFORE, AFTER) for b in (BEFORE, AFTER)]
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.8)
+        grid = figure.subplots(1, len(tests), squeeze=False)[0]
+        for axes, test in zip(grid, tests, strict=True):
+            for place, (predicts, observes) in enumerate(combinations):
+                values = _of(swaps, test, predicts, observes)
+                border, hatch = (PLAIN_BLUE if one == BEFORE else THROUGH_RED for one in (predicts, observes))
+                axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=hatch, hatch="////", linewidth=0)
+                axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=border, linewidth=1.8)
+                axes.scatter(np.full(len(values), place), values, s=9, color="black", zorder=3, linewidths=0)
+            axes.set_xticks(range(4), [f"{a}\n{b}" for a, b in combinations])
+            axes.set_title(SETS[test], loc="left")
+            axes.grid(visible=False, axis="x")
+            axes.set_ylabel("MSE (weighted)")
+            axes.set_ylim(bottom=0.0)
+        figure.supxlabel("above: the model that predicts, and its noise; below: the model that observes", fontsize=7.5)
+    caption = (
+        f"MSE (weighted) of filters that predict with one model and observe with another, Figure 6 of the paper: border, the model of the "
+        f"prediction step; hatching, that of the observation; blue {BEFORE}, red {AFTER}, of one seed each. Noise is that of the "
+        f"filter whose model predicts. Bars: median of seeds, dots: seeds. Data: {data}."
+    )
+    rows, sentences = [], [f"The paper: {AFTER} in the prediction step makes the MSE {paper.SWAP_GAIN:g} % lower."]
+    for test in tests:
+        middle = {pair: float(np.median(_of(swaps, test, *pair))) for pair in combinations}
+        rows += [{"test": SETS[test], "predicts": a, "observes": b, "mse": middle[a, b]} for a, b in combinations]
+        predicting = 100.0 * (1.0 - middle[AFTER, BEFORE] / middle[BEFORE, BEFORE])
+        observing = 100.0 * (1.0 - middle[BEFORE, AFTER] / middle[BEFORE, BEFORE])
+        sentences.append(
+            f"Here, on {SETS[test]}, against {BEFORE} in both: {AFTER} in the prediction step alone {_change(predicting)}, in the "
+            f"observation alone {_change(observing)}."
+        )
+    columns = {
+        "test": Column("test"),
+        "predicts": Column("predicts"),
+        "observes": Column("observes"),
+        "mse": Column("MSE (weighted)", decimals=4),
+    }
+    table = Table(f"swap_{name}", "The four filters, medians of seeds.", pd.DataFrame(rows), columns)
+    return Figure(f"figure_6_{name}", caption, figure), table, " ".join(sentences)
+
+
+def _of(swaps: pd.DataFrame, test: str, predicts: str, observes: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    own = swaps[(swaps["test_set"] == test) & (swaps["predicts"] == predicts) & (swaps["observes"] == observes)]
+    return own["mse"].to_numpy(dtype=np.float64)
+
+
+def _change(decrease: float) -> str:
+    return f"{fixed(abs(decrease), 0)} % {'lower' if decrease >= 0 else 'higher'}"
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(name.replace("_", " ") for name in names) or "none"
+
+
+def _ticks(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[float]:
+    """Marks of an axis that is linear to 100 and logarithmic beyond."""
+    low = float(np.min(values, initial=0.0))
+    beyond = [-(10.0**power) for power in range(3, 9) if -(10.0**power) >= 10.0 * low]
+    return [*reversed(beyond), -100.0, -50.0, 0.0, 50.0, 100.0]

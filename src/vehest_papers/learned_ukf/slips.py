@@ -1,0 +1,77 @@
+"""Figure 3: how the slip angle of the rear axle is distributed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure, paper_style
+from vehest_papers.learned_ukf import paper
+
+LEAST_SPEED = 0.5  # [m/s] below which an angle of slip says little
+LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
+WIDTH = 2.0  # [deg] of a bin
+PERCENTILES = (50, 90, 99)
+
+
+def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatArray:
+    """Slip angle of the rear axle by the references, atan2(vy - l_r r, vx), where the car moves; (K,) [deg].
+
+    Args:
+        recordings: with ``vx_ref``, ``vy_ref``, ``yaw_rate_ref``.
+        cg_to_rear_axle: l_r [m].
+
+    Source: Węgrzynowski et al. 2024, Section III-B.2.
+    """
+    parts = []
+    for recording in recordings:
+        vx, vy, yaw_rate = (recording[name] for name in ("vx_ref", "vy_ref", "yaw_rate_ref"))
+        moving = vx >= LEAST_SPEED
+        parts.append(np.degrees(np.arctan2(vy - cg_to_rear_axle * yaw_rate, vx))[moving])
+    return np.concatenate(parts)
+
+
+def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: str) -> tuple[Figure, Table, pd.DataFrame]:
+    """Density of each set's slip angle, its percentiles, and the drawn values.
+
+    Args:
+        slips: set, for people -> slip angles [deg].
+        name: of the files, ``slip_NAME``.
+        data: real or simulated, and what.
+        note: sentence for the caption, such as where l_r is from.
+    """
+    edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
+    drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN * 0.8, 2.9)
+        axes = figure.add_subplot()
+        for (label, values), colour, dash in zip(slips.items(), OTHER_COLOURS, ("solid", "dashed", "dashdot"), strict=False):
+            counts, _ = np.histogram(np.clip(values, -LIMIT, LIMIT), edges)
+            drawn[label] = counts / len(values) / WIDTH
+            axes.stairs(drawn[label], edges, color=colour, linestyle=dash, linewidth=1.2, label=label)
+        for side in (-1.0, 1.0):
+            known = "the paper's 99th percentile, all its data" if side > 0 else "_nolegend_"
+            axes.axvline(side * paper.SLIP_99, color="#767676", linewidth=0.8, linestyle="dotted", label=known)
+        axes.set_yscale("log")
+        axes.set_xlim(-LIMIT, LIMIT)
+        axes.set_xlabel("slip angle of the rear axle [deg]")
+        axes.set_ylabel("density [1/deg]")
+        legend_above(figure, axes)
+    caption = (
+        f"Distribution of the slip angle of the rear axle, Figure 3 of the paper; logarithmic. Data: {data}. Samples with v_x of "
+        f"{LEAST_SPEED:g} m/s and more; angles beyond {LIMIT:g}° count in the outermost bins. {note}"
+    )
+    rows = [
+        {"set": label, "samples": len(values), **{f"p{p}": float(np.percentile(np.abs(values), p)) for p in PERCENTILES}}
+        for label, values in slips.items()
+    ]
+    columns = {"set": Column("set"), "samples": Column("samples")} | {
+        f"p{p}": Column(f"{p} % below [deg]", decimals=1) for p in PERCENTILES
+    }
+    table = Table(f"slip_percentiles_{name}", "Size of the slip angle of the rear axle.", pd.DataFrame(rows), columns)
+    return Figure(f"figure_3_{name}", caption, figure), table, drawn

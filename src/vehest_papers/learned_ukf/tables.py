@@ -1,0 +1,184 @@
+"""Tables I and II of the paper beside ours, errors by state, consistency, definiteness and budget."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+
+from vehest.evaluation.consistency import COVERAGE
+from vehest.report.document import Column, Table
+from vehest.report.style import MISSING, fixed
+from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.kit.reading import median_and_range
+from vehest_papers.learned_ukf import paper
+from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
+from vehest_papers.learned_ukf.filtering import Definiteness
+from vehest_papers.learned_ukf.paper import Published
+
+METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "MAE"), "ae99": ("ae99_weighted", "99%-AE")}
+"""Attribute of `Published` -> metric, and its header."""
+
+STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
+
+
+def accuracy(runs: pd.DataFrame, test: str, name: str, caption: str, *, authors_code: bool) -> Table:
+    """Table I or II: the paper's figures, ours over seeds, and what the authors' public code reached.
+
+    Args:
+        runs: from `candidates.runs_of`.
+        test: test set.
+        name: of the file.
+        caption: of the table.
+        authors_code: whether these are the files on which the authors' code was run.
+    """
+    published = paper.TABLES[test]
+    rows = []
+    for candidate in dict.fromkeys(runs["candidate"]):
+        row: dict[str, object] = {"candidate": candidate}
+        code = paper.AUTHORS_CODE[test] if authors_code and candidate == paper.NNTF_UH else None
+        for short, (metric, _) in METRICS.items():
+            values = of_candidate(runs, candidate, f"{metric}.{test}")
+            row[f"paper_{short}"] = _figure(published.get(candidate), short)
+            row[f"ours_{short}"] = median_and_range(values, 4 if short != "ae99" else 3)
+            row |= {f"median_{short}": np.median(values), f"min_{short}": values.min(), f"max_{short}": values.max()}
+            row[f"code_{short}"] = _figure(code, short)
+        rows.append(row | {"n_seeds": len(values)})
+    columns = {"candidate": Column("method")}
+    for short, (_, header) in METRICS.items():
+        columns[f"paper_{short}"] = Column(f"{header}, paper", decimals=4)
+        columns[f"ours_{short}"] = Column(f"{header}, ours")
+        if authors_code:
+            columns[f"code_{short}"] = Column(f"{header}, authors' public code", decimals=4)
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str, *, authors_code: bool) -> Table:
+    """Root mean square error of each velocity on each test set."""
+    rows = []
+    for candidate in dict.fromkeys(runs["candidate"]):
+        row: dict[str, object] = {"candidate": candidate}
+        for test in tests:
+            known = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
+            code = paper.AUTHORS_CODE_RMS.get(test, ()) if authors_code and candidate == paper.NNTF_UH else ()
+            for state in STATES:
+                values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
+                row[f"ours_{state}_{test}"] = median_and_range(values, 3)
+                row |= {f"median_{state}_{test}": np.median(values), f"paper_{state}_{test}": known.get(state, math.nan)}
+                row[f"code_{state}_{test}"] = dict(zip(STATES, code, strict=False)).get(state, math.nan)
+                row[f"shown_{state}_{test}"] = _beside(row, state, test)
+        rows.append(row)
+    columns = {"candidate": Column("method")}
+    for test in tests:
+        columns |= {f"shown_{state}_{test}": Column(f"{state.replace('_', ' ')}, {SETS[test]} [{unit}]") for state, unit in STATES.items()}
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def consistency(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
+    """NEES, NIS and coverage of the bands of vy, of filters."""
+    rows: list[dict[str, object]] = [
+        {"candidate": "consistent", **{f"{metric}_{test}": value for test in tests for metric, value in _CONSISTENT.items()}}
+    ]
+    rows[0] |= {f"shown_{key}": fixed(float(value), 3) for key, value in list(rows[0].items()) if key != "candidate"}  # type: ignore[arg-type]
+    for candidate in dict.fromkeys(runs["candidate"]):
+        if np.isnan(of_candidate(runs, candidate, f"nees.{tests[0]}")).all():
+            continue
+        row: dict[str, object] = {"candidate": candidate}
+        for test in tests:
+            for metric in _CONSISTENT:
+                values = of_candidate(runs, candidate, f"{metric}.{test}")
+                row |= {f"{metric}_{test}": np.median(values), f"shown_{metric}_{test}": median_and_range(values, _DECIMALS[metric])}
+        rows.append(row)
+    columns = {"candidate": Column("method")}
+    columns |= {f"shown_{metric}_{test}": Column(f"{header}, {SETS[test]}") for test in tests for metric, header in _HEADERS.items()}
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+_CONSISTENT = {"nees": 1.0, "nis": 1.0, "coverage_1sigma": COVERAGE[1], "coverage_2sigma": COVERAGE[2]}
+_HEADERS = {"nees": "NEES", "nis": "NIS", "coverage_1sigma": "within 1σ", "coverage_2sigma": "within 2σ"}
+_DECIMALS = {"nees": 2, "nis": 2, "coverage_1sigma": 3, "coverage_2sigma": 3}
+
+
+def definiteness(
+    counted: Mapping[tuple[str, str], Sequence[Definiteness]], runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str
+) -> Table:
+    """Sequences that lose definiteness without repair, and steps that are repaired.
+
+    Args:
+        counted: (candidate, test set) -> one a seed.
+        runs: from `candidates.runs_of`.
+        tests: test sets.
+        name: of the file.
+        caption: of the table.
+    """
+    rows = []
+    for candidate in dict.fromkeys(candidate for candidate, _ in counted):
+        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(counted[candidate, tests[0]])}
+        for test in tests:
+            own = counted[candidate, test]
+            row[f"paper_{test}"] = "became unstable" if test == "tyre_d" and candidate in (paper.NNT, paper.NNT_U) else MISSING
+            row |= {f"lost_{test}": sum(one.lost for one in own), f"sequences_{test}": sum(one.sequences for one in own)}
+            row |= {f"lost_steps_{test}": sum(one.lost_steps for one in own), f"steps_{test}": sum(one.steps for one in own)}
+            row[f"shown_lost_{test}"] = f"{row[f'lost_{test}']} of {row[f'sequences_{test}']}"
+            row[f"shown_steps_{test}"] = f"{row[f'lost_steps_{test}']} of {row[f'steps_{test}']}"
+            row[f"mse_{test}"] = median_and_range(of_candidate(runs, candidate, f"mse_weighted.{test}"), 4)
+        rows.append(row)
+    columns = {"candidate": Column("method"), "paper_tyre_d": Column("paper, its unseen tyre")}
+    for test in tests:
+        columns[f"shown_lost_{test}"] = Column(f"sequences lost unrepaired, {SETS[test]}")
+        columns[f"shown_steps_{test}"] = Column(f"steps repaired, {SETS[test]}")
+        columns[f"mse_{test}"] = Column(f"MSE (weighted) repaired, {SETS[test]}")
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def budget(part: StudyArtefacts, runs: pd.DataFrame, name: str, caption: str) -> Table:
+    """Seeds, epochs, parameters and skipped steps, by candidate."""
+    rows = []
+    for candidate, models in models_by_candidate(part).items():
+        histories = [history for model in models if (history := model.history()) is not None]
+        fits = [model.fit_metrics() for model in models]
+        epochs = [_epochs_by_phase(history) for history in histories]
+        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(models)}
+        row["one_step"] = _median([counts[0] for counts in epochs if len(counts) > 1])
+        row["after"] = _median([counts[-1] for counts in epochs])
+        row["best_epoch"] = _median([fit.get("best_epoch", math.nan) for fit in fits])
+        row["n_parameters"] = int(of_candidate(runs, candidate, "n_parameters")[0])
+        row["skipped_steps"] = sum(fit.get("skipped_steps", 0.0) for fit in fits)
+        rows.append(row)
+    columns = {
+        "candidate": Column("method"),
+        "n_seeds": Column("seeds", decimals=0),
+        "one_step": Column("epochs, one-step", decimals=0),
+        "after": Column("epochs, through the filter or on sequences", decimals=0),
+        "best_epoch": Column("best of them", decimals=0),
+        "n_parameters": Column("parameters", decimals=0),
+        "skipped_steps": Column("skipped steps, all seeds", decimals=0),
+    }
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def medians(runs: pd.DataFrame, column: str) -> dict[str, float]:
+    """Candidate -> median over seeds."""
+    return {candidate: float(np.median(of_candidate(runs, candidate, column))) for candidate in dict.fromkeys(runs["candidate"])}
+
+
+def _figure(published: Published | None, short: str) -> float:
+    return getattr(published, short) if published else math.nan
+
+
+def _beside(row: Mapping[str, object], state: str, test: str) -> str:
+    known = [("paper", row[f"paper_{state}_{test}"]), ("authors' code", row[f"code_{state}_{test}"])]
+    words = [f"{who} {fixed(value, 3)}" for who, value in known if isinstance(value, float) and math.isfinite(value)]
+    own = str(row[f"ours_{state}_{test}"])
+    return f"{own} ({'; '.join(words)})" if words else own
+
+
+def _epochs_by_phase(history: pd.DataFrame) -> list[int]:
+    """Epochs of each phase; of one where a history knows no phases."""
+    return [int(count) for count in history.groupby("phase").size()] if "phase" in history else [len(history)]
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else math.nan

@@ -1,0 +1,8 @@
+"""The study of the simulated cars: what they do, beside what papers say of real ones and beside a real recording.
+
+Used by the pipeline ``proving_ground``. `documents` makes an index and a page a vehicle.
+"""
+
+from vehest_papers.proving_ground.pages import documents
+
+__all__ = ["documents"]

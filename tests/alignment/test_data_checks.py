@@ -1,0 +1,429 @@
+"""Checks: each one fires on the fault it is for, and a clean drive gets none of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.alignment.checks import Finding, checks_of_clock, checks_of_recording
+from vehest.data.recording import Recording
+
+RATE = 100.0
+LENGTH = 6000
+
+
+def clean_drive(rate: float = RATE, seconds: float = 60.0, noise: float = 1.0, seed: int = 0) -> Recording:
+    """A car that obeys d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate, seen by sensors with a little noise."""
+    time = np.arange(round(seconds * rate)) / rate
+    generator = np.random.default_rng(seed)
+    yaw_rate = 0.25 * np.sin(2 * np.pi * 0.11 * time) + 0.15 * np.sin(2 * np.pi * 0.43 * time + 1.0)
+    vx = 22.0 + 4.0 * np.sin(2 * np.pi * 0.05 * time)
+    vy = -1.2 * yaw_rate + 0.4 * np.sin(2 * np.pi * 0.29 * time)
+    ay = np.gradient(vy, 1 / rate) + vx * yaw_rate
+    ax = np.gradient(vx, 1 / rate) - vy * yaw_rate
+    exact = {"vx": vx, "yaw_rate": yaw_rate, "ax": ax, "ay": ay, "steer": 0.13 * yaw_rate}
+    levels = {"vx": 0.02, "yaw_rate": 0.003, "ax": 0.1, "ay": 0.1, "steer": 0.001}
+    channels = {name: samples + noise * levels[name] * generator.standard_normal(len(time)) for name, samples in exact.items()}
+    references = {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
+    return Recording("lap", "car", rate, 10.0, {**channels, **references})
+
+
+def changed(recording: Recording, **changes: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    return replace(recording, channels={**recording.channels, **{name: change(recording[name]) for name, change in changes.items()}})
+
+
+def with_standstill(recording: Recording, start: float, stop: float, **resting: float) -> Recording:
+    """The car stands for a while: speeds and angles rest, the inertial sensors show their noise."""
+    inside = slice(*recording.index_range(start, stop))
+    channels = {name: samples.copy() for name, samples in recording.channels.items()}
+    generator = np.random.default_rng(7)
+    for name, samples in channels.items():
+        quiet = {"ax": 0.05, "ay": 0.05, "yaw_rate": 0.003}.get(name, 0.0)
+        samples[inside] = resting.get(name, 0.0) + quiet * generator.standard_normal(len(samples[inside]))
+    return replace(recording, channels=channels)
+
+
+def complaints(recording: Recording) -> list[tuple[str, str, str]]:
+    return [(finding.level, finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"]
+
+
+def only_complaint(recording: Recording) -> Finding:
+    findings = [finding for finding in checks_of_recording(recording) if finding.level != "note"]
+    assert len(findings) == 1, findings
+    assert "\n" not in findings[0].message
+    return findings[0]
+
+
+@pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0 / 3.0])
+@pytest.mark.parametrize("seconds", [0.01, 0.1, 1.0, 60.0])
+def test_a_clean_drive_gets_no_complaint_at_any_rate_and_length(rate: float, seconds: float) -> None:
+    recording = clean_drive(rate, max(seconds, 3.0 / rate))
+    assert complaints(recording) == []
+
+
+def test_a_clean_drive_is_noted_to_follow_the_kinematics() -> None:
+    notes = [finding for finding in checks_of_recording(clean_drive()) if finding.level == "note"]
+    assert [(note.check, note.channel) for note in notes] == [("kinematics", "vy_ref")]
+
+
+def test_the_noted_bias_is_that_of_the_accelerometer() -> None:
+    note = checks_of_recording(changed(clean_drive(noise=0.0), ay=lambda ay: ay + 0.25))[0]
+    assert "mean bias -0.250 m/s²" in note.message
+
+
+def test_one_sample_is_no_reason_to_complain() -> None:
+    assert complaints(Recording("r", "car", 100.0, 0.0, {"vx": np.array([3.0]), "ay": np.array([0.1])})) == []
+
+
+# --- impossible values and units ---------------------------------------------------------------------------------------------------
+
+
+def test_an_impossible_value_is_found_with_its_time() -> None:
+    def spoil(ay: np.ndarray) -> np.ndarray:
+        out = ay.copy()
+        out[1234] = 500.0
+        return out
+
+    found = only_complaint(changed(clean_drive(), ay=spoil))
+    assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
+    assert "1 samples" in found.message
+    assert "500 m/s² at 22.34 s" in found.message
+
+
+def test_large_angular_rates_in_degrees_are_impossible_and_the_hint_says_degrees() -> None:
+    found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
+    assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
+    assert "degrees" in found[0].message
+
+
+def test_mild_angular_rates_in_degrees_are_found_by_the_slope_of_ay() -> None:
+    mild = changed(clean_drive(), yaw_rate=lambda yaw_rate: np.rad2deg(yaw_rate / 5), ay=lambda ay: ay / 5, vy_ref=lambda vy: vy / 5)
+    assert np.abs(mild["yaw_rate"]).max() < 8.0
+    found = checks_of_recording(mild)[0]
+    assert (found.level, found.check, found.channel) == ("error", "unit", "yaw_rate")
+    assert "deg/s" in found.message
+
+
+def test_steering_wheel_degrees_are_impossible_road_wheel_angles() -> None:
+    found = only_complaint(changed(clean_drive(), steer=lambda steer: np.rad2deg(15 * steer)))
+    assert (found.check, found.channel) == ("impossible", "steer")
+    assert "degrees" in found.message
+
+
+def test_lateral_acceleration_in_g_is_found() -> None:
+    found = checks_of_recording(changed(clean_drive(), ay=lambda ay: ay / 9.80665))
+    assert ("warning", "unit", "ay") in [(one.level, one.check, one.channel) for one in found]
+
+
+# --- signs -------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
+def test_the_sign_of_ay_against_yaw_rate_is_checked(channel: str) -> None:
+    found = checks_of_recording(changed(clean_drive(), **{channel: np.negative}))
+    first = found[0]
+    assert (first.level, first.check, first.channel) == ("warning", "sign", "yaw_rate")
+    assert "sign: -1" in first.message
+
+
+@pytest.mark.parametrize("turned", [("vy_ref",), ("ay", "yaw_rate")])
+def test_the_sign_of_vy_ref_is_checked_against_the_kinematics(turned: tuple[str, ...]) -> None:
+    found = only_complaint(changed(clean_drive(), **dict.fromkeys(turned, np.negative)))
+    assert (found.level, found.check, found.channel) == ("warning", "sign", "vy_ref")
+    assert "disagrees in sign with d(vy_ref)/dt" in found.message
+
+
+def test_a_reference_that_does_not_follow_the_kinematics_is_reported() -> None:
+    found = only_complaint(changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE))))
+    assert (found.level, found.check, found.channel) == ("warning", "kinematics", "vy_ref")
+
+
+def test_kinematics_are_not_judged_on_a_parked_car() -> None:
+    generator = np.random.default_rng(0)
+    parked = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "vy_ref": 0.01}
+    channels = {name: level * generator.standard_normal(LENGTH) for name, level in parked.items()}
+    assert complaints(Recording("parked", "car", RATE, 0.0, channels)) == []
+
+
+def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_silent() -> None:
+    recording = clean_drive()
+    slow = np.where(np.arange(LENGTH) % 5 == 0, recording["vy_ref"], np.nan)
+    gappy = replace(recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"}))
+    found = checks_of_recording(gappy)
+    assert [(one.level, one.check, one.channel) for one in found] == [("note", "nan", "vy_ref")]
+    assert "80.0 %" in found[0].message
+
+
+# --- stuck channels and standstill -------------------------------------------------------------------------------------------------
+
+
+def test_a_stuck_channel_is_found_with_value_time_and_duration() -> None:
+    def stick(ay: np.ndarray) -> np.ndarray:
+        out = ay.copy()
+        out[2000:2250] = 1.5
+        return out
+
+    found = only_complaint(changed(clean_drive(), ay=stick))
+    assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
+    assert "stays at 1.5 m/s² for 2.5 s from 30 s" in found.message
+
+
+def test_a_channel_that_never_changes_is_found() -> None:
+    found = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
+    assert (found.check, found.channel) == ("stuck", "steer")
+    assert "never changes: 0.02 rad" in found.message
+
+
+def test_a_gap_of_half_a_second_is_not_stuck() -> None:
+    def hold(ay: np.ndarray) -> np.ndarray:
+        out = ay.copy()
+        out[2000:2050] = 1.5
+        return out
+
+    assert complaints(changed(clean_drive(), ay=hold)) == []
+
+
+def test_a_slow_channel_held_between_its_samples_is_not_stuck() -> None:
+    assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == []
+
+
+def test_a_stuck_channel_with_gaps_is_found() -> None:
+    recording = clean_drive()
+    slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
+    slow[2000:2500:5] = 0.03
+    found = only_complaint(replace(recording, channels={**recording.channels, "steer": slow}, gappy=frozenset({"steer"})))
+    assert (found.check, found.channel) == ("stuck", "steer")
+    assert "4.96 s" in found.message
+
+
+def test_a_car_at_standstill_may_rest() -> None:
+    assert complaints(with_standstill(clean_drive(), 20.0, 35.0)) == []
+
+
+def test_a_steering_wheel_may_rest_at_any_angle_while_the_car_stands() -> None:
+    assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=0.4)) == []
+
+
+def test_a_speed_that_reads_zero_while_the_car_turns_is_stuck() -> None:
+    def fail(vx: np.ndarray) -> np.ndarray:
+        out = vx.copy()
+        out[2000:3000] = 0.0
+        return out
+
+    stuck = [finding for finding in checks_of_recording(changed(clean_drive(), vx=fail)) if finding.check == "stuck"]
+    assert [finding.channel for finding in stuck] == ["vx"]
+    assert "stays at 0 m/s for 10 s from 30 s" in stuck[0].message
+
+
+def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later() -> None:
+    def stick(steer: np.ndarray) -> np.ndarray:
+        out = steer.copy()
+        out[4000:4200] = 0.03
+        return out
+
+    found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stick))
+    assert (found.check, found.channel) == ("stuck", "steer")
+    assert "0.03 rad for 2 s from 50 s" in found.message
+
+
+def test_a_standstill_changes_no_finding_about_signs() -> None:
+    turned = changed(with_standstill(clean_drive(), 20.0, 35.0), vy_ref=np.negative)
+    assert [check for _, check, _ in complaints(turned)] == ["sign"]
+
+
+# --- saturation --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("low", "high", "sides"), [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)])
+def test_a_saturated_channel_is_found_on_the_side_where_it_is(low: float, high: float, sides: int) -> None:
+    found = [one for one in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high))) if one.level != "note"]
+    assert {(one.level, one.check, one.channel) for one in found if one.check == "saturated"} == {("warning", "saturated", "ay")}
+    assert sum(one.check == "saturated" for one in found) == sides
+    for one in found:
+        if one.check == "saturated":
+            assert ("highest" in one.message) == (f", {high:g} m/s²" in one.message)
+
+
+def test_a_quantised_channel_is_not_saturated() -> None:
+    for step in (0.05, 0.5):
+        assert complaints(changed(clean_drive(), ay=lambda ay, step=step: np.round(ay / step) * step)) == []
+    time = np.arange(LENGTH) / RATE
+    sine = np.round(8.0 * np.sin(2 * np.pi * 0.71 * time), 1)
+    assert complaints(Recording("r", "car", RATE, 0.0, {"ay": sine})) == []
+
+
+def test_a_quantised_and_saturated_channel_is_saturated() -> None:
+    found = checks_of_recording(changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4)))
+    assert sum(one.check == "saturated" for one in found) == 2
+
+
+def test_resting_values_are_not_saturated() -> None:
+    recording = with_standstill(clean_drive(), 20.0, 35.0)
+    assert complaints(changed(recording, vx=lambda vx: vx.clip(0.0, None))) == []
+
+
+def test_a_manoeuvre_of_one_exact_step_is_not_saturated() -> None:
+    steer = np.where(np.arange(400) < 350, 0.01 * np.sin(np.arange(400)), 0.1)
+    assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
+
+
+# --- clocks ------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("start", [0.0, 149.99, 1.7e9])
+@pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0 / 3.0, 1000.0])
+def test_a_uniform_clock_gets_no_complaint(start: float, rate: float) -> None:
+    assert checks_of_clock(start + np.arange(3000) / rate) == []
+
+
+def test_a_gap_is_found_with_its_length_and_time() -> None:
+    time = np.delete(np.arange(1000) / 100.0, np.s_[300:350])
+    (found,) = checks_of_clock(time)
+    assert (found.level, found.check) == ("error", "gap")
+    assert "1 gaps, the longest of 0.51 s after 2.99 s" in found.message
+
+
+def test_one_lost_sample_is_a_gap() -> None:
+    assert [found.check for found in checks_of_clock(np.delete(np.arange(1000) / 100.0, 500))] == ["gap"]
+
+
+def test_backward_and_repeated_times_are_found_with_their_sample() -> None:
+    time = np.arange(100) / 100.0
+    backward, repeated = time.copy(), time.copy()
+    backward[50:] -= 0.2
+    repeated[50] = repeated[49]
+    (found,) = checks_of_clock(backward)
+    assert (found.level, found.check) == ("error", "clock")
+    assert "goes backwards 1 times, first at sample 50 (0.3 s)" in found.message
+    (found,) = checks_of_clock(repeated)
+    assert "repeats 1 times, first at sample 50 (0.49 s)" in found.message
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_time_stamp_that_is_no_number_is_found(value: float) -> None:
+    time = np.arange(10.0)
+    time[4] = value
+    (found,) = checks_of_clock(time)
+    assert "sample 4 is not a number" in found.message
+
+
+@pytest.mark.parametrize("length", [0, 1])
+def test_fewer_than_two_time_stamps_are_no_clock(length: int) -> None:
+    (found,) = checks_of_clock(np.zeros(length))
+    assert (found.level, found.check) == ("error", "clock")
+
+
+def test_jitter_is_found_and_measured() -> None:
+    time = np.arange(1000) / 100.0
+    time[1::2] += 0.0005
+    (found,) = checks_of_clock(time)
+    assert (found.level, found.check) == ("warning", "jitter")
+    assert "up to 9.5 % from the median of 0.0105 s" in found.message
+
+
+def test_a_clock_that_speeds_up_slowly_drifts() -> None:
+    intervals = np.linspace(0.00995, 0.01005, 5000)
+    assert [found.check for found in checks_of_clock(np.concatenate([[0.0], np.cumsum(intervals)]))] == ["drift"]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@given(st.integers(2, 300), st.floats(1.0, 2000.0), st.floats(-1e6, 1e6))
+def test_no_uniform_clock_is_refused(length: int, rate: float, start: float) -> None:
+    assert [found for found in checks_of_clock(start + np.arange(length) / rate) if found.level == "error"] == []
+
+
+def test_a_reference_in_kilometres_an_hour_is_found_by_its_scale() -> None:
+    finding = only_complaint(changed(clean_drive(), vy_ref=lambda samples: samples * 3.6))
+    assert (finding.level, finding.check, finding.channel) == ("warning", "unit", "vy_ref")
+    assert "times as large as ay - vx·yaw_rate" in finding.message
+
+
+def test_a_reference_sideslip_in_degrees_is_found_although_its_values_are_possible() -> None:
+    gentle = changed(clean_drive(), vy_ref=lambda samples: samples * 0.9, sideslip_ref=lambda samples: np.degrees(0.9 * samples))
+    assert np.abs(gentle["sideslip_ref"]).max() < np.pi
+    finding = only_complaint(gentle)
+    assert (finding.level, finding.check, finding.channel) == ("error", "unit", "sideslip_ref")
+
+
+def with_wheels(recording: Recording) -> Recording:
+    """The same drive with four wheels that roll."""
+    wheels = {f"wheel_speed_{wheel}": recording["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
+    return replace(recording, channels={**recording.channels, **wheels})
+
+
+def fired(recording: Recording) -> set[tuple[str, str]]:
+    return {(finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"}
+
+
+def test_a_steering_offset_shows_straight_ahead() -> None:
+    whole = clean_drive()
+    assert ("offset", "steer") not in fired(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0)))
+    assert fired(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == {("offset", "steer")}
+
+
+def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
+    whole = with_wheels(clean_drive())
+    assert not fired(whole)
+
+    def interrupted(samples: np.ndarray) -> np.ndarray:
+        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), 0.0, samples)
+
+    def braked(samples: np.ndarray) -> np.ndarray:
+        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), -7.0, samples)
+
+    dropped = changed(whole, wheel_speed_rl=interrupted)
+    assert fired(dropped) == {("dropout", "wheel_speed_rl")}
+    assert not fired(changed(dropped, ax=braked)) & {("dropout", "wheel_speed_rl")}
+
+
+def backwards(recording: Recording, *stretches: tuple[int, int], speed: float = -2.0) -> Recording:
+    """The same drive, with stretches of samples in which its speed and its reference's are negative."""
+    slow = {name: recording[name].copy() for name in ("vx", "vx_ref")}
+    for samples in slow.values():
+        for start, stop in stretches:
+            samples[start:stop] = np.linspace(0.6 * speed, speed, stop - start)
+    return replace(recording, channels={**recording.channels, **slow})
+
+
+def reversing(recording: Recording) -> list[Finding]:
+    return [finding for finding in checks_of_recording(recording) if finding.check == "reverse"]
+
+
+def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_speed() -> None:
+    (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
+    assert (found.level, found.channel) == ("note", "vx")
+    assert "goes backwards 2 times" in found.message
+    assert "the longest for 2.5 s from 40 s, lowest -2 m/s" in found.message
+    assert "start and stop of a split" in found.message
+    assert "sign: -1" in found.message
+
+
+def test_a_drive_with_the_other_sign_of_vx_goes_backwards_throughout() -> None:
+    (found,) = reversing(changed(clean_drive(), vx=np.negative))
+    assert "goes backwards 1 times" in found.message
+    assert "for 60 s from 10 s" in found.message
+
+
+def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed() -> None:
+    drive = backwards(clean_drive(), (1000, 1150))
+    forwards = changed(drive, vx=np.abs)
+    assert not reversing(forwards)
+    without = replace(forwards, channels={name: samples for name, samples in forwards.channels.items() if name != "vx"})
+    assert [found.channel for found in reversing(without)] == ["vx_ref"]
+    assert not reversing(without.select(["yaw_rate", "ay"]))
+
+
+@pytest.mark.parametrize(("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)])
+def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length: int, speed: float, noted: int) -> None:
+    assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted
+
+
+def test_bad_input_of_a_single_track_filter_is_told_apart() -> None:
+    whole = clean_drive()
+    assert ("sign", "yaw_rate") in fired(changed(whole, yaw_rate=np.negative))
+    assert ("saturated", "ay") in fired(changed(whole, ay=lambda samples: np.clip(samples, -4.0, 4.0)))

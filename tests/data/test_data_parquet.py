@@ -1,0 +1,179 @@
+"""Parquet files from strangers: numbers come out as they went in; what claims, unpacks to or is more than it may is refused in one line."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from vehest.data.errors import DataError, VehestError
+from vehest.data.limits import Limits, use_limits
+from vehest.data.parquet import parquet_file, read_numbers
+
+N = 1000
+
+
+def columns() -> dict[str, Any]:
+    generator = np.random.default_rng(0)
+    return {"time": np.arange(N) / 100.0, "vx": generator.normal(20.0, 1.0, N), "gear": generator.integers(1, 6, N)}
+
+
+def written(folder: Path, content: dict[str, Any], **options: Any) -> Path:
+    pq.write_table(pa.table(content), folder / "lap.parquet", **options)
+    return folder / "lap.parquet"
+
+
+def read(file: Path, *names: str) -> dict[str, Any]:
+    with parquet_file(file) as table:
+        return read_numbers(file, table, names or table.schema_arrow.names)
+
+
+def refusal(file: Path) -> str:
+    with pytest.raises(DataError) as error:
+        read(file)
+    message = str(error.value)
+    assert f"'{file}'" in message
+    assert "\n" not in message
+    return message
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"row_group_size": 77},
+        {"use_dictionary": False, "compression": "none"},
+        {"data_page_version": "2.0", "compression": "zstd"},
+        {"data_page_size": 100, "compression": "gzip"},
+        {"write_page_index": True, "compression": "lz4", "write_page_checksum": True},
+    ],
+    ids=str,
+)
+def test_numbers_come_out_as_they_went_in(tmp_path: Path, options: dict[str, Any]) -> None:
+    values = read(written(tmp_path, columns(), **options))
+    for name, expected in columns().items():
+        np.testing.assert_array_equal(values[name], expected)
+        assert values[name].dtype == np.float64
+
+
+def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_path: Path) -> None:
+    content = {
+        "a": pa.array([1, None, 3], pa.uint8()),
+        "b": pa.array([1.5, 2.5, None], pa.float16()),
+        "c": pa.array([None] * 3, pa.int64()),
+    }
+    values = read(written(tmp_path, content))
+    np.testing.assert_array_equal(values["a"], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(values["b"], [1.5, 2.5, np.nan])
+    assert np.isnan(values["c"]).all()
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        pa.array([[1.0], [2.0]]),
+        pa.array([{"x": 1.0}, {"x": 2.0}]),
+        pa.array([b"1", b"2"]),
+        pa.array(["1", "2"]),
+        pa.array([True, False]),
+        pa.array([1, 2], pa.timestamp("ns")),
+        pa.array([1, 2], pa.decimal128(10)),
+        pa.array([b"12", b"34"], pa.binary(2)),
+    ],
+    ids=lambda odd: str(odd.type),
+)
+def test_a_column_of_something_else_than_numbers_is_named_with_its_type(tmp_path: Path, odd: pa.Array) -> None:
+    assert "column 'odd' is of type" in refusal(written(tmp_path, {"odd": odd}))
+
+
+def test_a_few_kilobytes_do_not_become_hundreds_of_megabytes(tmp_path: Path) -> None:
+    file = written(tmp_path, {"time": np.zeros(19_000_000)}, compression="zstd")
+    assert file.stat().st_size < 200_000
+    assert "times its size, more than the limit of 250; if that is meant, raise it: limits.expansion=NUMBER" in refusal(file)
+    with use_limits(Limits(expansion=10**6)):
+        assert len(read(file)["time"]) == 19_000_000
+
+
+def test_rows_and_values_are_counted_before_anything_is_decoded(tmp_path: Path) -> None:
+    file = written(tmp_path, columns())
+    with use_limits(Limits(samples=999)):
+        assert "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER" in refusal(file)
+    with use_limits(Limits(values=2999)):
+        assert "1000 rows of 3 columns, 3000 values, more than the limit of 2999" in refusal(file)
+        assert set(read(file, "time", "vx")) == {"time", "vx"}
+
+
+def with_other_numbers_in_its_description(file: Path, before: int, after: int) -> None:
+    """Write one number of a Parquet file's description as another one, in as many bytes."""
+    raw = file.read_bytes()
+    start = len(raw) - 8 - int.from_bytes(raw[-8:-4], "little")
+    length = len(varint(2 * before))
+    assert varint(2 * before) in raw[start:]
+    file.write_bytes(raw[:start] + raw[start:].replace(varint(2 * before), varint(2 * after, length)))
+
+
+def varint(value: int, length: int = 0) -> bytes:
+    parts = []
+    while value or len(parts) < length or not parts:
+        parts.append(value & 127)
+        value >>= 7
+    return bytes([part | 128 for part in parts[:-1]] + parts[-1:])
+
+
+def test_a_page_that_unpacks_to_more_than_the_description_says_is_refused(tmp_path: Path) -> None:
+    n_rows = 20_000_000
+    file = written(
+        tmp_path, {"time": np.zeros(n_rows)}, compression="zstd", use_dictionary=False, data_page_size=2**30, write_statistics=False
+    )
+    with_other_numbers_in_its_description(file, n_rows, 10)
+    with parquet_file(file) as table:
+        assert table.metadata.num_rows == 10
+    assert "times its size" in refusal(file)
+
+
+@pytest.mark.parametrize("claimed", [999, 1001, 10**6])
+def test_rows_that_are_not_there_are_missed(tmp_path: Path, claimed: int) -> None:
+    file = written(tmp_path, {"time": np.arange(N) / 100.0}, write_statistics=False, compression="none")
+    with_other_numbers_in_its_description(file, N, claimed)
+    if claimed < N:
+        assert len(read(file)["time"]) == claimed
+    else:
+        assert "truncated or damaged" in refusal(file)
+
+
+def test_a_description_longer_than_the_limit_is_not_read(tmp_path: Path) -> None:
+    file = written(tmp_path, {f"c{k}": [1.0] for k in range(300)})
+    with use_limits(Limits(text_bytes=10_000)):
+        assert "holds a description of" in refusal(file)
+
+
+def test_whatever_is_flipped_in_a_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    """Three hundred files with one to sixteen random bytes each, most of them near the end, where the description stands."""
+    good = written(tmp_path, columns(), data_page_size=500).read_bytes()
+    generator, file, refusals = random.Random(1), tmp_path / "lap.parquet", []
+    for _ in range(300):
+        raw = bytearray(good)
+        for _ in range(generator.choice([1, 2, 16])):
+            raw[-1 - min(int(generator.expovariate(1 / 400)), len(raw) - 1)] = generator.randrange(256)
+        file.write_bytes(raw)
+        try:
+            read(file)
+        except VehestError as error:
+            refusals.append(str(error))
+    assert all(str(file) in said and "\n" not in said for said in refusals)
+    assert len(refusals) > 100
+
+
+@pytest.mark.parametrize(
+    "content", [lambda raw: b"", lambda raw: raw[:100], lambda raw: b"PAR1" + raw[-8:], lambda raw: raw[:-8] + b"\xff" * 4 + b"PAR1"]
+)
+def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, content: Callable[[bytes], bytes]) -> None:
+    file = written(tmp_path, columns())
+    file.write_bytes(content(file.read_bytes()))
+    refusal(file)

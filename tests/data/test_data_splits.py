@@ -1,0 +1,352 @@
+"""Splits and windows: no sample serves two purposes, no window crosses from one recording into another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.data.splits import Catalogue, Span, Split, dataset_names, split_from_config
+from vehest.data.windows import window_starts, windows_of
+from vehest.sources.base import open_source
+from vehest.stages.config import compose_config
+
+PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+CONFIGURATIONS = sorted((Path(__file__).parents[2] / "conf" / "split").glob("*.yaml"))
+
+bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(0.0, 4.0)
+
+
+@st.composite
+def spans(draw: st.DrawFn) -> Span:
+    start, stop = sorted(draw(st.lists(bounds, min_size=2, max_size=2, unique=True)))
+    return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
+
+
+def samples_of(span: Span, rate_hz: float) -> set[tuple[str, int]]:
+    """Which samples of a recording of four seconds a stretch takes."""
+    recording = Recording(span.recording, "car", rate_hz, 0.0, {"ay": np.arange(4 * rate_hz)})
+    first, end = recording.index_range(span.start, span.stop)
+    return {(span.recording, index) for index in range(first, end)}
+
+
+@st.composite
+def roles(draw: st.DrawFn) -> list[tuple[Span, ...]]:
+    """Stretches for three purposes, of one recording: neighbours, or anything."""
+    if draw(st.booleans()):
+        times = sorted(draw(st.lists(bounds, min_size=4, max_size=7, unique=True)))
+        neighbours = [Span("set", "lap1", start, stop) for start, stop in pairwise(times)]
+        return [tuple(neighbours[role::3]) for role in range(3)]
+    return [tuple(draw(st.lists(spans(), min_size=1, max_size=2))) for _ in range(3)]
+
+
+@PROPERTY
+@given(roles(), st.sampled_from([20.0, 100.0, 125.0]))
+def test_train_validation_and_tests_never_share_samples(parts: list[tuple[Span, ...]], rate_hz: float) -> None:
+    train, validation, test = parts
+    taken = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
+    shared = bool(taken[0] & taken[1] or taken[0] & taken[2] or taken[1] & taken[2])
+    apart = not any(a.overlaps(b) for one, other in combinations(parts, 2) for a in one for b in other)
+    assert not (apart and shared)
+    if apart:
+        assert Split("drive", train, validation, {"test": test}).all_spans == train + validation + test
+    else:
+        with pytest.raises(ConfigurationError, match="share samples of recording"):
+            Split("drive", train, validation, {"test": test})
+
+
+@PROPERTY
+@given(spans(), spans())
+def test_overlap_goes_both_ways_and_is_that_of_the_times(one: Span, other: Span) -> None:
+    assert one.overlaps(other) is other.overlaps(one)
+    common = one.recording == other.recording and max(one.start, other.start) < min(one.stop, other.stop)
+    assert one.overlaps(other) is common
+
+
+def test_neighbouring_ranges_share_nothing() -> None:
+    parts = Split("s", (Span("d", "r", 150, 450),), (Span("d", "r", 450, 550),), {"test": (Span("d", "r", 550, 700),)})
+    assert len(parts.all_spans) == 3
+    recording = Recording("r", "car", 100.0, 149.99, {"ay": np.zeros(55_001)})
+    ranges = [recording.index_range(span.start, span.stop) for span in parts.all_spans]
+    assert ranges == [(1, 30_001), (30_001, 40_001), (40_001, 55_001)]
+
+
+def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing() -> None:
+    Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
+
+
+def test_two_test_sets_may_look_at_the_same_samples() -> None:
+    Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
+
+
+def test_a_shared_stretch_is_named_with_both_roles() -> None:
+    with pytest.raises(ConfigurationError) as error:
+        Split("s", (Span("d", "lap3", 0, 10),), (Span("d", "lap3", 10, 20),), {"wet": (Span("d", "lap3", 5, 6),)})
+    assert "train and test 'wet' share samples of recording 'lap3' (lap3 [0, 10) s and lap3 [5, 6) s)" in str(error.value)
+
+
+@pytest.mark.parametrize(("start", "stop"), [(2.0, 1.0), (1.0, 1.0), (math.nan, 1.0), (0.0, math.nan)])
+def test_a_stretch_must_run_forward(start: float, stop: float) -> None:
+    with pytest.raises(ConfigurationError, match="is not before stop"):
+        Span("d", "r", start, stop)
+
+
+def test_plain_values_make_a_split() -> None:
+    entry = {"recording": "lap", "start": 1, "stop": 2}
+    config = {
+        "name": "s",
+        "dataset": "d",
+        "train": [entry],
+        "validation": [{"recording": "v", "dataset": "e"}],
+        "tests": {"t": [{"recording": "x"}]},
+    }
+    split = split_from_config(config)
+    assert split.train == (Span("d", "lap", 1.0, 2.0),)
+    assert split.validation == (Span("e", "v", -math.inf, math.inf),)
+    assert split.tests == {"t": (Span("d", "x"),)}
+    assert split.datasets == ("d", "e")
+
+
+def test_a_split_may_have_tests_only_but_not_nothing() -> None:
+    config = {"name": "s", "dataset": "d", "train": [], "validation": [], "tests": {"t": [{"recording": "x"}]}}
+    split = split_from_config(config)
+    assert (split.train, split.validation, split.datasets) == ((), (), ("d",))
+    with pytest.raises(ConfigurationError, match="split 's' has no ranges at all"):
+        split_from_config(config | {"tests": {}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"trian": []}, "split.trian is not an option of split; options: name, title"),
+        ({"train": []}, "nothing to train on"),
+        ({"validation": []}, "nothing to validate on"),
+        ({"train": [{"recording": "a", "end": 3}]}, "split.train.0.end is not an option of split.train.0; options: dataset, recording"),
+        ({"train": [{"start": 3}]}, "needs a recording"),
+        ({"train": [{"recording": "a", "start": "three"}]}, "split.train.0.start must be a number, not 'three'"),
+        ({"train": [{"recording": "a", "start": None}]}, "split.train.0.start must be a number, not None"),
+        ({"train": ["a"]}, "split.train.0 must be a group of options, not 'a'"),
+        ({"train": {"recording": "a"}}, "split.train must be a list"),
+        ({"train": "a"}, "split.train must be a list"),
+        ({"tests": [{"recording": "a"}]}, "split.tests must be a mapping"),
+        ({"tests": {"wet": {"recording": "a"}}}, "split.tests.wet must be a list"),
+        ({"dataset": None}, "needs a recording and a dataset"),
+    ],
+)
+def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], what: str) -> None:
+    config = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config | changes)
+    assert what in str(error.value)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
+def test_every_split_that_is_shipped_is_one(file: Path) -> None:
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has one of some name."""
+
+    def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
+        names = open_source(about).ids() if about["source"] == "simulated" else ["some"]
+        speed = np.full(200, 20.0)
+        ten_seconds = {"ay": np.full(200, 3.0), "vx": speed, "vx_ref": speed, "yaw_rate": np.full(200, 0.15), "sideslip_ref": np.zeros(200)}
+        return {name: Recording(name, "car", 20.0, 0.0, ten_seconds).select for name in names}
+
+    config = yaml.safe_load(file.read_text(encoding="utf-8"))
+    split = split_from_config(config, cruising)
+    assert split.name == file.stem
+    assert set(dataset_names(config)) == set(split.datasets)
+
+
+# --- patterns and conditions
+
+
+def drives(ay: Mapping[str, Sequence[float]], vx: Sequence[float] | None = None, start_time: float = 0.0) -> Catalogue:
+    """A catalogue of data set ``d``, or of any, with drives at 100 Hz of a given ay."""
+
+    def reader(name: str) -> Callable[[Iterable[str]], Recording]:
+        everything = {"ay": np.array(ay[name]), "vx": np.array(vx or [10.0] * len(ay[name]))}
+        gappy = frozenset({"ay"})
+        recording = Recording(name, "car", 100.0, start_time, everything, gappy=gappy)
+        return lambda channels: recording.select(channels)
+
+    return lambda dataset: {name: reader(name) for name in ay}
+
+
+def kept_of(keep: object, catalogue: Catalogue, **entry: object) -> Split:
+    """A split whose training is cut by a condition."""
+    train = {"recordings": "train_*", **entry, "keep": keep}
+    return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
+
+
+def test_a_pattern_names_recordings_in_the_order_of_their_ids() -> None:
+    catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
+    config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
+    assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
+
+
+def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it() -> None:
+    asked: list[str] = []
+
+    def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        asked.append(dataset)
+        return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
+
+    plain = {"name": "s", "dataset": "d", "train": [{"recording": "a1"}], "validation": [{"recording": "b1"}]}
+    split_from_config(plain, catalogue)
+    assert asked == []
+    split_from_config(plain | {"train": [{"recordings": "a*"}], "validation": [{"recordings": "b*"}]}, catalogue)
+    assert asked == ["d"]
+
+
+def test_a_condition_keeps_whole_stretches_that_last() -> None:
+    # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
+    ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
+    keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
+    split = kept_of(keep, drives({"train_1": ay}, start_time=50.0))
+    assert [(span.start, span.stop) for span in split.train] == [(52.0, 54.0), (54.01, math.inf)]
+    kept = split.kept["train"]
+    assert (kept.n_recordings, kept.n_spans) == (1, 2)
+    assert [kept.seconds, kept.of_seconds] == pytest.approx([5.0, 7.01])
+    assert kept.describe() == "0.1 of 0.1 min in 2 stretches of 1 recording"
+
+
+@PROPERTY
+@given(st.lists(st.tuples(st.sampled_from([0.0, 5.0, -9.0, math.nan]), st.integers(1, 40)), min_size=1, max_size=12), st.integers(0, 30))
+def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces: list[tuple[float, int]], shortest: int) -> None:
+    ay = [value for value, length in pieces for _ in range(length)]
+    expected: set[int] = set()
+    run: list[int] = []
+    for k, value in enumerate([*ay, math.inf]):
+        if abs(value) <= 5.0:
+            run.append(k)
+            continue
+        expected.update(run if len(run) >= shortest else [])
+        run = []
+    catalogue = drives({"train_1": ay}, start_time=3.3)
+    keep = {"magnitude": {"ay": {"at_most": 5.0}}, "at_least_seconds": shortest / 100.0}
+    if not expected:
+        with pytest.raises(ConfigurationError, match="keeps nothing"):
+            kept_of(keep, catalogue)
+        return
+    recording = catalogue("d")["train_1"](["ay"])
+    ranges = [recording.index_range(span.start, span.stop) for span in kept_of(keep, catalogue).train]
+    assert {k for first, end in ranges for k in range(first, end)} == expected
+    assert all(one[1] < other[0] for one, other in pairwise(ranges))
+
+
+def test_all_channels_of_a_condition_must_meet_it() -> None:
+    ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
+    keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
+    spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
+    assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
+
+
+def test_a_condition_looks_at_no_more_than_the_range() -> None:
+    keep = {"magnitude": {"ay": {"at_most": 7.0}}}
+    spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
+    assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
+
+
+CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
+
+
+@pytest.mark.parametrize(
+    ("entry", "what"),
+    [
+        ({"recordings": "lap_*"}, "no recording of data set 'd' matches 'lap_*' (it has train_1)"),
+        ({"recordings": "train_*", "recording": "train_1"}, "needs a recording and a dataset (or recordings, a pattern)"),
+        ({"recording": "train_9", "keep": CONDITION}, "no recording 'train_9'"),
+        ({"keep": "slow"}, "split.train.0.keep must be a group of options, not 'slow'"),
+        ({"keep": {}}, "split.train.0.keep.magnitude is missing"),
+        ({"keep": {"magnitude": {"ay": {"at_most": 7.0}}, "seconds": 2}}, "keep; options: magnitude, at_least_seconds"),
+        ({"keep": {"magnitude": "ay"}}, "keep.magnitude must be a mapping, not 'ay'"),
+        ({"keep": {"magnitude": {"lateral": {"at_most": 7.0}}}}, "there is no channel 'lateral'"),
+        ({"keep": {"magnitude": {"ay": 7.0}}}, "keep.magnitude.ay must be a group of options, not 7.0"),
+        ({"keep": {"magnitude": {"ay": {}}}}, "'ay' needs at_least, at_most or both"),
+        ({"keep": {"magnitude": {"ay": {"most": 7.0}}}}, "magnitude.ay; options: at_least, at_most"),
+        ({"keep": {"magnitude": {"ay": {"at_most": "seven"}}}}, "magnitude.ay.at_most must be a number, not 'seven'"),
+        ({"keep": {"magnitude": {"ay": {"at_most": True}}}}, "magnitude.ay.at_most must be a number, not True"),
+        ({"keep": {"magnitude": {"ay": {"at_most": -7.0}}}}, "no magnitude of 'ay' lies between 0 and -7"),
+        ({"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}}, "no magnitude of 'ay' lies between 8 and 7"),
+        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds must be zero or positive, not -1"),
+        ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
+    ],
+)
+def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry: dict[str, object], what: str) -> None:
+    named = {} if "recording" in entry else {"recordings": "train_*"}
+    config = {"name": "s", "dataset": "d", "train": [{**named, **entry}], "validation": [{"recording": "v"}]}
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config, drives({"train_1": [0.0] * 200}))
+    assert what in str(error.value)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
+def test_patterns_and_conditions_without_recordings_say_what_they_need(entry: dict[str, object]) -> None:
+    config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
+    with pytest.raises(ConfigurationError, match="patterns and conditions need the recordings of data set 'd'"):
+        split_from_config(config)
+
+
+def test_a_condition_on_a_channel_that_a_recording_lacks_names_both() -> None:
+    with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
+        kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
+
+
+# --- windows
+
+
+def recorded(name: str, length: int, offset: float) -> Recording:
+    samples = offset + np.arange(float(length))
+    return Recording(name, "car", 20.0, 0.0, {"vx": samples, "ay": -samples, "vy_ref": samples + 0.5})
+
+
+@PROPERTY
+@given(st.lists(st.integers(1, 25), min_size=1, max_size=4), st.integers(1, 12))
+def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths: list[int], n_window: int) -> None:
+    recordings = [recorded(f"r{k}", length, 1000.0 * k) for k, length in enumerate(lengths)]
+    expected = []
+    for recording in recordings:
+        for now in range(n_window - 1, len(recording) - 1):
+            past = [[recording["vx"][k], recording["ay"][k]] for k in range(now - n_window + 1, now + 1)]
+            expected.append((past, recording["vy_ref"][now + 1]))
+    if not expected:
+        with pytest.raises(DataError, match=f"windows of {n_window} samples"):
+            windows_of(recordings, ["vx", "ay"], "vy_ref", n_window)
+        return
+    windows = windows_of(recordings, ["vx", "ay"], "vy_ref", n_window)
+    assert len(windows) == len(expected)
+    for start, target, (past, after) in zip(windows.starts, windows.targets, expected, strict=True):
+        assert windows.series[start : start + n_window].tolist() == past
+        assert target == after
+
+
+@PROPERTY
+@given(st.integers(0, 50), st.integers(1, 50))
+def test_window_starts_count_those_with_a_sample_after_them(n_samples: int, n_window: int) -> None:
+    assert window_starts(n_samples, n_window).tolist() == [k for k in range(n_samples) if k + n_window < n_samples]
+
+
+def test_windows_share_memory_instead_of_being_copied() -> None:
+    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
+    assert windows.series.nbytes == 1000 * 2 * 8
+
+
+def test_windows_over_gaps_are_refused_by_name() -> None:
+    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
+    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
+    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
+        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
+    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6

@@ -1,0 +1,458 @@
+"""Filters and corrections: what each says about time and truth, checked against closed forms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vehest.data import transforms
+from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.recording import Recording
+from vehest.data.transforms import (
+    TRANSFORMS,
+    LowPass,
+    MountingCorrection,
+    ReferenceLever,
+    RemoveOutliers,
+    Resample,
+    SpeedFromWheels,
+    transform_from_config,
+)
+from vehest.data.windows import windows_of
+
+PROPERTY = settings(max_examples=50, deadline=None, derandomize=True, database=None)
+RATE = 100.0
+
+
+def recorded(**channels: np.ndarray) -> Recording:
+    return Recording("lap", "car", RATE, 3.0, channels)
+
+
+def filtered(samples: np.ndarray, direction: str, cutoff_hz: float = 5.0) -> np.ndarray:
+    return LowPass(cutoff_hz, direction=direction)(recorded(ay=samples))["ay"]  # type: ignore[arg-type]
+
+
+def fitted_sine(samples: np.ndarray, time: np.ndarray, frequency: float) -> tuple[float, float]:
+    """Amplitude and phase of the sine that fits best."""
+    basis = np.stack([np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)], axis=1)
+    (sine, cosine), *_ = np.linalg.lstsq(basis, samples, rcond=None)
+    return float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+
+
+def bilinear(frequency: float, cutoff_hz: float) -> complex:
+    """Response of a second-order Butterworth filter made digital by the bilinear transform with pre-warping."""
+    warped = 1j * np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff_hz / RATE)
+    return complex(1.0 / (warped**2 + math.sqrt(2.0) * warped + 1.0))
+
+
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
+def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency: float) -> None:
+    time = np.arange(2000) / RATE
+    inside = slice(500, 1500)
+    response = bilinear(frequency, 5.0)
+    sine = np.sin(2 * np.pi * frequency * time)
+    gain, phase = fitted_sine(filtered(sine, "causal")[inside], time[inside], frequency)
+    assert gain == pytest.approx(abs(response), rel=1e-6)
+    assert phase == pytest.approx(np.angle(response), abs=1e-6)
+    gain, phase = fitted_sine(filtered(sine, "zero_phase")[inside], time[inside], frequency)
+    assert gain == pytest.approx(abs(response) ** 2, rel=1e-6)
+    assert phase == pytest.approx(0.0, abs=1e-6)
+
+
+@PROPERTY
+@given(arrays(np.float64, 60, elements=st.floats(-100, 100)), st.integers(1, 59), st.floats(-1e3, 1e3))
+def test_causal_low_pass_does_not_see_the_future(samples: np.ndarray, now: int, shock: float) -> None:
+    changed = samples.copy()
+    changed[now:] += shock
+    np.testing.assert_array_equal(filtered(changed, "causal")[:now], filtered(samples, "causal")[:now])
+
+
+def test_zero_phase_low_pass_sees_the_future_and_says_so() -> None:
+    step = np.where(np.arange(200) < 100, 0.0, 1.0)
+    assert abs(filtered(step, "zero_phase")[99]) > 0.1
+    assert filtered(step, "causal")[99] == 0.0
+    assert LowPass(5.0, direction="zero_phase").mode == "offline"
+    assert LowPass(5.0, direction="causal").mode == "causal"
+
+
+def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
+    bump = np.exp(-((np.arange(401) - 200.0) ** 2) / 50.0)
+    smooth = filtered(bump, "zero_phase")
+    np.testing.assert_allclose(smooth, smooth[::-1], atol=1e-9)
+    assert np.argmax(smooth) == 200
+    assert np.argmax(filtered(bump, "causal")) > 200
+
+
+@PROPERTY
+@given(st.integers(1, 40), st.floats(-1e3, 1e3), st.sampled_from(["causal", "zero_phase"]))
+def test_low_pass_keeps_a_constant_however_short(length: int, value: float, direction: str) -> None:
+    np.testing.assert_allclose(filtered(np.full(length, value), direction), value, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 50.0, 80.0, math.nan])
+def test_low_pass_beyond_nyquist_is_refused(cutoff_hz: float) -> None:
+    with pytest.raises(ConfigurationError, match="between 0 and 50 Hz"):
+        LowPass(cutoff_hz)(recorded(ay=np.zeros(10)))
+
+
+@pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
+def test_a_symmetric_low_pass_has_the_gain_of_its_taps_and_no_phase(frequency: float) -> None:
+    time = np.arange(1000) / RATE
+    samples = LowPass(5.0, design="fir")(recorded(ay=np.sin(2 * np.pi * frequency * time)))["ay"]
+    lag = np.arange(-30, 31) / RATE
+    taps = np.sinc(10.0 * lag) * (0.54 + 0.46 * np.cos(np.pi * lag / 0.3))
+    response = float(np.sum(taps * np.cos(2 * np.pi * frequency * lag)) / taps.sum())
+    inside = slice(200, 800)
+    gain, phase = fitted_sine(samples[inside], time[inside], frequency)
+    assert gain * np.cos(phase) == pytest.approx(response, abs=1e-6)
+    assert gain * np.sin(phase) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("length", [1, 2, 7, 300])
+def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length: int) -> None:
+    line = 3.0 - 0.2 * np.arange(length)
+    np.testing.assert_allclose(LowPass(5.0, design="fir")(recorded(ay=line))["ay"], line, atol=1e-9)
+
+
+def test_a_causal_low_pass_runs_along_with_the_drive_as_over_the_recording() -> None:
+    generator = np.random.default_rng(0)
+    drive = recorded(ay=generator.standard_normal(80).cumsum() + 5.0, vx=generator.standard_normal(80))
+    low_pass = LowPass(5.0, ("ay",), "causal")
+    stepper, whole = low_pass.online(RATE), low_pass(drive)
+    steps = [stepper.step({name: float(drive[name][k]) for name in ("ay", "vx")}) for k in range(80)]
+    for name in ("ay", "vx"):
+        np.testing.assert_allclose([step[name] for step in steps], whole[name], rtol=0, atol=1e-12)
+    with pytest.raises(DataError, match="'ay' is missing"):
+        stepper.step({"vx": 1.0})
+
+
+def test_what_cannot_be_causal_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="use design=butterworth for a causal one"):
+        LowPass(5.0, direction="causal", design="fir")
+    with pytest.raises(ConfigurationError, match="use direction=causal"):
+        LowPass(5.0, design="fir").online(RATE)
+
+
+def test_reference_lever_brings_velocities_to_the_centre_of_gravity() -> None:
+    """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
+    yaw_rate, vx, vy = np.array([0.0, 0.4, -0.3]), np.full(3, 15.0), np.array([0.0, -0.2, 0.4])
+    at_sensor = {"vx_ref": vx - yaw_rate * 0.5, "vy_ref": vy + yaw_rate * 2.0, "yaw_rate": yaw_rate}
+    moved = ReferenceLever(2.0, 0.5)(recorded(**at_sensor, sideslip_ref=np.zeros(3)))
+    np.testing.assert_allclose(moved["vx_ref"], vx)
+    np.testing.assert_allclose(moved["vy_ref"], vy)
+    np.testing.assert_allclose(moved["sideslip_ref"], np.arctan2(vy, vx))
+
+
+def test_only_the_named_channels_are_filtered() -> None:
+    noise = np.random.default_rng(0).standard_normal(100)
+    out = LowPass(5.0, channels=("ay",))(recorded(ay=noise, ax=noise))
+    np.testing.assert_array_equal(out["ax"], noise)
+    assert out["ay"].std() < 0.6 * noise.std()
+
+
+def drive_signal(length: int = 2000) -> np.ndarray:
+    time = np.arange(length) / RATE
+    return 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
+
+
+def test_outlier_removal_removes_planted_spikes_and_nothing_else() -> None:
+    clean = drive_signal()
+    spikes = np.random.default_rng(3).choice(np.arange(0, len(clean), 8), 60, replace=False)
+    spoilt = clean.copy()
+    spoilt[spikes] += np.random.default_rng(4).choice([-1.0, 1.0], 60) * np.random.default_rng(5).uniform(3, 50, 60)
+    out = RemoveOutliers()(recorded(ay=spoilt))["ay"]
+    assert np.abs(out - clean)[spikes].max() < 0.5
+    untouched = np.setdiff1d(np.arange(len(clean)), spikes)
+    np.testing.assert_array_equal(out[untouched], clean[untouched])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_outlier_removal_leaves_a_clean_signal_alone(noise: float) -> None:
+    clean = drive_signal() + noise * np.random.default_rng(0).standard_normal(2000)
+    out = RemoveOutliers()(recorded(ay=clean))["ay"]
+    assert np.mean(out == clean) > 0.99  # six deviations of eleven normal samples: a few in a thousand
+    if noise == 0.0:
+        np.testing.assert_array_equal(out, clean)
+
+
+def test_outlier_removal_keeps_steps_ramps_and_quantised_ramps() -> None:
+    for samples in (np.repeat([0.0, 5.0], 50), np.arange(100.0), np.round(np.arange(100.0) / 7.0), np.full(100, 2.0)):
+        np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], samples)
+
+
+def test_outlier_removal_keeps_the_peak_of_a_slide_and_removes_a_glitch_on_it() -> None:
+    """A slide of 10 degrees within half a second, noise of an optical sensor."""
+    time = np.arange(300) / RATE
+    slide = np.radians(10.0) * np.exp(-np.square((time - 1.5) / 0.25)) + 1e-3 * np.random.default_rng(1).standard_normal(300)
+    spoilt = slide.copy()
+    spoilt[150] += 0.2
+    cleaned = RemoveOutliers()(recorded(ay=spoilt))["ay"]
+    assert abs(cleaned[150] - slide[150]) < 0.005
+    assert np.delete(cleaned, 150).max() == np.delete(slide, 150).max()
+    assert (np.delete(cleaned == slide, 150)).mean() > 0.98
+
+
+def test_outlier_removal_removes_a_spike_from_a_channel_at_rest() -> None:
+    samples = np.zeros(50)
+    samples[20] = 9.0
+    np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], np.zeros(50))
+
+
+@PROPERTY
+@given(st.integers(1, 14), st.integers(1, 8), st.data())
+def test_outlier_removal_of_short_recordings_stays_within_their_values(length: int, half_window: int, data: st.DataObject) -> None:
+    samples = data.draw(arrays(np.float64, length, elements=st.floats(-10, 10)))
+    out = RemoveOutliers(half_window)(recorded(ay=samples))["ay"]
+    assert len(out) == length
+    assert out.min() >= samples.min()
+    assert out.max() <= samples.max()
+
+
+@pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
+def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
+    with pytest.raises(ConfigurationError, match="half_window"):
+        RemoveOutliers(**arguments)  # type: ignore[arg-type]
+
+
+def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, np.ndarray, np.ndarray]:
+    """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
+
+    The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
+    """
+    time, step = np.arange(800) / RATE, 2e-4
+    lever, turn = complex(lever_x, lever_y), np.exp(1j * yaw)  # the plane as complex numbers
+
+    def heading(at: np.ndarray) -> np.ndarray:
+        return 0.4 * at + 0.5 * np.sin(1.5 * at)
+
+    def centre(at: np.ndarray) -> np.ndarray:
+        return 20.0 * at + 3.0 * np.sin(0.7 * at) + 5.0j * np.cos(0.5 * at)
+
+    def sensor(at: np.ndarray) -> np.ndarray:
+        return centre(at) + lever * np.exp(1j * heading(at))
+
+    def acceleration(position: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """In the vehicle's axes."""
+        return (position(time + step) - 2 * position(time) + position(time - step)) / step**2 * np.exp(-1j * heading(time))
+
+    truth, measured = acceleration(centre), acceleration(sensor) / turn
+    channels = {"ax": measured.real, "ay": measured.imag, "yaw_rate": 0.4 + 0.75 * np.cos(1.5 * time)}
+    return Recording("lap", "car", RATE, 0.0, channels), truth.real, truth.imag
+
+
+@pytest.mark.parametrize(("lever_x", "lever_y", "yaw"), [(0.0, 0.0, 0.2), (1.3, 0.0, 0.0), (0.0, -0.6, 0.0), (-0.8, 0.5, -0.15)])
+def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever_y: float, yaw: float) -> None:
+    recording, true_ax, true_ay = rigid_body(lever_x, lever_y, yaw)
+    corrected = MountingCorrection(lever_x, lever_y, yaw)(recording)
+    inside = slice(1, -1)  # central differences of the yaw rate
+    np.testing.assert_allclose(corrected["ax"][inside], true_ax[inside], atol=1e-4)
+    np.testing.assert_allclose(corrected["ay"][inside], true_ay[inside], atol=1e-4)
+    before = max(np.abs(recording["ax"] - true_ax).max(), np.abs(recording["ay"] - true_ay).max())
+    assert before > 0.1
+    assert MountingCorrection(lever_x, lever_y, yaw).mode == ("causal" if lever_x == lever_y == 0.0 else "offline")
+
+
+def test_mounting_correction_of_one_sample_knows_the_centripetal_part() -> None:
+    recording = recorded(ax=np.array([1.0]), ay=np.array([2.0]), yaw_rate=np.array([0.5]))
+    corrected = MountingCorrection(lever_x=2.0, lever_y=-1.0)(recording)
+    assert corrected["ax"].tolist() == [1.0 + 0.25 * 2.0]
+    assert corrected["ay"].tolist() == [2.0 - 0.25 * 1.0]
+
+
+def test_filters_and_corrections_refuse_channels_with_gaps() -> None:
+    channels = {name: np.array([0.0, np.nan, 1.0, 2.0]) for name in ("ax", "ay", "yaw_rate")}
+    recording = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset(channels))
+    for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0)):
+        with pytest.raises(DataError, match="has gaps and cannot be filtered"):
+            transform(recording)
+
+
+def test_a_missing_channel_is_named() -> None:
+    for transform in (LowPass(5.0, channels=("vx",)), RemoveOutliers(channels=("vx",)), MountingCorrection(1.0)):
+        with pytest.raises(DataError, match=r"no channel '(vx|ax)'"):
+            transform(recorded(ay=np.zeros(20)))
+
+
+def test_transforms_leave_the_recording_they_are_given_alone() -> None:
+    recording, *_ = rigid_body(1.0, 0.0, 0.0)
+    before = {name: samples.copy() for name, samples in recording.channels.items()}
+    for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0), Resample(20.0)):
+        out = transform(recording)
+        assert (out.id, out.start_time, out.vehicle) == (recording.id, recording.start_time, recording.vehicle)
+    for name, samples in before.items():
+        np.testing.assert_array_equal(recording[name], samples)
+
+
+def test_transforms_are_built_from_plain_values() -> None:
+    assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}) == LowPass(5, ("ax", "ay"))
+    assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
+    assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
+    # Those of an alignment are built from plain values in test_alignment.py.
+    of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
+    assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
+    others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
+    assert set(TRANSFORMS) == others | of_an_alignment
+
+
+@pytest.mark.parametrize(
+    ("config", "what"),
+    [
+        ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
+        ({}, "'None' is not one of"),
+        ({"name": "low_pass"}, "cutoff_hz"),
+        ({"name": "low_pass", "cutoff_hz": 5.0, "cutof": 1}, "cutof"),
+        ({"name": "low_pass", "cutoff_hz": 5.0, "direction": "backward"}, "causal, zero_phase"),
+        ({"name": "resample", "rate_hz": "fast"}, "resample"),
+        ({"name": "speed_from_wheels", "wheel_radius": 0, "track_front": 2, "track_rear": 2}, "wheel_radius must be a positive number"),
+    ],
+)
+def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        transform_from_config(config)
+    assert what in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
+
+
+def rolling(**shown: np.ndarray) -> tuple[Recording, np.ndarray]:
+    """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
+    time = np.arange(2000) / RATE
+    u = 8.0 + 3.0 * np.sin(0.7 * time)
+    yaw_rate, steer = 0.3 * np.sin(0.9 * time), 0.2 * np.sin(0.9 * time)
+    sides = {"fl": 1.05, "fr": -1.05, "rl": 1.0, "rr": -1.0}
+    wheels = {f"wheel_speed_{place}": (u - yaw_rate * side) / 0.48 for place, side in sides.items()}
+    for place in ("fl", "fr"):
+        wheels[f"wheel_speed_{place}"] /= np.cos(steer)
+    channels = {"yaw_rate": yaw_rate, "steer": steer, "ax": 2.1 * np.cos(0.7 * time), **wheels} | shown
+    gappy = frozenset(name for name, samples in channels.items() if np.isnan(samples).any())
+    return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
+
+
+def damaged(value: float, *wheels: str, start: int = 500, stop: int = 650) -> tuple[Recording, np.ndarray]:
+    """The same with some wheels that show another value for a while."""
+    whole, _ = rolling()
+    broken = {}
+    for wheel in wheels:
+        broken[f"wheel_speed_{wheel}"] = np.array(whole[f"wheel_speed_{wheel}"])
+        broken[f"wheel_speed_{wheel}"][start:stop] = value
+    return rolling(**broken)
+
+
+def test_speed_from_wheels_inverts_what_rolling_wheels_do() -> None:
+    drive, u = rolling()
+    np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
+
+
+@pytest.mark.parametrize("value", [0.0, 60.0, math.nan])
+def test_a_wheel_that_drops_out_or_spins_does_not_count(value: float) -> None:
+    drive, u = damaged(value, "fl")
+    np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
+    assert not WHEELS.plausible(drive)[0, 500:650].any()
+    assert WHEELS.plausible(drive)[1:].all()
+
+
+@pytest.mark.parametrize("wheels", [("rl", "rr"), ("fl", "fr", "rl"), ("fl", "fr", "rl", "rr")])
+def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels: tuple[str, ...]) -> None:
+    drive, u = damaged(math.nan if len(wheels) == 4 else 0.0, *wheels)
+    vx = WHEELS(drive)["vx"]
+    limited = np.abs(vx - u).max()
+    assert np.isfinite(vx).all()
+    assert limited < (0.1 if len(wheels) != 3 else 12.0)  # three that agree on zero outvote one: what remains is the limit of acceleration
+    assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
+
+
+def test_speed_from_wheels_knows_no_later_samples() -> None:
+    drive, _ = damaged(0.0, "rl", "rr")
+    np.testing.assert_array_equal(WHEELS(drive.cut(3.0, 9.0))["vx"], WHEELS(drive)["vx"][:600])
+
+
+def test_wheels_that_were_never_measured_are_refused() -> None:
+    missing = np.full(2000, math.nan)
+    with pytest.raises(DataError, match="no wheel speed was measured"):
+        WHEELS(rolling(yaw_rate=missing)[0])
+
+
+def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:
+    generator = np.random.default_rng(0)
+    return Recording("lap", "car", rate_hz, 0.0, {name: generator.normal(0.0, 1.0, n_samples) for name in ("vx", "ay")})
+
+
+@pytest.mark.parametrize(
+    ("config", "limit"),
+    [
+        ({"name": "resample", "rate_hz": 1e9}, "samples"),
+        ({"name": "resample", "rate_hz": 1e300}, "samples"),
+        ({"name": "resample", "rate_hz": 4e6}, "filter_samples"),
+        ({"name": "low_pass", "cutoff_hz": 1e-9}, "filter_samples"),
+        ({"name": "low_pass", "cutoff_hz": 1e-300, "direction": "causal"}, "filter_samples"),
+        ({"name": "low_pass", "cutoff_hz": 5, "design": "fir", "reach": 1e9}, "filter_samples"),
+        ({"name": "low_pass", "cutoff_hz": 5, "design": "fir", "reach": 1e308}, "filter_samples"),
+        ({"name": "remove_outliers", "half_window": 10**9}, "filter_samples"),
+        ({"name": "remove_outliers", "half_window": 10**30}, "filter_samples"),
+        ({"name": "remove_outliers", "half_window": 499_999, "channels": "long"}, "values"),
+    ],
+    ids=str,
+)
+def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config: dict[str, object], limit: str) -> None:
+    long = config.get("channels") == "long"
+    with pytest.raises(VehestError) as error:
+        transform_from_config({key: value for key, value in config.items() if value != "long"})(lap(n_samples=600 if long else 400))
+    assert f"limits.{limit}=NUMBER" in str(error.value)
+    assert "recording 'lap'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("delay", [1e9, -1e9, 1e308, 4.0, -4.0])
+def test_a_delay_beyond_the_recording_is_refused(delay: float) -> None:
+    with pytest.raises(DataError, match=r"recording 'lap' lasts 4 s, too short to be shifted by"):
+        transform_from_config({"name": "delay_correction", "delay": delay})(lap())
+
+
+def test_a_rate_that_leaves_nothing_is_refused() -> None:
+    with pytest.raises(DataError, match="is not a ratio of whole numbers"):
+        Resample(1e-9)(lap())
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ({"name": "low_pass", "cutoff_hz": "5"}, "cutoff_hz must be a number, not '5'"),
+        ({"name": "remove_outliers", "half_window": 2.5}, "half_window must be a whole number, not 2.5"),
+        ({"name": "mounting_correction", "yaw": [1]}, "yaw must be a number"),
+        ({"name": "resample", "rate_hz": True}, "rate_hz must be a number, not True"),
+        ({"name": ["resample"]}, "is not one of"),
+    ],
+)
+def test_an_argument_of_the_wrong_type_is_named(config: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        transform_from_config(config)
+    assert said in str(error.value)
+
+
+def test_outlier_removal_in_pieces_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
+    monkeypatch.setattr(transforms, "VALUES_AT_ONCE", 40)
+    np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)
+
+
+def test_a_long_symmetric_low_pass_is_that_of_its_direct_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+    low_pass = LowPass(2.0, design="fir", reach=50.0)
+    through_spectra = low_pass(lap(n_samples=12_000))["ay"]
+    monkeypatch.setattr(transforms, "LONGEST_DIRECT", 20_000)
+    np.testing.assert_allclose(through_spectra, low_pass(lap(n_samples=12_000))["ay"], atol=1e-12)
+
+
+def test_a_window_longer_than_the_limit_is_refused() -> None:
+    with pytest.raises(
+        DataError, match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples"
+    ):
+        windows_of([lap()], ["vx"], "ay", 2_000_000)

@@ -1,0 +1,227 @@
+"""What keeps files from asking for too much: limits, text, schemas, names."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
+from vehest.data.files import file_name, regular_file
+from vehest.data.limits import Limits, check_limit, check_unpacked, current_limits, limits_from_config, use_limits
+from vehest.data.schema import FURTHER_KEYS, validated
+from vehest.data.text_files import parse_json, parse_yaml, read_text, read_yaml
+from vehest.stages.config import compose_config
+
+
+@dataclass(frozen=True)
+class Inner:
+    gain: float
+    steps: int = 3
+
+
+@dataclass(frozen=True)
+class Outer:
+    name: str
+    inner: Inner
+    many: dict[str, Inner]
+    bounds: tuple[float, float] | None = None
+    on: bool = False
+
+
+GOOD = {"name": "a", "inner": {"gain": 1}, "many": {"x": {"gain": 0.5, "steps": 4.0}}, "bounds": [0, 1.5]}
+
+
+def test_plain_values_become_dataclasses():
+    assert validated(Outer, GOOD, "'f'") == Outer("a", Inner(1.0), {"x": Inner(0.5, 4)}, (0.0, 1.5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": 3}, "'f': name must be text, not 3"),
+        ({"inner": 3}, "'f': inner must be a group of options, not 3"),
+        ({"inner": {"gain": True}}, "'f': inner.gain must be a number, not True"),
+        ({"inner": {"gain": float("nan")}}, "'f': inner.gain must be a number, not nan"),
+        ({"inner": {"gain": "1"}}, "'f': inner.gain must be a number, not '1'"),
+        ({"inner": {"gain": 1, "steps": 1.5}}, "'f': inner.steps must be a whole number, not 1.5"),
+        ({"inner": {}}, "'f': inner.gain is missing"),
+        ({"inner": {"gain": 1, "stepz": 1}}, "'f': inner.stepz is not an option of inner; options: gain, steps"),
+        ({"other": 1}, "'f': unknown key 'other'; there are: name, inner, many, bounds, on"),
+        ({"many": [1]}, "'f': many must be a mapping"),
+        ({"on": 1}, "'f': on must be true or false, not 1"),
+        ({"name": {1, 2}}, "'f': name is no plain value but a set"),
+    ],
+)
+def test_what_does_not_fit_a_schema_is_one_line(change, message):
+    with pytest.raises(DataError) as caught:
+        validated(Outer, GOOD | change, "'f'")
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Kinds:
+    names: Annotated[tuple[str, ...], "a list of names"] = ()
+    inner: tuple[Inner | None, ...] = ()
+    lists: tuple[tuple[int, ...], ...] | None = None
+    pair: tuple[float, str] | None = None
+    files: str | tuple[str, ...] = "*"
+    values: dict[str, int | float | bool | str | None] | None = None
+    rate: Annotated[float, "a number up to 5"] | None = None
+    maps: dict[str, dict[str, Inner]] | None = None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"names": "a"}, "it.names must be a list of names, not 'a'"),
+        ({"names": [3]}, "it.names.0 must be text, not 3"),
+        ({"inner": 3}, "it.inner must be a list of mappings, not 3"),
+        ({"inner": ["a"]}, "it.inner.0 must be a group of options, not 'a'; options: gain, steps"),
+        ({"inner": [{"gain": 1, "gian": 1}]}, "it.inner.0.gian is not an option of it.inner.0; options: gain, steps"),
+        ({"lists": 3}, "it.lists must be a list of lists of whole numbers, not 3"),
+        ({"lists": [3]}, "it.lists.0 must be a list of whole numbers, not 3"),
+        ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
+        ({"pair": [1, 2]}, "it.pair.1 must be text, not 2"),
+        ({"files": 3}, "it.files must be text or a list of text, not 3"),
+        ({"values": {"a": [1]}}, "it.values.a must be a number or true or false or text, not [1]"),
+        ({"rate": "x"}, "it.rate must be a number up to 5, not 'x'"),
+        ({"rate": float("nan")}, "it.rate must be a number up to 5, not nan"),
+        ({"maps": {"a": 3}}, "it.maps.a must be a mapping, not 3"),
+        ({"maps": {"a": {"b": 3}}}, "it.maps.a.b must be a group of options, not 3; options: gain, steps"),
+    ],
+)
+def test_a_refusal_says_what_the_type_of_the_key_takes(content, message):
+    with pytest.raises(ConfigurationError) as caught:
+        validated(Kinds, content, "", error=ConfigurationError, group="it")
+    assert str(caught.value) == message
+
+
+def test_a_schema_may_take_further_keys():
+    @dataclass(frozen=True)
+    class Loose:
+        __pydantic_config__ = FURTHER_KEYS
+        name: str
+
+    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
+
+
+def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
+    file = tmp_path / "bomb.yaml"
+    file.write_text("\n".join(lines))
+    started = time.process_time()
+    with pytest.raises(DataError, match=r"bomb.yaml' holds more than 500000 values"):
+        read_yaml(file)
+    assert time.process_time() - started < 5.0  # processor time of a bomb that would take hours
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: &a [*a]", "repeats 'a' inside itself"),
+        ("[" * 100 + "]" * 100, "nests deeper than 60 levels"),
+        ("a: [1", "cannot be read as YAML"),
+        ("a: !!python/object/apply:os.system ['true']", "cannot be read as YAML"),
+        ("a: 2020-13-45", "cannot be read as YAML"),
+        ("a: *nothing", "cannot be read as YAML"),
+    ],
+)
+def test_yaml_that_is_none_is_one_line(text, message):
+    with pytest.raises(DataError, match=message):
+        parse_yaml(text, "'f'")
+
+
+def test_honest_yaml_with_anchors_is_read():
+    assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
+
+
+@pytest.mark.parametrize("text", ["[" * 100000, '{"a": ' * 70 + "1" + "}" * 70, "{", "1" * 5000, b"\xff\xfe"])
+def test_json_that_is_none_is_one_line(text):
+    with pytest.raises(DataError, match=r"cannot be read as JSON|nests deeper"):
+        parse_json(text, "'f'")
+
+
+def test_only_regular_files_are_read(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path, message in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
+        with pytest.raises(DataError, match=message):
+            regular_file(path)
+    for path in (tmp_path / "none", tmp_path / "none" / "x"):
+        with pytest.raises(MissingError):
+            regular_file(path)
+    with pytest.raises(DataError):
+        regular_file(Path("a" * 5000))
+
+
+def test_text_is_utf8_and_of_bounded_length(tmp_path):
+    (tmp_path / "latin").write_bytes("ä".encode("latin-1"))
+    (tmp_path / "long").write_text("x" * 100)
+    with pytest.raises(DataError, match="is not UTF-8 text"):
+        read_text(tmp_path / "latin")
+    with (
+        use_limits(Limits(text_bytes=50)),
+        pytest.raises(DataError, match=r"long' is 100 bytes long, more than the limit of 50; .*limits.text_bytes"),
+    ):
+        read_text(tmp_path / "long")
+
+
+def test_limits_come_from_a_configuration_and_end_with_their_block():
+    with use_limits(limits_from_config({"samples": 5})):
+        assert current_limits().samples == 5
+        with pytest.raises(DataError, match=r"6 samples, more than the limit of 5"):
+            check_limit("samples", 6, "'f' holds 6 samples")
+    assert current_limits() == Limits()
+    for wrong in ({"sample": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
+        with pytest.raises(ConfigurationError, match=r"limits\.sample"):
+            limits_from_config(wrong)
+
+
+def test_the_configuration_names_every_limit_with_its_default():
+    assert limits_from_config(compose_config("ingest", ["dataset=tabular"])["limits"]) == Limits()
+
+
+def test_a_file_may_not_unpack_to_hundreds_of_times_its_size():
+    check_unpacked("f", 1000, 60 * 2**20)
+    check_unpacked("f", 2**20, 200 * 2**20)
+    with pytest.raises(DataError, match="times its size"):
+        check_unpacked("f", 1000, 100 * 2**20)
+    with pytest.raises(DataError, match="bytes"):
+        check_unpacked("f", 2**40, 2**41)
+
+
+def test_an_hour_at_1_khz_stays_below_half_of_the_limits():
+    assert Limits().samples > 2 * 3600 * 1000
+    assert Limits().values > 2 * 3600 * 1000 * 55
+
+
+@given(st.text(max_size=300))
+def test_whatever_a_name_holds_it_stays_one_component(name):
+    made = file_name(name, ".csv")
+    assert Path(made).name == made
+    assert not made.startswith(".")
+    assert len(made.encode()) < 140
+    assert made == file_name(name, ".csv")
+
+
+@given(st.text(max_size=40), st.text(max_size=40))
+def test_different_names_stay_different(one, other):
+    assert (file_name(one) == file_name(other)) == (one == other)
+
+
+def test_plain_names_stay_as_they_are():
+    assert file_name("ksnn-linear_bias_p2-seed0", ".csv") == "ksnn-linear_bias_p2-seed0.csv"
+
+
+def test_escapes_for_the_terminal_are_shown_not_obeyed():
+    assert printable("a\x1b[31mb\r\n\u202e") == "a\\x1b[31mb\\r\\n\\u202e"
+    assert printable("größe β °") == "größe β °"
+    assert printable("\udcff") == "\\udcff"

@@ -1,0 +1,143 @@
+"""Baselines: closed forms, one sample at a time, what they refuse."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from conftest import planar_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.registry import estimator_class
+from vehest.training.nothing import NoTraining
+from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.single_track import lateral_dynamics
+
+BASELINES = ("zero", "static_map", "kinematic", "data_sheet")
+
+
+def new(name: str, **settings: float):
+    given = {"rate_hz": 20.0, **({"wheelbase": 2.4} if name == "data_sheet" else {}), **settings}
+    return estimator_class(name).from_config(given)
+
+
+def fitted(name: str, drive: Recording, **settings: float):
+    estimator = new(name, **settings)
+    record = estimator.fit(FitData([drive], [drive]), NoTraining())
+    return estimator, record
+
+
+def steady_drive(car: SingleTrackParameters, seconds: float = 30.0) -> Recording:
+    """Steady cornering of the linear single track at several speeds and steering angles: v and r solve 0 = A x + B δ at each sample."""
+    generator = np.random.default_rng(3)
+    vx = generator.uniform(8.0, 35.0, round(20 * seconds))
+    steer = generator.uniform(-0.05, 0.05, len(vx))
+    matrix, steering = (part.numpy() for part in lateral_dynamics(car, torch.as_tensor(vx)))
+    states = -np.linalg.solve(matrix, (steering * steer[:, None])[..., None])[..., 0]
+    channels = {"vx": vx, "yaw_rate": states[:, 1], "ay": vx * states[:, 1], "vy_ref": vx * states[:, 0]}
+    return Recording("steady", "car", 20.0, 0.0, channels, "simulated")
+
+
+CAR = SingleTrackParameters(1000.0, 1600.0, 1.2, 1.3, 8.0e4, 1.1e5)
+
+
+def test_static_map_finds_the_two_numbers_of_a_linear_single_track():
+    estimator, record = fitted("static_map", steady_drive(CAR))
+    assert estimator.values["b"] == pytest.approx(CAR.cg_to_rear_axle, rel=1e-9)
+    wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
+    assert estimator.values["k"] == pytest.approx(CAR.mass * CAR.cg_to_front_axle / (wheelbase * CAR.cornering_stiffness_rear), rel=1e-9)
+    assert record.metrics["best_train_loss"] == pytest.approx(0.0, abs=1e-18)
+
+
+def test_data_sheet_is_exact_on_a_car_with_the_stiffness_it_assumes():
+    drive = steady_drive(CAR)
+    wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
+    coefficient = CAR.cornering_stiffness_rear / (CAR.mass * 9.81 * CAR.cg_to_front_axle / wheelbase)
+    estimator = new("data_sheet", wheelbase=wheelbase, cg_to_rear_axle=CAR.cg_to_rear_axle, cornering_coefficient=coefficient)
+    (estimate,) = estimator.estimate([drive.without_references()])
+    np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
+
+
+def test_kinematic_integration_is_the_solution_of_its_equation():
+    drive = planar_drive(20.0)
+    estimator = new("kinematic")
+    estimator.values = {"time_constant": 2.5}
+    (estimate,) = estimator.estimate([drive.without_references()])
+    rate = drive["ay"] - drive["vx"] * drive["yaw_rate"]
+
+    def derivative(t: float, v: np.ndarray) -> np.ndarray:
+        return np.array([rate[min(int(np.floor(t * 20.0 + 1e-9)) + 1, len(rate) - 1)] - v[0] / 2.5])  # held from the sample before
+
+    start = estimate["vy"][0]
+    solved, times = [start], drive.time - drive.time[0]
+    for begin, end in itertools.pairwise(times):
+        solved.append(solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[0, -1])
+    np.testing.assert_allclose(estimate["vy"], solved, atol=1e-8)
+
+
+def test_kinematic_integration_finds_the_time_constant_that_made_the_data():
+    truth = new("kinematic")
+    truth.values = {"time_constant": 1.7}
+    drive = planar_drive(60.0)
+    vy = truth.estimate([drive.without_references()])[0]["vy"]
+    made = Recording("made", "car", 20.0, 0.0, {**drive.channels, "vy_ref": vy}, "simulated")
+    estimator, record = fitted("kinematic", made)
+    assert estimator.values["time_constant"] == pytest.approx(1.7, rel=1e-4)
+    assert record.metrics["best_validation_loss"] < 1e-8
+
+
+def test_zero_is_zero(drive):
+    (estimate,) = new("zero").estimate([drive.without_references()])
+    assert not estimate["vy"].any()
+    assert not estimate["sideslip"].any()
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_online_and_batch_agree_and_weights_come_back(name, drive):
+    estimator, record = fitted(name, drive)
+    again = new(name)
+    again.load_weights(estimator.weights())
+    (estimate,) = again.estimate([drive.without_references()])
+    stepper = again.online()
+    steps = [stepper.step({channel: drive[channel][k] for channel in again.channels})["vy"] for k in range(len(drive))]
+    np.testing.assert_allclose(steps, estimate["vy"], rtol=1e-12, atol=1e-14)
+    assert again.n_parameters == len(estimator.values)
+    assert record.metrics["epochs"] == 0
+
+
+def test_what_does_not_determine_a_static_map_is_refused(drive):
+    straight = Recording("straight", "car", 20.0, 0.0, {**drive.channels, "yaw_rate": np.zeros(len(drive))}, "simulated")
+    one_speed = Recording("one speed", "car", 20.0, 0.0, {**drive.channels, "vx": np.full(len(drive), 20.0)}, "simulated")
+    for recording in (straight, one_speed):
+        with pytest.raises(DataError, match="do not determine a static map"):
+            fitted("static_map", recording)
+
+
+def test_gaps_and_missing_channels_are_refused(drive):
+    without = drive.select([name for name in drive.channels if name != "ay"])
+    with pytest.raises(DataError, match="no channel 'ay'"):
+        fitted("kinematic", without)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "needs your car's wheelbase"),
+        ({"wheelbase": -1}, "wheelbase must be positive"),
+        ({"wheelbase": 2.4, "cg_to_rear_axle": 3.0}, "between 0 and the wheelbase"),
+        ({"wheelbase": 2.4, "cornering_coefficient": 0}, "cornering_coefficient must be positive"),
+    ],
+)
+def test_a_data_sheet_that_makes_no_sense_is_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        estimator_class("data_sheet").from_config({"rate_hz": 20.0, **settings})
+
+
+def test_nothing_runs_online_before_it_is_fitted():
+    with pytest.raises(ConfigurationError, match="has not been fitted"):
+        new("static_map").online()

@@ -1,0 +1,206 @@
+"""The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre forces and without."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dugoff_drive import NOISE, TYRES, dugoff_drive
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
+from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.filtering.track_filter import groups_of, in_nonlinear_range
+from vehest.filters.noise_levels import quiet_level
+from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
+from vehest.training.search import staged_optuna_search
+
+LEVELS = {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 1e-3, "process_yaw_rate": 1e-3}
+FORCES = {"force_factor": 1.5, "fy_front": 100.0, "fy_rear": 100.0}
+QUICK = IdentificationSettings(method="data", tyres_from="*", restarts=2, generations=40)
+
+
+def given(inputs: str = "full", **settings: object) -> DugoffUkf:
+    """A filter that knows the car it is on."""
+    noise = LEVELS | (FORCES if inputs == "full" else {})
+    return DugoffUkf.from_config({"inputs": inputs, "tyres": TYRES, "noise": noise, **settings})
+
+
+def changed(drive: Recording, channels: dict[str, np.ndarray], gappy: tuple[str, ...] = ()) -> Recording:
+    return replace(drive, channels={**drive.channels, **channels}, gappy=frozenset(gappy))
+
+
+def error_of(estimator: DugoffUkf, drive: Recording) -> float:
+    """Root mean square of the sideslip's error after a second [rad]."""
+    estimate = estimator.estimate([drive.without_references()])[0]
+    return float(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)))
+
+
+def test_the_fit_finds_tyres_and_sensors_noise():
+    drives = [dugoff_drive(30.0, seed, straight=5.0) for seed in (1, 2)]
+    estimator = DugoffUkf.from_config({})
+    record = estimator.fit(FitData(drives, [dugoff_drive(10.0, 3)]), QUICK)
+    for name in ("cornering_stiffness_front", "friction_front", "cornering_stiffness_rear", "friction_rear"):
+        assert record.metrics[name] == pytest.approx(TYRES[name], rel=0.05), name
+        assert record.metrics[f"{name}_spread"] < 0.02 * TYRES[name]
+    assert record.metrics["noise_ay"] == pytest.approx(NOISE["ay"], rel=0.2)
+    assert record.metrics["noise_fy_front"] == pytest.approx(NOISE["fy"] * np.sqrt(2.0), rel=0.2)
+    assert record.metrics["best_validation_loss"] < np.radians(0.3) ** 2
+    assert estimator.n_parameters == 6 + 7
+
+
+def test_tyres_are_found_without_measured_forces():
+    drives = [dugoff_drive(25.0, seed) for seed in (1, 2)]
+    estimator = DugoffUkf.from_config({"inputs": "imu"})
+    estimator.fit(FitData([drive.select([n for n in drive.channels if not n.startswith("fy")]) for drive in drives], []), QUICK)
+    assert estimator.tyres[0] == pytest.approx(TYRES["cornering_stiffness_front"], rel=0.1)
+    assert estimator.channels == ("yaw_rate", "vx", "ay", "steer", "ax")
+
+
+@pytest.mark.parametrize("inputs", ["full", "imu"])
+def test_the_filter_follows_the_car_and_knows_how_well(inputs):
+    drive = dugoff_drive(20.0, 5)
+    estimator = given(inputs)
+    assert error_of(estimator, drive) < np.radians(0.2)
+    estimate = estimator.estimate([drive.without_references()])[0]
+    assert estimate.covariance_of == ("vy", "yaw_rate")
+    error = (estimate["vy"] - drive["vy_ref"])[100:] / np.sqrt(estimate.covariance[100:, 0, 0])
+    assert 0.2 < np.sqrt(np.mean(error**2)) < 2.0
+    assert set(estimate["nis_dof"]) == ({4.0} if inputs == "full" else {2.0})
+
+
+def test_drives_of_different_length_are_estimated_as_alone():
+    drives = [dugoff_drive(seconds, seed).without_references() for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))]
+    estimator = given()
+    for together, drive in zip(estimator.estimate(drives), drives, strict=True):
+        np.testing.assert_array_equal(together["vy"], estimator.estimate([drive])[0]["vy"])
+    assert list(groups_of([3, 5, 3], 10)) == [[1, 0], [2]]
+    assert list(groups_of([30, 5], 10)) == [[0], [1]]
+
+
+@pytest.mark.parametrize("inputs", ["full", "imu"])
+def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
+    drive = dugoff_drive(6.0, 7)
+    gap, slow = drive["ay"].copy(), drive["vx"].copy()
+    gap[150:220] = np.nan
+    slow[300:380] = np.linspace(20.0, -1.0, 80)
+    slow[380:420] = np.linspace(-1.0, 15.0, 40)
+    drive = changed(drive, {"ay": gap, "vx": slow, "fy_fl": np.where(np.arange(600) % 7, drive["fy_fl"], np.nan)}, ("ay", "fy_fl"))
+    estimator = given(inputs)
+    batch = estimator.estimate([drive.without_references()])[0]
+    stepper = estimator.online()
+    online = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(len(drive))]
+    for name in ("vy", "yaw_rate"):
+        np.testing.assert_allclose([row[name] for row in online], batch[name], rtol=0.0, atol=1e-9)
+    assert np.isfinite(batch["sideslip"]).all()
+    assert batch["nis_dof"][160] == (3.0 if inputs == "full" else 1.0)
+    rolling = np.flatnonzero(drive["vx"] < 3.0)
+    assert (batch["nis_dof"][rolling] == 0.0).all()
+    np.testing.assert_allclose(batch["yaw_rate"][rolling[1:]], (drive["vx"] * drive["steer"])[rolling[1:] - 1] / 2.88, rtol=1e-12)
+
+
+def test_a_state_handed_over_is_where_the_estimate_starts():
+    drive = dugoff_drive(2.0, 7).without_references()
+    first = given().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
+    assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
+
+
+def test_forces_are_trusted_with_a_hysteresis():
+    ay = np.array([0.0, 3.9, -4.1, 3.5, np.nan, -3.1, 2.9, 3.9, 4.0])
+    expected = [False, False, True, True, True, True, False, False, True]
+    assert in_nonlinear_range(ay, 4.0, 3.0).tolist() == expected
+    whole = in_nonlinear_range(ay, 4.0, 3.0)
+    assert all(in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k] for k in range(1, len(ay)))
+    assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
+
+
+def test_process_noise_is_tuned_by_the_house_search():
+    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
+    drives = [dugoff_drive(4.0, seed) for seed in (1, 2)]
+    record = estimator.fit(FitData(drives, drives), IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=12))
+    untuned = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
+    before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
+    assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
+    assert record.metrics["evaluations"] == 12
+
+
+def test_sensors_levels_are_read_where_the_car_moves_and_tyres_where_loads_are_known():
+    drive, still = dugoff_drive(12.0, straight=4.0), np.arange(1200) >= 700
+    quiet = {
+        "ay": np.where(still, 0.0, drive["ay"]),
+        "vx": np.where(still, 0.0, drive["vx"]),
+        "steer": np.where(still, 0.0, drive["steer"]),
+    }
+    record = DugoffUkf.from_config({"inputs": "imu", "tyres": TYRES}).fit(FitData([changed(drive, quiet)], []), QUICK)
+    assert record.metrics["noise_ay"] > 0.8 * NOISE["ay"]
+    gap = changed(drive, {"ax": np.where(still, np.nan, drive["ax"])}, ("ax",))
+    with pytest.raises(DataError, match="recording 'drive': channel 'ax' has gaps"):
+        DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
+
+
+def test_levels_are_tuned_on_the_reference_that_is_scored():
+    drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
+    other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
+    losses = [given().fit(FitData([], [own]), data).metrics["best_validation_loss"] for own in (drive, other)]
+    assert losses[0] == losses[1]
+    blind = drive.select([name for name in drive.channels if name != "vy_ref"])
+    with pytest.raises(DataError, match="recording 'drive' has no vy_ref"):
+        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData([blind], []), IdentificationSettings(method="nelder_mead"))
+
+
+def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
+    """Going on identifies again; a network trained behind half a search would then meet another filter."""
+    drives = [dugoff_drive(3.0)]
+    estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
+    before = {name: values.copy() for name, values in estimator.weights().items() if name.startswith("network.")}
+    identification = IdentificationSettings(method="nelder_mead", grid=2, max_evaluations=3)
+    answers = iter([False])
+    context = FitContext(should_stop=lambda: next(answers, True))
+    record = estimator.fit(FitData(drives, drives), EndToEndSettings(identification=identification), context)
+    assert record.interrupted
+    assert record.metrics == {"best_epoch": 0}
+    assert all(np.array_equal(values, estimator.weights()[name], equal_nan=True) for name, values in before.items())
+
+
+def test_stages_search_wide_bounds_and_then_close_to_the_best():
+    pytest.importorskip("optuna", reason="needs optuna: pip install 'vehest[tuning]'")
+    search = staged_optuna_search(lambda x: float(np.sum((x - 0.7) ** 2)), [(-5.0, 1.0)] * 2, 30, 0, FitContext(), stages=2, shrink=0.2)
+    assert search.evaluations == len(search.starts) == 30
+    assert np.ptp(search.starts[:15, 0]) > 2.0
+    assert np.ptp(search.starts[15:, 0]) <= 1.2
+    assert search.starts[:, :2].max() <= 1.0
+    assert search.cost == search.starts[:, -1].min()
+
+
+def test_without_optuna_an_error_names_the_way_out(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    drives = [dugoff_drive(2.0)]
+    with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):
+        DugoffUkf.from_config({"tyres": TYRES}).fit(FitData(drives, drives), IdentificationSettings())
+
+
+def test_noise_is_read_where_little_happens():
+    generator = np.random.default_rng(0)
+    lively = np.concatenate([np.zeros(2000), np.sin(np.arange(2000) / 5.0)])
+    shown = [0.1 * np.arange(4000) + 3.0 * lively + 0.5 * generator.standard_normal(4000)]
+    assert quiet_level(shown, [lively], 50) == pytest.approx(0.5, rel=0.1)
+    with pytest.raises(ValueError, match="without a gap"):
+        quiet_level([np.full(100, np.nan)], [np.zeros(100)], 50)
+
+
+def test_what_makes_no_sense_is_refused():
+    with pytest.raises(ConfigurationError, match="linear_below must lie between"):
+        DugoffUkf.from_config({"linear_below": 5.0})
+    with pytest.raises(ConfigurationError, match=r"estimator\.tyres: give all"):
+        DugoffUkf.from_config({"tyres": {"friction_front": 1.0}})
+    with pytest.raises(ConfigurationError, match="has no tyres yet"):
+        DugoffUkf.from_config({}).online()
+    with pytest.raises(ConfigurationError, match="cg_height must be positive"):
+        DugoffUkf.from_config({"car": {"cg_height": -1.0}})
+    with pytest.raises(DataError, match=r"no training recording is called '\*skidpad\*'"):
+        DugoffUkf.from_config({}).fit(FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data"))

@@ -1,0 +1,270 @@
+"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+
+from conftest import planar_drive
+from dugoff_drive import TYRES
+from single_track_drive import linear_drive
+from small_car_drive import small_car_drive
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.transforms import Resample
+from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import EndToEndSettings
+from vehest.estimators.ensemble_ukf import EnsembleSettings
+from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.networks.velocity_recurrent import SequenceSettings
+from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
+from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import NoiseTuningSettings
+from vehest.training.nothing import NoTraining
+from vehest.training.samples import SampleSettings
+from vehest.training.search import DirectSearchSettings
+from vehest.training.sequences import PhaseSettings
+from vehest.training.supervised import SupervisedSettings
+from vehest.training.through_filter import ThroughFilterSettings
+
+VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
+SMALL = {"inputs": "imu", "hidden": [8, 4]}
+DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
+CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
+    "factor_graph": {"window": 0.05},
+    "data_sheet": {"wheelbase": 2.7},
+    "velocity_gru": VELOCITIES,
+    "velocity_lstm": VELOCITIES,
+    "learned_ukf": {"width": 8},
+    "dugoff_ukf": {"inputs": "imu", **DUGOFF},
+    "sideslip_ffnn": SMALL,
+    "ensemble_ukf": {"members": 2, **SMALL, **DUGOFF},
+    "cnn_ukf": {**SMALL, **DUGOFF},
+    "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
+}
+ONCE, GIVEN = PhaseSettings(max_epochs=1), IdentificationSettings(method="data")
+SAMPLED = {
+    SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
+    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
+    EndToEndSettings: lambda dtype: EndToEndSettings(ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype),
+}
+
+
+def _fitted(name, dtype="float64", **config):
+    if name == "factor_graph":
+        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
+    estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
+    estimator.seed(0)
+    if estimator.training_type is NoTraining:
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), NoTraining())
+    elif estimator.training_type is SequenceSettings:
+        training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
+        estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
+    elif estimator.training_type is ThroughFilterSettings:
+        once = PhaseSettings(learning_rate=5e-3, max_epochs=1)
+        training = ThroughFilterSettings(once, 100, once, once, steps=50, validation_steps=100, validation_drop_steps=20, dtype=dtype)
+        estimator.fit(FitData([small_car_drive(2.0)], [small_car_drive(1.5, 1)]), training)
+    elif estimator.training_type is NoiseTuningSettings:
+        estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
+    elif estimator.training_type is IdentificationSettings:
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), IdentificationSettings(method="data"))
+    elif estimator.training_type in SAMPLED:
+        training = SAMPLED[estimator.training_type](dtype)
+        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0, seed=1)[0]]), training)
+    elif name == "luenberger":
+        data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
+        estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
+    else:
+        data = FitData([planar_drive(20.0, noise=0.05)], [planar_drive(10.0, seed=1)])
+        estimator.fit(data, SupervisedSettings(max_epochs=2, dtype=dtype))
+    return estimator
+
+
+def _drive_for(estimator):
+    if "motor_current" in estimator.channels:
+        return small_car_drive(3.0, 4).without_references()
+    if "steer" in estimator.channels:
+        return linear_drive(12.0, estimator.settings.rate_hz, seed=4)[0].without_references()
+    return planar_drive(12.0, estimator.settings.rate_hz, seed=4, noise=0.02).without_references()
+
+
+def test_parameter_counts_are_those_of_the_paper():
+    """Tables III to V of Da Lio et al. 2023."""
+
+    def count(name, **config):
+        return estimator_class(name).from_config(config).n_parameters
+
+    for p in range(2, 7):
+        assert count("ksnn", n_local=p, n_hidden=0, bias=False) == 6 * p
+        assert count("ksnn", n_local=p, n_hidden=0, bias=True) == 8 * p
+        for q in (1, 2, 3):
+            assert count("ksnn", n_local=p, n_hidden=q, bias=False) == (4 * q + 6) * p
+            assert count("ksnn", n_local=p, n_hidden=q, bias=True) == (6 * q + 10) * p
+    assert count("ksnn", n_local=2, n_hidden=3, bias=False) == 36
+    assert count("ksnn", n_local=2, n_hidden=3, bias=True) == 56
+    assert [count("gru", n_states=n) for n in (2, 5, 6)] == [45, 156, 205]
+    assert [count("lstm", n_states=n) for n in (2, 5, 6)] == [59, 206, 271]
+    assert count("luenberger") == 2
+
+
+@pytest.mark.parametrize("name", estimator_names())
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
+def test_online_agrees_with_batch(name, dtype, tolerance):
+    estimator = _fitted(name, dtype)
+    drive = _drive_for(estimator)
+    batch = estimator.estimate([drive])[0]["vy"]
+    stepper = estimator.online()
+    online = np.full(len(drive) + stepper.horizon_steps, np.nan)
+    for k in range(len(drive)):
+        online[k + stepper.horizon_steps] = stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
+    online = online[: len(drive)]
+    assert np.array_equal(np.isnan(online), np.isnan(batch))
+    assert np.nanmax(np.abs(online - batch)) <= tolerance
+    assert np.isfinite(batch).sum() >= len(drive) - 30
+
+
+@pytest.mark.parametrize("name", estimator_names())
+def test_estimates_use_no_future_measurements(name):
+    estimator = _fitted(name)
+    drive = _drive_for(estimator)
+    half = len(drive) // 2
+    changed = {channel: np.concatenate([samples[:half], samples[half:] + 1.0]) for channel, samples in drive.channels.items()}
+    other = type(drive)(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, changed, drive.kind)
+    before, after = (estimator.estimate([recording])[0]["vy"][:half] for recording in (drive, other))
+    assert np.array_equal(before, after, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", estimator_names())
+def test_model_read_back_estimates_the_same(tmp_path, name):
+    estimator = _fitted(name, "float32")
+    save_model(estimator, tmp_path, {"seed": 0})
+    loaded = load_model(tmp_path)
+    drive = _drive_for(estimator)
+    one, other = estimator.estimate([drive])[0], loaded.estimate([drive])[0]
+    assert np.array_equal(one["vy"], other["vy"], equal_nan=True)
+    assert loaded.settings == estimator.settings
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["model.safetensors", "model.yaml"]
+
+
+def test_model_files_execute_nothing(tmp_path):
+    save_model(_fitted("luenberger"), tmp_path)
+    marker = tmp_path / "executed"
+    text = (tmp_path / "model.yaml").read_text()
+    (tmp_path / "model.yaml").write_text(text + f"evil: !!python/object/apply:os.mkdir ['{marker}']\n")
+    with pytest.raises(DataError, match="cannot be read as YAML"):
+        load_model(tmp_path)
+    assert not marker.exists()
+    (tmp_path / "model.yaml").write_text(text.replace("estimator: luenberger", "estimator: os.system"))
+    with pytest.raises(DataError, match=r"model\.yaml': estimator 'os\.system' is not one of"):
+        load_model(tmp_path)
+
+
+@pytest.mark.parametrize("size", [0, 40, -8])
+def test_truncated_weights_are_one_clear_error(tmp_path, size):
+    save_model(_fitted("ksnn"), tmp_path)
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:size])
+    with pytest.raises(DataError, match="truncated or damaged"):
+        load_model(tmp_path)
+
+
+def test_weights_of_another_structure_are_refused(tmp_path):
+    save_model(_fitted("ksnn"), tmp_path)
+    description = yaml.safe_load((tmp_path / "model.yaml").read_text())
+    description["settings"]["n_local"] = 4
+    (tmp_path / "model.yaml").write_text(yaml.safe_dump(description))
+    with pytest.raises(DataError, match="do not fit its settings"):
+        load_model(tmp_path)
+
+
+def test_folder_without_model_is_one_clear_error(tmp_path):
+    with pytest.raises(MissingError, match="holds no model"):
+        load_model(tmp_path)
+
+
+def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
+    estimator = _fitted("ksnn")
+    with pytest.raises(DataError, match="works at 20 Hz; resample it first"):
+        estimator.estimate([Resample(10).__call__(drive)])
+    with pytest.raises(DataError, match="no channel 'ax'"):
+        estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])])
+    gaps = {**drive.channels, "ay": np.where(np.arange(len(drive)) == 7, np.nan, drive["ay"])}
+    gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
+    with pytest.raises(DataError, match="has gaps"):
+        estimator.estimate([gappy])
+
+
+def test_sideslip_is_atan2_of_estimated_vy_and_measured_vx(drive):
+    estimate = _fitted("gru").estimate([drive.without_references()])[0]
+    assert np.array_equal(estimate["sideslip"], np.arctan2(estimate["vy"], drive["vx"]), equal_nan=True)
+
+
+def test_luenberger_starts_from_a_state_that_is_handed_over():
+    estimator = _fitted("luenberger")
+    estimator.threshold = 0.0
+    drive = _drive_for(estimator)
+    free = estimator.estimate([drive])[0]["vy"]
+    started = estimator.estimate([drive], {"vy": 2.0})[0]["vy"]
+    assert abs(started[0] - free[0]) > 1.0
+    assert abs(started[-1] - free[-1]) < 0.05, "the observer forgets where it started"
+
+
+def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
+    estimator = _fitted("luenberger")
+    drive = _drive_for(estimator)
+    states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
+    both = estimator.estimate([drive, drive], states)
+    for state, own in zip(states, both, strict=True):
+        assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
+    one = estimator.estimate([drive, drive], states[0])
+    assert np.array_equal(one[0]["vy"], one[1]["vy"])
+    with pytest.raises(DataError, match="2 initial states for 1 recordings"):
+        estimator.estimate([drive], states)
+    monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
+    assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
+
+
+def test_window_network_has_no_state_to_start_from(drive):
+    with pytest.raises(ConfigurationError, match="no state to start from"):
+        _fitted("ksnn").estimate([drive], {"vy": 1.0})
+
+
+def test_registry_knows_names_and_modules():
+    first = "cnn_ukf, data_sheet, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, kinematic, ksnn, learned_ukf, lstm, luenberger"
+    names = f"{first}, rational_ekf, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
+    assert ", ".join(sorted(estimator_names())) == names
+    assert estimator_module("ksnn") == "vehest.estimators.ksnn"
+    with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):
+        estimator_class("kalman_filter_from_the_future")
+    with pytest.raises(ConfigurationError, match="'windowed' is not one of"):
+        estimator_class("windowed")
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "message"),
+    [
+        ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
+        ("ksnn", {"n_hidden": -1}, "n_hidden must not be negative"),
+        ("ksnn", {"window": 0}, "window must be at least 1"),
+        ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
+        ("lstm", {"rate_hz": 0}, "rate_hz must be positive"),
+        ("luenberger", {"gain": 3}, "gain is not an option"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(name, config, message):
+    with pytest.raises(ConfigurationError, match=message):
+        estimator_class(name).from_config(config)
+
+
+def test_activations_partition_unity_and_end_with_the_last_model():
+    import torch
+
+    from vehest.estimators.ksnn import KinematicsStructuredNetwork, KsnnSettings
+
+    network = KinematicsStructuredNetwork(KsnnSettings(n_local=3), yaw_rate_max=0.6)
+    phi = network.activations(torch.tensor([0.0, 0.15, -0.3, 0.6, 2.0]))
+    assert torch.allclose(phi.sum(-1), torch.ones(5))
+    assert torch.allclose(phi[0], torch.tensor([1.0, 0.0, 0.0]))
+    assert torch.allclose(phi[1], torch.tensor([0.5, 0.5, 0.0]))
+    assert torch.allclose(phi[2], torch.tensor([0.0, 1.0, 0.0]), atol=1e-6)
+    assert torch.allclose(phi[4], torch.tensor([0.0, 0.0, 1.0]))

@@ -1,0 +1,177 @@
+"""The Kalman filter over the single track: consistent on its own model, honest about where its noise levels come from."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from single_track_drive import NOISE, linear_drive, with_gaps
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.estimators.base import FitData
+from vehest.estimators.kalman import KalmanFilter, KalmanSettings
+from vehest.estimators.registry import estimator_class
+from vehest.filters.noise_levels import high_passed_level
+from vehest.stages.config import compose_config
+from vehest.training.nothing import NoTraining
+from vehest.vehicle.parameters import FERRARI_250LM
+
+GIVEN = {"noise": {**NOISE, "steer_factor": 1.0}}
+
+
+def kalman(**config) -> KalmanFilter:
+    estimator = estimator_class("kalman").from_config(config)
+    assert isinstance(estimator, KalmanFilter)
+    return estimator
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    """NEES of two states averages 2 on the model's own drive; its mean over 20,000 correlated samples lies within 5 % of it.
+
+    The covariance is of (vy, r), as estimates hold it.
+    """
+    drive, states = linear_drive(200.0, seed=1)
+    estimate = kalman(**GIVEN).estimate([drive.without_references()])[0]
+    error = np.stack([estimate["vy"] - drive["vy_ref"], estimate["yaw_rate"] - states[:, 1]], axis=1)[100:]
+    nees = np.einsum("ti,tij,tj->t", error, np.linalg.inv(estimate.covariance[100:]), error)
+    assert nees.mean() == pytest.approx(2.0, rel=0.05)
+    assert np.allclose(estimate["sideslip"], np.arctan2(estimate["vy"], drive["vx"]))
+
+
+def test_levels_are_those_of_the_high_passed_training_signals():
+    drives = [linear_drive(60.0, seed=seed, noise={**NOISE, "steer": 1e-3})[0] for seed in (1, 2)]
+    estimator = kalman()
+    with pytest.raises(ConfigurationError, match="no noise levels yet"):
+        estimator.online()
+    record = estimator.fit(FitData(drives, []), NoTraining())
+    assert estimator.levels["ay"] == high_passed_level([drive["ay"] for drive in drives], 0.2)
+    assert estimator.levels["yaw_rate"] == pytest.approx(NOISE["yaw_rate"] * np.sqrt(0.8), rel=0.05)
+    assert record.metrics["epochs"] == 0
+    assert (estimator.n_parameters, estimator.learns, estimator.causal, estimator.variant) == (3, True, True, "kalman")
+
+
+def test_a_level_that_is_given_is_not_read():
+    estimator = kalman(noise={"ay": 0.7})
+    estimator.fit(FitData([linear_drive(60.0)[0]], []), NoTraining())
+    assert estimator.levels["ay"] == 0.7
+    assert estimator.n_parameters == 2
+
+
+def test_levels_of_the_recording_itself_make_the_estimate_offline():
+    drive = linear_drive(30.0, seed=3)[0].without_references()
+    own, trained = kalman(noise={"read_from": "recording"}), kalman()
+    trained.fit(FitData([drive], []), NoTraining())
+    one, other = own.estimate([drive])[0], trained.estimate([drive])[0]
+    assert np.array_equal(one["vy"], other["vy"])
+    assert (one.mode, other.mode) == ("offline", "causal")
+    assert (own.learns, own.n_parameters, own.variant) == (False, 0, "kalman_own_noise")
+    with pytest.raises(ConfigurationError, match="cannot run along with a drive"):
+        own.online()
+
+
+def test_levels_that_are_all_given_need_no_training():
+    estimator = kalman(**GIVEN)
+    assert (estimator.learns, estimator.causal, estimator.variant) == (False, True, "kalman_given_noise")
+    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
+
+
+def test_references_are_not_looked_at():
+    drive = linear_drive(30.0, seed=4)[0]
+    estimator = kalman()
+    estimator.fit(FitData([drive.without_references()], []), NoTraining())
+    assert np.isfinite(estimator.estimate([drive.without_references()])[0]["vy"]).all()
+
+
+def test_samples_that_are_missing_are_skipped():
+    """Without ay and yaw rate for 2 s the estimate goes on by the model alone, and knows that it knows less."""
+    drive, states = linear_drive(30.0, seed=5)
+    gappy = with_gaps(drive, {"ay": slice(1000, 1200), "yaw_rate": slice(1100, 1200)})
+    estimator = kalman(**GIVEN)
+    estimate = estimator.estimate([gappy])[0]
+    whole = estimator.estimate([drive])[0]
+    assert np.array_equal(estimate["vy"][:1000], whole["vy"][:1000])
+    assert np.abs(estimate["vy"] - whole["vy"])[2000:].max() < 1e-6, "the gap is forgotten"
+    assert (estimate.covariance[1100:1200, 0, 0] > 1.2 * whole.covariance[1100:1200, 0, 0]).all()
+    error = np.degrees(estimate["sideslip"] - states[:, 0])[1100:1200]
+    assert np.abs(error).max() < 2.0
+    stepper = estimator.online()
+    online = [stepper.step({name: gappy[name][k] for name in estimator.channels})["vy"] for k in range(1300)]
+    assert np.abs(np.array(online) - estimate["vy"][:1300]).max() < 1e-9
+
+
+def test_speed_and_steering_may_not_be_missing():
+    with pytest.raises(DataError, match="'vx' is NaN; only yaw_rate and ay may be missing"):
+        kalman(**GIVEN).online().step({"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0})
+    with pytest.raises(DataError, match="channel 'steer' has gaps"):
+        kalman(**GIVEN).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
+    with pytest.raises(DataError, match="no channel 'steer'"):
+        kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
+
+
+def test_a_car_that_stands_or_reverses_has_an_estimate():
+    drive = linear_drive(20.0, seed=6)[0]
+    slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
+    estimate = kalman(**GIVEN).estimate([type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)])[0]
+    assert np.isfinite(estimate["vy"]).all()
+    assert np.isfinite(estimate.covariance).all()
+
+
+def test_a_state_that_is_handed_over_is_believed():
+    drive = linear_drive(2.0)[0]
+    estimate = kalman(**GIVEN).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
+    assert estimate["vy"][0] == pytest.approx(2.0, abs=1e-3)
+    assert estimate["yaw_rate"][0] == pytest.approx(-0.3, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "samples", "message"),
+    [
+        ("steer", np.zeros(3000), "'linear': channel 'steer' has no noise that could be read off it; give estimator.noise.steer"),
+        ("ay", np.full(3000, np.nan), "channel 'ay': 75 samples without a gap are needed to read a noise level; give estimator.noise.ay"),
+    ],
+)
+def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
+    drive = linear_drive(30.0)[0]
+    wrong = type(drive)("linear", "car", 100.0, 0.0, {**drive.channels, name: samples}, "simulated", frozenset({"ay"}))
+    with pytest.raises(DataError, match=message):
+        kalman().fit(FitData([wrong], []), NoTraining())
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"noise": {"read_from": "elsewhere"}}, "read_from 'elsewhere' is not one of: training, recording"),
+        ({"noise": {"ay": -1}}, r"estimator\.noise\.ay must be positive"),
+        ({"noise": {"ay": "much"}}, r"estimator\.noise\.ay must be a number, not 'much'"),
+        ({"noise": {"cutoff": 1.5}}, "cutoff must lie between"),
+        ({"noise": {"gyro": 1}}, r"estimator\.noise\.gyro is not an option of estimator\.noise; options: read_from"),
+        ({"noise": 3}, r"estimator\.noise must be a group of options, not 3"),
+        ({"car": {"mass": 1000}}, r"estimator\.car\.yaw_inertia is missing"),
+        ({"car": {**asdict(FERRARI_250LM), "mass": -3}}, r"estimator\.car: mass must be positive, not -3"),
+        ({"car": {**asdict(FERRARI_250LM), "mass": None}}, r"estimator\.car\.mass must be a number, not None"),
+        ({"minimum_speed": 0}, "minimum_speed must be positive"),
+        ({"initial_deviation": 0}, "initial_deviation must be positive"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(config, message):
+    with pytest.raises(ConfigurationError, match=message):
+        kalman(**config)
+
+
+def test_configuration_file_states_the_defaults():
+    config = compose_config("train", ["estimator=kalman"])
+    assert config["training"] == {"name": "none"}
+    assert kalman(**config["estimator"]).settings == KalmanSettings()
+
+
+def test_a_long_recording_takes_well_under_a_second():
+    drive = linear_drive(2.0)[0]
+    channels = {name: np.resize(samples, 55_000) for name, samples in drive.channels.items()}
+    long = type(drive)("long", "car", 100.0, 0.0, channels, "simulated")
+    estimator = kalman(**GIVEN)
+    estimator.estimate([drive])
+    started = time.perf_counter()
+    estimator.estimate([long])
+    assert time.perf_counter() - started < 1.0  # 0.04 s on the machine it was written on

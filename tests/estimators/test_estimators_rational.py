@@ -1,0 +1,342 @@
+"""Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again, bad input survived."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from rational_drive import CURVES, NOISE, changed, rational_drive
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.estimators.base import FitData
+from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter, RationalSettings
+from vehest.estimators.registry import estimator_class
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.nonlinear import extended_filter
+from vehest.stages.config import compose_config
+from vehest.training.context import FitContext
+from vehest.training.noise_tuning import NoiseTuningSettings
+from vehest.training.search import optuna_search
+from vehest.vehicle.rational_tyres import AxleForce, rational_axle
+
+LEVEL = {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003, "tyres": 0.01}
+QUICK = NoiseTuningSettings(grid=1, max_evaluations=25)
+
+
+def rational(tyres: str = "rational_adaptive", **config) -> RationalFilter:
+    """A filter with everything given."""
+    curves = {name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")}
+    estimator = estimator_class("rational_ekf").from_config({"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
+    assert isinstance(estimator, RationalFilter)
+    return estimator
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return rational_drive(40.0, seed=1)
+
+
+def with_gaps(drive):
+    yaw_rate, ay = drive["yaw_rate"].copy(), drive["ay"].copy()
+    yaw_rate[100:120], ay[110:150] = np.nan, np.nan
+    return changed(drive, {"yaw_rate": yaw_rate, "ay": ay})
+
+
+def rmse(estimate, drive) -> float:
+    return float(np.degrees(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[30:] ** 2))))
+
+
+# Tyres
+
+
+def test_slopes_of_the_rational_tyre_are_those_of_automatic_differentiation():
+    values = torch.tensor([0.06, np.log(0.008), np.log(7e4), np.log(0.7)], dtype=torch.float64)
+    found = rational_axle(values[0], values[1].exp(), values[2].exp(), values[3].exp())
+    slopes = torch.func.jacrev(lambda v: rational_axle(v[0], v[1].exp(), v[2].exp(), v[3].exp()).force)(values)
+    assert torch.allclose(torch.stack(found[1:]), slopes, rtol=1e-12)
+    assert AxleForce._fields[1:] == ("per_slip", "per_log_c1", "per_log_c2", "per_log_friction")
+
+
+def test_rational_tyre_peaks_where_it_should_and_is_linear_without_a_bend():
+    slip = np.linspace(0.0, 0.4, 100001)
+    force = rational_axle(slip, 0.008, 7e4, 1.0).force
+    assert slip[force.argmax()] == pytest.approx(np.sqrt(2 * 0.008), abs=1e-5)
+    assert force.max() == pytest.approx(7e4 * np.sqrt(2 * 0.008) / 2)
+    assert np.array_equal(rational_axle(slip, np.inf, 7e4, 1.0).force, 7e4 * slip)
+
+
+# The compiled filter
+
+
+@pytest.mark.parametrize("tyres", KINDS)
+def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
+    """One prediction of a covariance without noise is A P Aᵀ, that of a known state Δt σ² B Bᵀ."""
+    estimator = rational(tyres)
+    track, n = estimator.track(), 4 + len(estimator.settings.adapted)
+    generator = np.random.default_rng(0)
+    for sample in (np.array([np.nan, 22.0, np.nan, 0.11]), np.array([np.nan, 9.0, np.nan, -0.3])):
+        root = 0.01 * generator.standard_normal((n, n))
+        mean = 0.1 * generator.standard_normal(n)
+        state, inputs = torch.as_tensor(mean), torch.as_tensor(sample[[1, 3]])
+        slope = torch.func.jacrev(track.transition)(state, inputs).numpy()
+        steering = torch.func.jacrev(track.transition, 1)(state, inputs)[:, 1].numpy()
+        wander = np.diag([0.0] * 4 + [0.05**2] * (n - 4))
+        rows = np.stack([sample, sample])
+        silent = estimator.filter_samples(rows, Gaussian(mean, root @ root.T), dict.fromkeys(LEVELS, 0.0)).last
+        noisy = estimator.filter_samples(rows, Gaussian(mean, np.zeros((n, n))), dict(zip(LEVELS, (0.1, 0.1, 0.2, 0.05), strict=True))).last
+        assert np.allclose(silent.mean, track.transition(state, inputs), rtol=1e-12)
+        assert np.allclose(silent.covariance, slope @ root @ root.T @ slope.T, rtol=1e-9, atol=1e-15)
+        assert np.allclose(noisy.covariance, track.step * (0.04 * np.outer(steering, steering) + wander), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("tyres", KINDS)
+def test_compiled_filter_is_the_extended_filter_of_the_same_model(tyres, drive):
+    """To 1e-9, gaps included; that one takes its Jacobians from automatic differentiation, step by step."""
+    estimator, gappy = rational(tyres), with_gaps(drive).cut(4.0, 8.0)
+    samples = gappy.stack(estimator.channels)
+    ours = estimator.filter_samples(samples)
+    first = estimator.start(samples[0])
+    measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
+    theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).steps
+    assert np.abs(ours.mean - theirs.filtered.mean.numpy()).max() < 1e-9
+    assert np.abs(ours.last.covariance - theirs.filtered.covariance[-1].numpy()).max() < 1e-9
+    assert np.abs(ours.innovation - theirs.innovation.numpy()).max() < 1e-9
+    assert np.allclose(ours.innovation_covariance, theirs.innovation_covariance.numpy(), rtol=1e-9, atol=1e-12)
+    assert np.array_equal(ours.measured, theirs.measured.numpy())
+
+
+@pytest.mark.parametrize("config", [{"tyres": tyres} for tyres in KINDS] + [{"filter": "unscented"}])
+def test_online_is_batch_through_gaps_and_a_stop(config, drive):
+    gappy = with_gaps(drive).cut(0.0, 12.0)
+    gappy = changed(gappy, {"vx": np.where(np.abs(gappy.time - 9.0) < 1.0, 1.0, gappy["vx"])})
+    estimator = rational(**config)
+    estimate = estimator.estimate([gappy.without_references()])[0]
+    stepper = estimator.online()
+    steps = [stepper.step({name: gappy[name][k] for name in estimator.channels}) for k in range(len(gappy))]
+    for name in steps[0]:
+        assert np.allclose([step[name] for step in steps], estimate[name], rtol=1e-9, atol=1e-9)
+
+
+def test_unscented_filter_agrees_where_the_model_is_nearly_linear_in_its_uncertainty(drive):
+    short = drive.cut(0.0, 15.0)
+    extended, unscented = (rational(filter=kind).estimate([short])[0] for kind in ("extended", "unscented"))
+    assert np.degrees(np.abs(extended["sideslip"] - unscented["sideslip"])[40:].max()) < 0.1
+    assert (extended["nis_dof"] == 2).all()
+
+
+def test_ten_hours_take_far_less_than_a_minute(drive):
+    estimator = rational()
+    samples = np.resize(drive.stack(estimator.channels), (72_000, 4))
+    estimator.filter_samples(samples[:10])
+    started = time.process_time()
+    estimator.filter_samples(samples)
+    assert 10.0 * (time.process_time() - started) < 20.0  # an hour took 0.04 s on the machine it was written on
+
+
+# Tyres that change
+
+
+def test_changed_tyres_are_found_and_help():
+    """Tyres 15 % softer than those fitted: c₂ of both axles within 5 % of the truth after 90 s, and half the error of fixed tyres."""
+    worn = rational_drive(120.0, seed=2, stiffness=0.85)
+    adaptive, fixed = rational().estimate([worn])[0], rational("rational").estimate([worn])[0]
+    for axle in ("front", "rear"):
+        late = adaptive[f"cornering_stiffness_{axle}"][-600:]
+        assert late.mean() == pytest.approx(0.85 * CURVES[f"c2_{axle}"], rel=0.05)
+    late = worn.cut(60.0, 120.0)
+    errors = [np.sqrt(np.mean((estimate["sideslip"][1200:] - late["sideslip_ref"]) ** 2)) for estimate in (adaptive, fixed)]
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_tyres_that_are_held_straight_ahead_keep_still_there_and_move_in_bends(drive):
+    """Where |u r| is below the limit the parameters stay, and an offset of ay on a straight no longer moves them."""
+    estimator = rational(adapt_above=2.0)
+    filtered = estimator.filter_samples(drive.stack(estimator.channels))
+    before, after = filtered.mean[:-1, 4:], filtered.mean[1:, 4:]
+    held = (before == after).all(axis=1)
+    bend = np.abs(drive["vx"] * filtered.mean[:, 1])[1:]
+    assert held[bend < 1.5].all()
+    assert not held[bend > 2.5].any()
+    assert 0.1 < held.mean() < 0.9
+    straight = changed(drive, {"steer": np.zeros(800), "yaw_rate": np.zeros(800), "ay": np.full(800, 0.3)})
+    kept, moved = (rational(adapt_above=limit).filter_samples(straight.stack(estimator.channels)).last.mean[4:] for limit in (2.0, 0.0))
+    assert (kept == 0.0).all()
+    assert np.abs(moved).max() > 0.1
+    assert (rational(adapt_above=2.0).variant, rational("rational", adapt_above=2.0).variant) == ("ratte_held", "ratt")
+
+
+def test_friction_is_found():
+    estimate = rational("rational_friction").estimate([rational_drive(60.0, seed=3, friction=0.7)])[0]
+    assert estimate["friction"][-200:].mean() == pytest.approx(0.7, abs=0.03)
+    assert np.allclose(estimate["cornering_stiffness_front"], CURVES["c2_front"] * estimate["friction"])
+
+
+def test_tyre_parameters_stay_inside_their_bounds_whatever_is_measured(drive):
+    absurd = changed(drive, {"ay": -3.0 * drive["ay"], "yaw_rate": 2.0 * drive["yaw_rate"]})
+    for tyres in ("linear", "rational_adaptive", "rational_friction"):
+        estimator = rational(tyres, bound=1.5, noise={**LEVEL, "tyres": 0.5})
+        states = estimator.filter_samples(absurd.stack(estimator.channels)).mean[:, 4:]
+        assert np.abs(states).max() == pytest.approx(np.log(1.5)), "the bound is reached"
+        assert (np.abs(states) <= np.log(1.5)).all()
+
+
+# Bad input
+
+
+@pytest.mark.parametrize("kind", ["extended", "unscented"])
+def test_a_car_that_stands_or_reverses_rolls_without_slip_and_its_tyres_are_held(kind, drive):
+    vx = np.interp(drive.time[:200], [0, 3, 5, 7, 10], [20.0, 0.0, 0.0, -2.0, 20.0])
+    slow = changed(drive.cut(0.0, 10.0), {"vx": vx, "steer": np.full(200, 0.1)})
+    estimator = rational(filter=kind)
+    estimate = estimator.estimate([slow])[0]
+    below = vx < estimator.settings.minimum_speed
+    assert all(np.isfinite(values).all() for values in estimate.channels.values())
+    assert np.isfinite(estimate.covariance).all()
+    assert np.allclose(estimate["vy"][below], vx[below] * np.tan(0.1 * 1.07 / 2.40))
+    assert len(set(estimate["cornering_stiffness_front"][below])) == 1
+    assert (estimate["nis_dof"][below] == 0).all()
+
+
+@pytest.mark.parametrize("tyres", KINDS)
+@pytest.mark.parametrize("fault", ["flipped", "saturated", "offset", "minutes_without_measurements", "huge"])
+def test_faults_leave_estimates_finite(tyres, fault, drive):
+    n = len(drive)
+    channels = {
+        "flipped": {"yaw_rate": -drive["yaw_rate"]},
+        "saturated": {"ay": np.clip(drive["ay"], -2.0, 2.0)},
+        "offset": {"steer": drive["steer"] + np.radians(5.0)},
+        "minutes_without_measurements": {"yaw_rate": np.full(n, np.nan), "ay": np.full(n, np.nan), "vx": np.full(n, 3.5)},
+        "huge": {"ay": 1e6 * drive["ay"], "yaw_rate": -1e6 * drive["yaw_rate"]},
+    }[fault]
+    estimate = rational(tyres).estimate([changed(drive, channels)])[0]
+    assert all(np.isfinite(values).all() for values in estimate.channels.values())
+    assert np.isfinite(estimate.covariance).all()
+
+
+@pytest.mark.parametrize("fault", ["flipped", "saturated"])
+def test_innovations_tell_of_faults(fault, drive):
+    """On the model's own drive they are about as large as expected; a flipped yaw rate or a saturated ay makes them many times so."""
+    channels = {"flipped": {"yaw_rate": -drive["yaw_rate"]}, "saturated": {"ay": np.clip(drive["ay"], -2.0, 2.0)}}[fault]
+    good, bad = (rational("rational").estimate([part])[0] for part in (drive, changed(drive, channels)))
+    expected = good["nis"].sum() / good["nis_dof"].sum()
+    assert 0.2 < expected < 3.0
+    assert bad["nis"].sum() / bad["nis_dof"].sum() > 5.0 * expected
+
+
+# The fit
+
+
+def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected():
+    train, held_out = rational_drive(60.0, seed=4), rational_drive(40.0, seed=5)
+    estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
+    with pytest.raises(ConfigurationError, match="has no axle curves yet; fit or load it first"):
+        estimator.online()
+    record = estimator.fit(FitData([train], [held_out]), QUICK)
+    for name, value in CURVES.items():
+        assert record.metrics[name] == pytest.approx(value, rel=0.15)
+        assert 0.0 < record.metrics[f"{name}_interval"] < 0.3 * value
+    filtered = estimator.filter_samples(train.stack(estimator.channels))
+    nis, n_measured = filtered.nis()
+    assert nis.sum() / n_measured.sum() == pytest.approx(1.0, rel=0.05)
+    assert rmse(estimator.estimate([held_out])[0], held_out) < 0.15
+    assert record.metrics["best_validation_loss"] == pytest.approx(
+        np.mean((estimator.estimate([held_out])[0]["sideslip"] - held_out["sideslip_ref"])[30:] ** 2)
+    )
+    other = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    other.load_weights(estimator.weights())
+    assert np.array_equal(other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"])
+
+
+def test_curves_come_from_the_recordings_that_are_named_and_start_as_uncertain_as_they_are_told():
+    """Tyres 15 % softer in a second drive do not change the curves, only the levels."""
+    train, worn = rational_drive(60.0, seed=4), rational_drive(60.0, seed=7, stiffness=0.85)
+    alone, both = (estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}}) for spread in (None, 0.2))
+    alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
+    both.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
+    assert np.array_equal(alone.curves, both.curves)
+    np.testing.assert_allclose(both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12)
+    with pytest.raises(ConfigurationError, match=r"curves_from 'fit_\*' matches no training recording \(rational4\)"):
+        both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
+
+
+def test_levels_of_the_unscented_filter_are_found_through_the_extended_one():
+    train = rational_drive(30.0, seed=8)
+    fitted = [estimator_class("rational_ekf").from_config({"filter": kind}) for kind in ("extended", "unscented")]
+    for estimator in fitted:
+        estimator.fit(FitData([train], []), NoiseTuningSettings(grid=1, max_evaluations=5))
+    assert fitted[0].levels == fitted[1].levels
+    assert fitted[1].settings.filter == "unscented"
+
+
+def test_levels_of_the_data_need_no_search_and_given_ones_stay():
+    train = rational_drive(30.0, seed=6)
+    estimator = estimator_class("rational_ekf").from_config({"noise": {"tyres": 0.02}})
+    record = estimator.fit(FitData([train], []), NoiseTuningSettings(method="data"))
+    assert record.metrics["noise_tyres"] == 0.02
+    assert record.metrics["noise_yaw_rate"] == pytest.approx(NOISE["yaw_rate"], rel=0.2)
+    assert estimator.n_parameters == 7
+    assert "evaluations" not in record.metrics
+
+
+def test_everything_given_needs_no_fit():
+    estimator = rational()
+    assert (estimator.learns, estimator.n_parameters, estimator.variant) == (False, 0, "ratte")
+    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
+
+
+def test_optuna_is_asked_for_by_name_where_it_is_absent(monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(MissingError, match=r"pip install 'vehest\[tuning\]', or set method=nelder_mead"):
+        optuna_search(lambda p: 0.0, [(0.0, 1.0)], 3, 0, FitContext())
+
+
+@pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
+def test_levels_that_optuna_finds_lie_in_the_box_and_get_better_with_trials():
+    train = rational_drive(30.0, seed=9)
+    few, many = (estimator_class("rational_ekf").from_config({"tyres": "rational"}) for _ in range(2))
+    records = [own.fit(FitData([train], []), NoiseTuningSettings(method="optuna", trials=n)) for own, n in ((few, 3), (many, 25))]
+    assert [record.metrics["evaluations"] for record in records] == [3, 25]
+    assert records[1].metrics["best_train_loss"] <= records[0].metrics["best_train_loss"]
+    low, high = BOXES["ay"]
+    assert 10.0**low <= many.levels["ay"] / many.levels["yaw_rate"] <= 10.0**high
+
+
+@pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
+def test_optuna_finds_the_minimum_and_the_same_for_the_same_seed():
+    records = [optuna_search(lambda p: float((p[0] - 0.3) ** 2), [(-1.0, 1.0)], 40, 7, FitContext()) for _ in range(2)]
+    assert records[0].best[0] == pytest.approx(0.3, abs=0.1)
+    assert np.array_equal(records[0].starts, records[1].starts)
+
+
+def test_a_drive_without_a_reference_is_one_clear_error(drive):
+    with pytest.raises(DataError, match="sideslip_ref"):
+        rational(noise={"tyres": 0.01}).fit(FitData([drive.without_references()], []), QUICK)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
+        ({"filter": "particle"}, "filter 'particle' is not one of: extended, unscented"),
+        ({"bound": 1.0}, "bound must be more than 1"),
+        ({"adapt_above": -1.0}, "adapt_above must not be negative"),
+        ({"adapt_above": 1.0, "filter": "unscented"}, "adapt_above needs estimator.filter=extended"),
+        ({"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
+        ({"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
+        ({"noise": {"tyres": -1.0}}, r"estimator\.noise\.tyres must be positive"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(config, message):
+    with pytest.raises(ConfigurationError, match=message):
+        estimator_class("rational_ekf").from_config(config)
+
+
+def test_configuration_file_states_the_defaults():
+    config = compose_config("train", ["estimator=rational_ekf"])
+    assert estimator_class("rational_ekf").from_config(config["estimator"]).settings == RationalSettings()
+    assert {name: value for name, value in config["training"].items() if name != "name"} == vars(NoiseTuningSettings())

@@ -1,0 +1,235 @@
+"""Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting states, long drives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import signal
+
+from conftest import planar_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.networks import velocity_recurrent
+from vehest.estimators.networks.velocity_recurrent import SequenceSettings
+from vehest.estimators.registry import estimator_class
+from vehest.training.context import FitContext
+from vehest.training.sequences import PhaseSettings
+
+NAMES = ["velocity_gru", "velocity_lstm"]
+INPUTS = ["yaw_rate", "ax", "ay"]
+QUICK = SequenceSettings(PhaseSettings(max_epochs=3, learning_rate=1e-2), 60, 100, 20, batch_size=2)
+
+
+def _drive(seconds: float = 2.5, seed: int = 0, scale: float = 1.0) -> Recording:
+    """A planar drive at 100 Hz with a reference of the yaw rate."""
+    drive = planar_drive(seconds, 100.0, seed, noise=0.02, name=f"drive {seed}")
+    channels = {**drive.channels, "yaw_rate_ref": drive["yaw_rate"], "vy_ref": scale * drive["vy_ref"]}
+    return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, "simulated")
+
+
+DATA = FitData([_drive(seed=1), _drive(0.5, seed=2)], [_drive(seed=3)])
+
+
+def _estimator(name: str, seed: int = 0, **config):
+    estimator = estimator_class(name).from_config({"inputs": INPUTS, "n_states": 6} | config)
+    estimator.seed(seed)
+    return estimator
+
+
+def _weights(estimator) -> np.ndarray:
+    return np.concatenate([values.ravel() for values in estimator.weights().values()])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(name: str) -> None:
+    """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
+    estimator = _estimator(name)
+    record = estimator.fit(DATA, QUICK)
+    errors = []
+    for first in (0.0, 1.0):  # the last half second does not fill a sequence
+        piece = DATA.validation[0].cut(first, first + 1.0)
+        estimate = estimator.estimate([piece.without_references()])[0]
+        errors.append(np.stack([estimate[q] - piece[f"{q}_ref"] for q in ("vx", "vy", "yaw_rate")])[:, 20:])
+    weighted = np.array([0.2225, 0.5064, 0.1566]) @ np.square(np.concatenate(errors, axis=1))
+    assert record.metrics["best_validation_loss"] == pytest.approx(weighted.mean(), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_error_in_dropped_samples_teaches_nothing(name: str) -> None:
+    """References that differ only where every possible sequence drops its samples lead to the same weights."""
+    training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
+    whole = _drive(seed=1)
+    spoilt = {**whole.channels, "vy_ref": np.where(np.arange(250) < 20, -whole["vy_ref"], whole["vy_ref"])}
+    # means and deviations of the references must not move either
+    estimators = []
+    for drive in (whole, Recording(whole.id, whole.vehicle, 100.0, 0.0, spoilt, "simulated")):
+        estimator = _estimator(name, outputs=["vy"])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(velocity_recurrent.VelocityNetwork, "standardise", lambda *_: None)
+            estimator.fit(FitData([drive], DATA.validation), training)
+        estimators.append(estimator)
+    assert np.array_equal(_weights(estimators[0]), _weights(estimators[1]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_learns_a_lag_of_the_yaw_rate_that_holds_on_another_drive(name: str) -> None:
+    def lagging(seed: int) -> Recording:
+        noise = np.random.default_rng(seed).standard_normal((4, 600))
+        measured = dict(zip(("vx", "yaw_rate", "ax", "ay"), noise, strict=True))
+        return Recording("lag", "none", 100.0, 0.0, {**measured, "vy_ref": signal.lfilter([-0.5], [1.0, -0.8], noise[1])}, "simulated")
+
+    training = SequenceSettings(PhaseSettings(max_epochs=15, learning_rate=1e-2), 50, 100, 20, batch_size=4)
+    estimator, another = _estimator(name, outputs=["vy"]), lagging(3)
+    estimator.fit(FitData([lagging(1)], [lagging(2)]), training)
+    error = (estimator.estimate([another.without_references()])[0]["vy"] - another["vy_ref"])[20:]
+    assert np.square(error).mean() < 0.3 * another["vy_ref"].var()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_members_train_as_if_alone_and_seeds_differ(name: str) -> None:
+    together = [_estimator(name, seed) for seed in (0, 1)]
+    type(together[0]).fit_members(together, DATA, QUICK, FitContext())
+    for seed, member in enumerate(together):
+        alone = _estimator(name, seed)
+        alone.fit(DATA, QUICK)
+        assert np.array_equal(_weights(alone), _weights(member))
+    assert not np.allclose(_weights(together[0]), _weights(together[1]))
+
+
+def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path: Path) -> None:
+    whole = _estimator("velocity_gru", dropout=0.3)
+    record = whole.fit(DATA, QUICK)
+    questions = iter(range(100))
+    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=lambda: next(questions) > 3))
+    assert stopped.interrupted
+    assert 0 < stopped.metrics["epochs"] < 3
+    resumed = _estimator("velocity_gru", dropout=0.3)
+    assert resumed.fit(DATA, QUICK, FitContext([tmp_path])).history == record.history
+    assert np.array_equal(_weights(whole), _weights(resumed))
+
+
+def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings() -> None:
+    estimator = _estimator("velocity_gru")
+    drives = [estimator._drive(recording) for recording in (_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4))]
+    phase = velocity_recurrent._phase(estimator.network, estimator.settings, QUICK, drives, drives[:1])
+    generator = torch.Generator().manual_seed(0)
+    known = [{tuple(row) for row in torch.as_tensor(drive.inputs, dtype=torch.float32).tolist()} for drive in drives]
+    firsts = []
+    for _ in range(3):
+        sequences = [sequence for batch in phase.batches(generator) for sequence in batch.inputs]
+        assert len(sequences) == 3, "two of the first drive, none of the short one, one of the last"
+        for sequence in sequences:
+            rows = {tuple(row) for row in sequence.tolist()}
+            assert len(rows) == 60
+            assert sum(rows <= drive for drive in known) == 1
+        firsts.append(sorted(sequence[0, 0].item() for sequence in sequences))
+    assert firsts[0] != firsts[1] != firsts[2]
+
+
+def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean() -> None:
+    estimator = _estimator("velocity_gru", dropout=0.25, n_states=64)
+    drives = [estimator._drive(recording) for recording in DATA.train]
+    phase = velocity_recurrent._phase(estimator.network, estimator.settings, QUICK, drives, drives[:1])
+    masks = torch.cat([batch.mask.reshape(-1) for batch in phase.batches(torch.Generator().manual_seed(0))])
+    assert float((masks == 0).float().mean()) == pytest.approx(0.25, abs=0.02)
+    assert float(masks.mean()) == pytest.approx(1.0, abs=0.03)
+
+
+def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not() -> None:
+    drive = _drive(seed=5).without_references()
+    given = {"vx": 10.0, "vy": 3.0, "yaw_rate": 1.0}
+    measured = {"vx": drive["vx"][0], "vy": 0.0, "yaw_rate": drive["yaw_rate"][0]}
+    for name in NAMES:
+        estimator = _estimator(name)
+        estimator.fit(DATA, QUICK)
+        free, started, told = (estimator.estimate([drive], state)[0] for state in (None, given, measured))
+        assert np.array_equal(free["vy"], told["vy"])
+        assert np.array_equal(free["vy"], started["vy"]) == (name == "velocity_gru")
+        assert abs(free["vy"][-1] - started["vy"][-1]) < 1e-3, "it forgets where it started"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator = _estimator(name)
+    estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
+    drive = _drive(seed=5).without_references()
+    whole = estimator.estimate([drive])[0]
+    monkeypatch.setattr(velocity_recurrent, "CHUNK", 37)
+    pieces = estimator.estimate([drive])[0]
+    for quantity in ("vx", "vy", "yaw_rate"):
+        assert np.abs(whole[quantity] - pieces[quantity]).max() < 1e-12
+
+
+def test_lstm_follows_its_equations() -> None:
+    """h, c by the gates written out; then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64."""
+    estimator = _estimator("velocity_lstm", n_dense=5)
+    estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
+    w = estimator.weights()
+    drive = _drive(0.3, seed=5).without_references()
+    h, c = np.zeros(6), np.zeros(6)
+    start = np.array([drive["vx"][0], 0.0, drive["yaw_rate"][0]])
+    y = (start - w["output_mean"]) / w["output_scale"]
+    expected = []
+    for x in (drive.stack(INPUTS) - w["input_mean"]) / w["input_scale"]:
+        gates = w["recurrent.weight_ih_l0"] @ x + w["recurrent.bias_ih_l0"] + w["recurrent.weight_hh_l0"] @ h + w["recurrent.bias_hh_l0"]
+        admit, keep, new, show = gates.reshape(4, 6)
+        c = c / (1 + np.exp(-keep)) + np.tanh(new) / (1 + np.exp(-admit))
+        h = np.tanh(c) / (1 + np.exp(-show))
+        y = w["read_out.weight"] @ np.maximum(w["dense.weight"] @ np.concatenate([h, y]) + w["dense.bias"], 0.0) + w["read_out.bias"]
+        expected.append(y * w["output_scale"] + w["output_mean"])
+    estimate = estimator.estimate([drive])[0]
+    assert np.abs(np.stack([estimate[q] for q in ("vx", "vy", "yaw_rate")], axis=1) - np.array(expected)).max() < 1e-12
+
+
+def test_gru_of_the_paper_has_its_sizes() -> None:
+    assert estimator_class("velocity_gru").from_config({}).n_parameters == 3 * 64 * (6 + 64 + 2) + 3 * 65
+    assert estimator_class("velocity_lstm").from_config({}).n_parameters == 4 * 64 * (6 + 64 + 2) + 64 * 68 + 3 * 65
+
+
+def test_inputs_stay_apart_from_what_is_read_for_the_sideslip_only() -> None:
+    estimator = _estimator("velocity_gru")
+    estimator.fit(DATA, QUICK)
+    drive = _drive(seed=5).without_references()
+    faster = Recording(drive.id, drive.vehicle, 100.0, 0.0, {**drive.channels, "vx": drive["vx"] + 5.0}, "simulated")
+    one, other = (estimator.estimate([recording])[0] for recording in (drive, faster))
+    assert np.array_equal(one["vy"], other["vy"])
+    assert np.array_equal(other["sideslip"], np.arctan2(other["vy"], faster["vx"]))
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"inputs": []}, "at least one channel"),
+        ({"inputs": "ax"}, r"estimator\.inputs must be a list of text, not 'ax'"),
+        ({"inputs": ["ax", "ax"]}, "list of different channels"),
+        ({"inputs": ["warp"]}, "channel 'warp' is not known"),
+        ({"inputs": ["vy_ref"]}, "'vy_ref' comes from a reference sensor"),
+        ({"outputs": ["vx"]}, "vy among them, not vx"),
+        ({"n_states": 0}, "n_states must be at least 1"),
+        ({"dropout": 1.0}, "dropout must lie in 0"),
+        ({"negative_slope": 0.0}, "negative_slope must be over 0"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(config: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        estimator_class("velocity_gru").from_config(config)
+
+
+def test_recordings_too_short_or_with_gaps_are_one_clear_error() -> None:
+    with pytest.raises(
+        DataError, match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it"
+    ):
+        _estimator("velocity_gru").fit(DATA, SequenceSettings())
+    with pytest.raises(DataError, match=r"'drive 2' is 50 samples long: too short to validate on with training\.dropped_steps 60"):
+        _estimator("velocity_gru").fit(FitData(DATA.train, [DATA.train[1]]), SequenceSettings(PhaseSettings(), 100, 100, 60))
+    with pytest.raises(ConfigurationError, match=r"sequence_steps must be more than dropped_steps \(200\), not 100"):
+        SequenceSettings(sequence_steps=100)
+    drive = _drive()
+    holes = {**drive.channels, "vy_ref": np.where(np.arange(250) == 7, np.nan, drive["vy_ref"])}
+    gappy = Recording(drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"}))
+    with pytest.raises(DataError, match="'vy_ref' has gaps"):
+        _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK)

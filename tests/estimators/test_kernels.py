@@ -1,0 +1,213 @@
+"""The compiled recursions equal the plain PyTorch ones, and those equal something independent."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from conftest import planar_drive
+from vehest.data.windows import windows_of
+from vehest.estimators.gru import Gru
+from vehest.estimators.kernels.activation import rational_tanh
+from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
+from vehest.estimators.kernels.threads import over_members
+from vehest.estimators.ksnn import Ksnn, KsnnSettings
+from vehest.estimators.lstm import Lstm
+from vehest.estimators.networks.recurrent import RecurrentSettings
+from vehest.stages import group
+from vehest.training.members import FlatParameters, predict_members
+
+STRUCTURES = [
+    Ksnn(KsnnSettings(n_local=1, n_hidden=0, bias=True)),
+    Ksnn(KsnnSettings(n_local=2, n_hidden=0, bias=False)),
+    Ksnn(KsnnSettings(n_local=5, n_hidden=3, bias=True)),
+    Ksnn(KsnnSettings(n_local=3, n_hidden=2, bias=False)),
+    Gru(RecurrentSettings(n_states=5)),
+    Lstm(RecurrentSettings(n_states=4)),
+]
+
+
+def _problem(estimator, dtype, members=3, batch=70):
+    """Parameters of several members, windows of each, and the series; batch is no multiple of the lanes."""
+    drive = planar_drive()
+    network = estimator.new_network([drive]).to(dtype)
+    windows = windows_of([drive], estimator.channels, "vy_ref", 30)
+    layout = FlatParameters(network)
+    rows = []
+    for member in range(members):
+        network.reset(torch.Generator().manual_seed(member))
+        rows.append(layout.pack([network])[0])
+    flat = torch.stack(rows).requires_grad_()
+    starts = torch.randint(0, len(windows), (members, batch), generator=torch.Generator().manual_seed(9))
+    series = network.prepared(torch.as_tensor(windows.series, dtype=dtype))
+    weights = torch.randn(members, batch, generator=torch.Generator().manual_seed(10), dtype=torch.float64).to(dtype)
+
+    def value_and_gradient(compiled):
+        value = predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled)
+        (gradient,) = torch.autograd.grad((value * weights).sum(), flat)
+        return value.detach(), gradient
+
+    return value_and_gradient
+
+
+@pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
+def test_compiled_recursion_equals_plain_one_in_value_and_gradient(estimator, dtype, tolerance):
+    value_and_gradient = _problem(estimator, dtype)
+    (value, gradient), (plain_value, plain_gradient) = value_and_gradient(True), value_and_gradient(False)
+    scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
+    assert (value - plain_value).abs().max() <= tolerance * scale
+    assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_threads_do_not_change_a_bit_of_the_ksnn(dtype):
+    value_and_gradient = _problem(Ksnn(KsnnSettings(n_local=3, n_hidden=2, bias=True)), dtype, members=5)
+    alone = value_and_gradient(True)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        together = value_and_gradient(True)
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(one, other) for one, other in zip(alone, together, strict=True))
+
+
+def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
+    before = torch.get_num_threads()
+    try:
+        for threads, members in ((1, 1), (1, 5), (2, 1), (2, 64), (3, 5), (4, 2)):
+            torch.set_num_threads(threads)
+            times, workers = np.zeros(members, int), set()
+
+            def work(first, end, times=times, workers=workers):
+                times[first:end] += 1
+                workers.add(threading.get_ident())
+
+            over_members(work, members)
+            assert (times == 1).all()
+            assert len(workers) <= min(threads, members)
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
+    """Yaw rates at centres, between them and beyond the last one; the lanes of a block are in different local models."""
+    estimator = Ksnn(KsnnSettings(n_local=4, n_hidden=2, bias=True))
+    drive = planar_drive()
+    network = estimator.new_network([drive]).double()
+    network.reset(torch.Generator().manual_seed(0))
+    network.yaw_rate_max.fill_(0.3)
+    series = torch.as_tensor(drive.stack(estimator.channels))
+    series[:, 0] = torch.tensor([0.0, 0.1, -0.2, 0.3, 0.05, -0.15, 0.29, 0.5, -0.7])[torch.arange(len(series)) % 9]
+    layout, starts = FlatParameters(network), torch.arange(65).unsqueeze(0)
+    flat = layout.pack([network]).requires_grad_()
+    values, gradients = [], []
+    for compiled in (True, False):
+        values.append(predict_members(network, layout.views(flat), series, starts, 30, compiled=compiled))
+        gradients.append(torch.autograd.grad(values[-1].sum(), flat)[0])
+    assert torch.allclose(*values, rtol=0, atol=1e-12)
+    assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
+
+
+def test_gradient_of_the_ksnn_equals_finite_differences():
+    estimator = Ksnn(KsnnSettings(n_local=3, n_hidden=1, bias=True))
+    drive = planar_drive(10.0)
+    network = estimator.new_network([drive]).double()
+    network.reset(torch.Generator().manual_seed(1))
+    layout = FlatParameters(network)
+    windows = windows_of([drive], estimator.channels, "vy_ref", 30)
+    series, starts = torch.as_tensor(windows.series), torch.as_tensor(windows.starts[:8]).unsqueeze(0)
+    flat = layout.pack([network]).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda rows: predict_members(network, layout.views(rows), series, starts, 30, compiled=True), (flat,), eps=1e-6, atol=1e-6
+    )
+
+
+def test_gru_equals_the_library_gru():
+    states = 5
+    network = Gru(RecurrentSettings(n_states=states)).empty_network().double()
+    network.reset(torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        network.gate_bias.copy_(torch.randn(3, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+    library = torch.nn.GRU(4, states, batch_first=True).double()
+    with torch.no_grad():
+        library.weight_ih_l0.copy_(network.input_weight.reshape(-1, 4))
+        library.weight_hh_l0.copy_(network.state_weight.reshape(-1, states))
+        library.bias_ih_l0.copy_(network.gate_bias.reshape(-1))
+        library.bias_hh_l0.zero_()
+    windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    assert torch.allclose(network.last_state(windows), library(windows)[1][0], rtol=0, atol=1e-12)
+
+
+def test_lstm_equals_the_library_lstm():
+    states = 6
+    network = Lstm(RecurrentSettings(n_states=states)).empty_network().double()
+    network.reset(torch.Generator().manual_seed(3))
+    with torch.no_grad():
+        network.gate_bias.copy_(torch.randn(4, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+    library = torch.nn.LSTM(4, states, batch_first=True).double()
+    order = [0, 1, 3, 2]  # the library's gates are input, forget, cell, output
+    with torch.no_grad():
+        library.weight_ih_l0.copy_(network.input_weight[order].reshape(-1, 4))
+        library.weight_hh_l0.copy_(network.state_weight[order].reshape(-1, states))
+        library.bias_ih_l0.copy_(network.gate_bias[order].reshape(-1))
+        library.bias_hh_l0.zero_()
+    windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    assert torch.allclose(network.last_state(windows), library(windows)[1][0][0], rtol=0, atol=1e-12)
+
+
+def test_rational_tanh_is_within_2e_7_of_tanh():
+    x = np.linspace(-12.0, 12.0, 20001).astype(np.float32)
+    assert np.abs(np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))).max() < 2e-7
+
+
+def test_compiled_observer_equals_the_readable_one():
+    drive = planar_drive(20.0, 100.0, noise=0.02)
+    measurements = drive.stack(("yaw_rate", "vx", "ay", "ax"))
+    vy, vx = np.empty(len(drive)), np.empty(len(drive))
+    implicit_euler_observer(measurements, 6.0, 0.1, 0.01, 0.0, np.nan, vy, vx)
+    compiled_vy, compiled_vx = observe(measurements, 6.0, 0.1, 0.01)
+    assert np.array_equal(vy, compiled_vy)
+    assert np.array_equal(vx, compiled_vx)
+
+
+def test_observer_has_the_transfer_functions_of_appendix_b():
+    """At constant yaw rate the response to a_y and a_x is that of Eqs. 18 and 19 of Da Lio et al. 2023."""
+    omega, alpha, step, n = 0.4, 5.0, 0.01, 400
+    denominator = [alpha**2 * omega**2 * step**2 + 2 * omega * alpha * step + 1, -2 * omega * alpha * step - 2, 1.0]
+    for column, numerator in ((2, [(2 * omega * alpha * step + 1) * step, -step, 0.0]), (3, [-(alpha**2) * omega * step**2, 0.0, 0.0])):
+        measurements = np.zeros((n, 4))
+        measurements[:, 0] = omega
+        measurements[0, column] = 1.0
+        vy, _ = observe(measurements, alpha, 0.0, step, 0.0, 0.0)
+        expected, padded = np.zeros(n), np.zeros(n + 2)
+        impulse = np.zeros(n + 2)
+        impulse[2] = 1.0
+        for k in range(n):
+            forced = sum(b * impulse[k + 2 - i] for i, b in enumerate(numerator))
+            padded[k + 2] = (forced - denominator[1] * padded[k + 1] - denominator[2] * padded[k]) / denominator[0]
+        expected = padded[2:]
+        assert np.allclose(vy, expected, rtol=0, atol=1e-12)
+
+
+def test_observer_resets_below_the_threshold():
+    measurements = np.tile([0.05, 20.0, 3.0, 0.0], (10, 1))
+    vy, vx = observe(measurements, 5.0, 0.1, 0.01)
+    assert (vy == 0.0).all()
+    assert (vx == 20.0).all()
+
+
+def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads(*_: object) -> list[int]:
+        return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
+
+    monkeypatch.setattr(group, "_run_group", threads)
+    with threadpool_limits(2, "blas"):  # what a process on two cores starts with
+        seen = group.run_group(group.Group([], None, frozenset()), lambda: False, lambda progress: None)
+        assert set(seen) == {1}
+        assert set(threads()) == {2}

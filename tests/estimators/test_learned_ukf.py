@@ -1,0 +1,287 @@
+"""The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from small_car_drive import small_car_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf, LearnedUkfSettings
+from vehest.estimators.registry import estimator_class
+from vehest.sources.base import open_source
+from vehest.stages.config import compose_config
+from vehest.training.context import FitContext
+from vehest.training.sequences import PhaseSettings
+from vehest.training.through_filter import ThroughFilterSettings
+
+SENSORS = ("ax", "ay", "yaw_rate", "motor_speed", "steer", "motor_current")
+REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
+
+
+def quick(epochs: int = 1, one_step: int = 40, dtype: str = "float64", **changes) -> ThroughFilterSettings:
+    phases = {
+        "one_step": PhaseSettings(learning_rate=1e-2, max_epochs=one_step, validate_every=one_step, schedule="cosine"),
+        "through": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
+        "noise": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
+    }
+    sizes = {"one_step_batch": 128, "steps": 100, "validation_steps": 150, "validation_drop_steps": 30, "dtype": dtype}
+    return ThroughFilterSettings(**phases, **sizes | changes)
+
+
+def data() -> FitData:
+    return FitData([small_car_drive(4.0, 0), small_car_drive(4.0, 1)], [small_car_drive(4.0, 2)])
+
+
+def estimator(seed: int = 0, **config) -> LearnedUkf:
+    made = LearnedUkf.from_config({"width": 16} | config)
+    made.seed(seed)
+    return made
+
+
+@cache
+def trained(dtype: str = "float64") -> LearnedUkf:
+    """NNTF_UH, trained for a moment; tests leave it as it is."""
+    made = estimator()
+    drives = FitData([small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)])
+    made.fit(drives, quick(3, 200, dtype=dtype, one_step_batch=256))
+    return made
+
+
+def drive(seed: int = 3, seconds: float = 6.0) -> Recording:
+    return small_car_drive(seconds, seed).without_references()
+
+
+def with_gaps(recording: Recording, gaps: dict[str, slice]) -> Recording:
+    channels = dict(recording.channels)
+    for name, samples in gaps.items():
+        channels[name] = channels[name].copy()
+        channels[name][samples] = np.nan
+    return Recording(recording.id, recording.vehicle, recording.rate_hz, recording.start_time, channels, "simulated", frozenset(gaps))
+
+
+def online(made: LearnedUkf, recording: Recording) -> dict[str, np.ndarray]:
+    stepper = made.online()
+    names = (*SENSORS, "vx")
+    rows = [stepper.step({name: float(recording[name][k]) for name in names}) for k in range(len(recording))]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+# Candidates
+
+
+def test_variants_are_called_as_in_the_paper() -> None:
+    cases = {
+        "pc": {"dynamics": "pacejka", "noise": "constant", "through_filter": False},
+        "pcr": {"dynamics": "residual", "noise": "constant", "through_filter": False},
+        "nn_u": {"dynamics": "neural", "noise": "constant"},
+        "nnt_uh": {"dynamics": "tyre_network"},
+        "nntf_uh": {},
+        "nntf_uh_mu0.4": {"start_friction": 0.4},
+        "nntf_uh_unrepaired": {"repair": False},
+        "nntf_uh_si": {"scaled": False},
+    }
+    assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {name: name for name in cases}
+
+
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics: str) -> None:
+    made = estimator(
+        dynamics=dynamics, noise="constant" if dynamics == "pacejka" else "state_dependent", through_filter=dynamics != "residual"
+    )
+    short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
+    record = made.fit(short, quick(one_step=2, steps=40, validation_steps=60, validation_drop_steps=10))
+    assert record.metrics["epochs"] == 3
+    assert record.history["epoch"] == [1, 2, 3], "whole numbers, over all phases, as a tracker wants them"
+    assert record.history["phase"] == [0, 0, 1]
+    assert record.metrics["skipped_steps"] == 0
+    assert record.metrics["best_validation_loss"] <= record.metrics["start_validation_loss"] < 10.0
+    estimate = made.estimate([small_car_drive(1.0, 3).without_references()])[0]
+    assert estimate.covariance_of == ("vx", "vy", "yaw_rate", "rim_speed", "friction")
+    assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
+    assert all(np.isfinite(estimate[name]).all() for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip", "nis"))
+
+
+def test_after_a_moment_of_training_it_estimates_a_drive_that_it_has_not_seen() -> None:
+    """A sliding car's lateral velocity to less than half of its deviation, which a filter that calls it zero does not reach."""
+    recording = small_car_drive(6.0, 3)
+    start = {name: float(recording[reference][0]) for name, reference in REFERENCES.items()}
+    estimate = trained().estimate([recording.without_references()], start)[0]
+    for name, reference in REFERENCES.items():
+        error = (estimate[name] - recording[reference])[100:]
+        assert np.sqrt(np.mean(error**2)) < (0.5 * recording["vy_ref"].std() if name == "vy" else 0.3), name
+
+
+# Online and batch
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
+def test_online_agrees_with_batch_also_where_sensors_fail(dtype: str, tolerance: float) -> None:
+    recording = with_gaps(drive(seconds=2.0), {"ay": slice(40, 60), "steer": slice(50, 55), "motor_speed": slice(100, 120)})
+    batch = trained(dtype).estimate([recording])[0]
+    step_by_step = online(trained(dtype), recording)
+    for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
+        assert np.abs(step_by_step[name] - batch[name]).max() <= tolerance, name
+
+
+def test_recordings_together_are_what_they_are_alone() -> None:
+    drives = [drive(3, 2.0), drive(4, 1.0), drive(5, 2.0)]
+    together = trained().estimate(drives)
+    for one, own in zip(drives, together, strict=True):
+        assert np.abs(trained().estimate([one])[0]["vy"] - own["vy"]).max() < 1e-12
+        assert own.recording_id == one.id
+
+
+# Starts
+
+
+def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it() -> None:
+    recording = drive()
+    free, given = (trained().estimate([recording], state)[0] for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5}))
+    assert abs(given["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
+    assert given.covariance[0, 1, 1] < free.covariance[0, 1, 1]
+    assert abs(given["vy"][-1] - free["vy"][-1]) < 0.02
+
+
+def test_members_that_differ_in_the_start_of_friction_share_their_training() -> None:
+    one, other, third = estimator(), estimator(start_friction=0.4), estimator(repair=False)
+    assert one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
+    told = []
+    short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
+    LearnedUkf.fit_members(
+        [one, other, third], short, quick(one_step=2, steps=40, validation_steps=60), FitContext(on_progress=told.append)
+    )
+    assert len(told) == 3, "the epochs of one training"
+    for name, values in one.weights().items():
+        assert np.array_equal(values, other.weights()[name]), name
+    first = [made.estimate([drive(seconds=1.0)])[0]["friction"][0] for made in (one, other)]
+    assert first == pytest.approx([0.6, 0.4], abs=0.03)
+    assert (one.filter.repair, third.filter.repair) == (True, False)
+
+
+def test_seeds_differ_and_a_seed_gives_the_same_numbers_again() -> None:
+    short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
+    made = [estimator(seed) for seed in (0, 0, 1)]
+    for one in made:
+        one.fit(short, quick(one_step=2, steps=40, validation_steps=60))
+    vy = [one.estimate([drive(seconds=1.0)])[0]["vy"] for one in made]
+    assert np.array_equal(vy[0], vy[1])
+    assert not np.array_equal(vy[0], vy[2])
+
+
+# Sensors that fail
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor: str) -> None:
+    whole = drive()
+    estimate, undisturbed = (trained().estimate([recording])[0] for recording in (with_gaps(whole, {sensor: slice(200, 250)}), whole))
+    for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip"):
+        assert np.isfinite(estimate[name]).all(), name
+    assert np.array_equal(estimate["vy"][:200], undisturbed["vy"][:200])
+    assert not np.array_equal(estimate["vy"][200:250], undisturbed["vy"][200:250])
+    assert np.abs(estimate["vy"][-100:] - undisturbed["vy"][-100:]).max() < 0.05
+    if sensor in ("ax", "ay", "yaw_rate", "motor_speed"):
+        assert np.array_equal(estimate["nis_dof"][[199, 200, 249, 250]], [4, 3, 3, 4])
+
+
+def noise_drive(seconds: float, seed: int = 0) -> Recording:
+    """Nothing but noise, with the deviations and worse of a wild drive."""
+    generator = np.random.default_rng(seed)
+    scales = {"ax": 6.0, "ay": 6.0, "yaw_rate": 3.0, "motor_speed": 60.0, "steer": 0.3, "motor_current": 15.0}
+    count = round(100 * seconds)
+    channels = {name: scale * generator.standard_normal(count) for name, scale in scales.items()}
+    return Recording("noise", "none", 100.0, 0.0, channels | {"vx": 0.05 * channels["motor_speed"]}, "simulated")
+
+
+def assert_finite_and_possible(estimate) -> None:
+    for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
+        assert np.isfinite(estimate[name]).all(), name
+    assert np.isfinite(estimate.covariance).all()
+    assert estimate["vx"].min() >= 0.05 - 1e-6
+    assert estimate["friction"].min() >= 0.05 - 1e-6
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_pure_noise_stays_finite_and_within_what_is_possible(dtype: str) -> None:
+    assert_finite_and_possible(trained(dtype).estimate([noise_drive(20.0)])[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dynamics", DYNAMICS)
+def test_ten_minutes_of_pure_noise_stay_finite(dynamics: str) -> None:
+    made = estimator(dynamics=dynamics)
+    made.fit(data(), quick(one_step=20, dtype="float32"))
+    assert_finite_and_possible(made.estimate([noise_drive(600.0)])[0])
+
+
+@pytest.mark.slow
+def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root) -> None:
+    """Half a second of each sensor in turn, and of all at once, in every recording of both tyres."""
+    config = compose_config("ingest", ["dataset=f1tenth", f"root={data_root}", "output=unused"])
+    recordings = {recording.id: recording for recording in open_source(config["dataset"]).recordings()}
+    learnt = [recording for name, recording in recordings.items() if name.startswith("iros")]
+    made = estimator(width=0)
+    made.fit(FitData(learnt[1:], learnt[:1]), quick(2, 100, "float32", one_step_batch=2048, steps=500, validation_steps=1000))
+    for recording in recordings.values():
+        gaps = {sensor: slice(200 + 150 * k, 250 + 150 * k) for k, sensor in enumerate(SENSORS)}
+        failing = with_gaps(recording.without_references(), gaps)
+        everything = with_gaps(failing, {sensor: slice(1300, 1350) for sensor in SENSORS})
+        assert_finite_and_possible(made.estimate([everything])[0])
+
+
+# What is refused
+
+
+def test_weights_of_another_width_are_refused() -> None:
+    with pytest.raises(DataError, match=r"do not fit its settings: 'dynamics\.network\.0\.bias'"):
+        estimator(width=8).load_weights(trained().weights())
+
+
+def test_a_drive_without_what_it_learns_from_is_one_clear_error() -> None:
+    missing = small_car_drive(1.2, 0).without_references()
+    with pytest.raises(DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"):
+        estimator().fit(FitData([missing], [missing]), quick())
+    gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})
+    with pytest.raises(DataError, match="channel 'steer' has gaps"):
+        estimator().fit(FitData([gappy], [gappy]), quick())
+
+
+def test_a_sample_that_is_infinite_is_refused_and_one_that_is_incomplete_too() -> None:
+    stepper = trained().online()
+    sample = dict.fromkeys(SENSORS, 0.5)
+    with pytest.raises(DataError, match="infinite value"):
+        stepper.step(sample | {"ay": np.inf})
+    with pytest.raises(DataError, match="no channel 'ax'"):
+        stepper.step({"ay": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"dynamics": "magic"}, "dynamics 'magic' is not one of: pacejka, residual"),
+        ({"noise": "none"}, "noise 'none' is not one of"),
+        ({"friction": 0.0}, "friction must be positive"),
+        ({"start_friction": 0.01}, "start_friction must lie above least_friction"),
+        ({"width": -1}, "width must not be negative"),
+        ({"car": {"mass": 0.0}}, r"car\.mass must be positive"),
+        ({"car": {"cg_to_rear_axle": 0.4}}, "less than the wheelbase"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(config: dict, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        LearnedUkf.from_config(config)
+
+
+def test_it_is_registered_and_counts_its_parameters() -> None:
+    """A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state."""
+    made = estimator_class("learned_ukf").from_config({})
+    assert made.settings == LearnedUkfSettings()
+    network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
+    assert made.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
+    assert torch.get_default_dtype() == torch.float32

@@ -1,0 +1,256 @@
+"""Filters that take a network's word: how much it counts, online and in batch, gradients end to end, what is lost on the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_sample_network import loaded_drive
+
+from dugoff_drive import TYRES
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.estimators import cnn_ukf
+from vehest.estimators.base import FitData
+from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
+from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
+from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
+from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter
+from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.networks.sample_network import learnt_samples
+from vehest.estimators.registry import estimator_class
+from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
+from vehest.training.samples import Draw
+from vehest.training.sequences import PhaseSettings
+
+LEVELS = {
+    "process_vy": 2e-3,
+    "process_yaw_rate": 2e-3,
+    "force_factor": 2.0,
+    "ay": 0.06,
+    "yaw_rate": 0.002,
+    "fy_front": 100.0,
+    "fy_rear": 100.0,
+}
+GIVEN = {"tyres": TYRES, "noise": LEVELS, "hidden": [10, 6]}
+DATA = FitData([loaded_drive(seed=1, name="first"), loaded_drive(3.0, seed=2, name="second")], [loaded_drive(4.0, seed=3)])
+NOTHING = IdentificationSettings(method="data")
+TRAININGS = {
+    "ensemble_ukf": EnsembleSettings(PhaseSettings(learning_rate=5e-3, max_epochs=2), batch_size=256, identification=NOTHING),
+    "cnn_ukf": EndToEndSettings(
+        PhaseSettings(learning_rate=5e-3, max_epochs=1), 256, PhaseSettings(max_epochs=2), steps=64, batch_size=6, identification=NOTHING
+    ),
+}
+BOTH = pytest.mark.parametrize("name", list(TRAININGS))
+
+
+def estimator_of(name: str, **config: object) -> NetworkUkf:
+    own = {"members": 3} if name == "ensemble_ukf" else {}
+    estimator = estimator_class(name).from_config({**GIVEN, **own, **config})
+    estimator.seed(1)
+    assert isinstance(estimator, NetworkUkf)
+    return estimator
+
+
+def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, EndToEnd]:
+    """A network that is not trained yet, in double precision, and its training through the filter."""
+    estimator = estimator_of("cnn_ukf", dropout=dropout)
+    assert isinstance(estimator, CnnUkf)
+    raw = learnt_samples(DATA.train, estimator.inputs, estimator.name)
+    estimator.network.double().scale(*raw)
+    estimator.network.reset([torch.Generator().manual_seed(0)])
+    with torch.no_grad():
+        estimator.network.get_parameter("bias_3")[0, 1:] = torch.tensor([-4.0, -6.0, -6.0])
+    training = EndToEndSettings(steps=30, batch_size=batch_size)
+    return estimator, EndToEnd(estimator, estimator.network.samples(*raw), DATA.train, training)
+
+
+def gradients_of(estimator: CnnUkf, loss: torch.Tensor) -> list[torch.Tensor]:
+    return list(torch.autograd.grad(loss, list(estimator.network.parameters())))
+
+
+@pytest.mark.parametrize(("name", "inputs", "measured"), [("ensemble_ukf", "full", 5), ("cnn_ukf", "imu", 3)])
+def test_a_fitted_filter_with_a_network_runs_online_as_in_batch_and_from_its_file(
+    name: str, inputs: str, measured: int, tmp_path: Path
+) -> None:
+    estimator = estimator_of(name, inputs=inputs)
+    record = estimator.fit(DATA, TRAININGS[name])
+    assert np.isfinite(record.metrics["best_validation_loss"])
+    drive = DATA.validation[0].cut(0.0, 1.2)
+    both = estimator.estimate([drive.without_references(), DATA.train[1].without_references()])  # padded to one length
+    save_model(estimator, tmp_path)
+    stepper = load_model(tmp_path).online()
+    steps = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(len(drive))]
+    for quantity in ("vy", "yaw_rate"):
+        np.testing.assert_allclose([step[quantity] for step in steps], both[0][quantity], rtol=0, atol=1e-9)
+    assert both[0].covariance_of == ("vy", "yaw_rate")
+    assert both[0]["nis_dof"][0] == measured
+
+
+def test_a_word_counts_as_much_as_its_variance_says() -> None:
+    estimator, drive = estimator_of("ensemble_ukf"), DATA.train[0]
+    wrong = drive["sideslip_ref"] + 0.02
+
+    def filtered(variance: float) -> np.ndarray:
+        ((_, (mean, *_)),) = estimator.filtered([drive], [Word(wrong, np.full(len(drive), variance))])
+        return mean[0, :, 0]
+
+    np.testing.assert_allclose(np.arctan2(filtered(1e-10), drive["vx"])[5:], wrong[5:], atol=1e-4)
+    alone = estimator.model.estimate([drive.without_references()])[0]["vy"]
+    np.testing.assert_allclose(filtered(1e6), alone, atol=1e-6)
+
+
+def test_the_ensembles_variance_is_scaled_by_the_papers_formula() -> None:
+    variance = np.array([1e-6, 4e-4])
+    np.testing.assert_allclose(scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE)
+    np.testing.assert_allclose(scaled_variance(variance, np.array([-4.269, 0.7901])), 10**-4.269 * variance**0.7901 + LEAST_VARIANCE)
+
+
+def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks() -> None:
+    inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").inputs)
+    told = {}
+    for kind in ("models", "mixture"):
+        estimator = estimator_of("ensemble_ukf", variance=kind)
+        assert isinstance(estimator, EnsembleUkf)
+        estimator.network.scale(inputs, DATA.validation[0]["sideslip_ref"])
+        estimator.network.reset([torch.Generator().manual_seed(member) for member in range(3)])
+        told[kind] = estimator.word(inputs)
+    unit = float(estimator.network.unit)
+    said = unit * estimator.network.said(inputs)[..., 0]
+    np.testing.assert_allclose(told["models"].sideslip, np.clip(said.mean(0), -1.5, 1.5), rtol=1e-12)
+    np.testing.assert_allclose(told["models"].variance, said.var(0) + LEAST_VARIANCE, rtol=1e-9)
+    assert (told["mixture"].variance > told["models"].variance).all()
+
+
+def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is() -> None:
+    """Eq. 11, on the validation recordings."""
+    estimator = estimator_of("ensemble_ukf")
+    search = IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=10)
+    training = replace(TRAININGS["ensemble_ukf"], identification=search)
+    assert isinstance(estimator, EnsembleUkf)
+    found = estimator.fit(DATA, training).metrics
+    assert [found["scaling_p1"], found["scaling_p2"]] == estimator.scaling.tolist() != [0.0, 1.0]
+
+    def loss() -> float:
+        words = [estimator.word(recording.stack(estimator.inputs)) for recording in DATA.validation]
+        return estimator.mean_squared_error(DATA.validation, words, search.skip_seconds)
+
+    assert loss() == pytest.approx(found["best_validation_loss"], rel=1e-9)
+    estimator.scaling = np.array([0.0, 1.0])
+    assert found["best_validation_loss"] < loss()
+
+
+def test_the_loss_of_pre_training_is_that_of_the_formulas() -> None:
+    """Eqs. 5 and 6, with the distrust as a standard deviation."""
+    estimator, _ = end_to_end()
+    samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.inputs, estimator.name))
+    levels, rows = torch.tensor([2e-3, 3e-3], dtype=torch.float64), torch.tensor([[3, 500, 1000]])
+    phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
+    outputs = estimator.network(samples.inputs[rows])[0]
+    unit = float(estimator.network.unit)
+    sigma = torch.sigmoid(outputs[:, 1:])
+    variance = sigma[:, 0] ** 2 + 1e-6
+    error = unit * (outputs[:, 0] - samples.targets[rows[0]])
+    expected = (0.5 * variance.log() + 0.5 * error**2 / variance).mean() + ((sigma[:, 1:] - levels) ** 2).sum(1).mean()
+    assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(expected.item(), rel=1e-12)
+
+
+def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
+    monkeypatch.setattr(cnn_ukf, "START", (KNOWN, KNOWN))  # as precise as a state that is handed over
+    estimator, training = end_to_end()
+    recording = DATA.train[1]
+    training.training = replace(training.training, steps=len(recording))
+    batch = training.cut(torch.tensor([len(DATA.train[0])]), torch.tensor([5]))
+    word = estimator.word(recording.stack(estimator.inputs))
+    start = {"vy": recording["vy_ref"][0], "yaw_rate": recording["yaw_rate"][0]}
+    ((_, (mean, *_)),) = estimator.filtered([recording], [word], [start])
+    wanted = np.arctan2(recording["vy_ref"], recording["vx"])
+    errors = [np.square(angle - wanted).mean() for angle in (word.sideslip, np.arctan2(mean[0, :, 0], recording["vx"]))]
+    assert training.loss(batch).item() == pytest.approx(sum(errors), rel=1e-6)
+
+
+def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
+    """Network, adaptive noises, filter and loss (Eq. 7), through a filter in readable torch."""
+    estimator, training = end_to_end()
+    batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
+    found = training.loss(batch)
+    expected_filter = TrackFilter(estimator.model.track(sees_sideslip=True), compiled=False)
+    ours, training.filter = training.filter, expected_filter
+    expected = training.loss(batch)
+    assert found.item() == pytest.approx(expected.item(), rel=1e-10)
+    for own, other in zip(gradients_of(estimator, found), gradients_of(estimator, expected), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))
+    training.filter = ours
+    said = estimator.said(estimator.network(batch.inputs.reshape(1, -1, 17)).reshape(4, 30, 4))
+    assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
+
+
+def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on() -> None:
+    estimator, training = end_to_end()
+    batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
+    rest = type(batch)(*(part[1:] if part.dim() and len(part) == 4 else part for part in batch))
+    spoilt = batch._replace(driven=batch.driven.clone())
+    spoilt.driven[0, 9, 1] = torch.nan
+    losses = [training.loss(part) for part in (spoilt, rest)]
+    assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-12)
+    for own, other in zip(*(gradients_of(estimator, loss) for loss in losses), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-15)
+    assert training.lost == 1
+
+
+def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone() -> None:
+    _, training = end_to_end()
+    batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
+    gradient = torch.ones(4, 30, 4)
+    gradient[2, 3, 1] = torch.inf
+    cleaned = training._cleaned(gradient, batch, torch.tensor([True, False, False, False]))
+    assert cleaned.sum((1, 2)).tolist() == [0.0, 120.0, 0.0, 120.0]
+    assert training.lost == 1
+
+
+def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step() -> None:
+    _, training = end_to_end()
+    firsts = torch.tensor([30, 830, 60, 100])
+    batch = training.cut(firsts, torch.tensor([5]))
+    batch.driven[:, 7, 1] = torch.nan
+    with pytest.raises(DataError, match=r"not finite at 0\.37 s of recording 'first' \(step 8 of a sequence\), nor in 4 of the batch's 4"):
+        training.loss(batch)
+    assert training.place(830) == "0.30 s of recording 'second'"
+
+
+def test_pre_training_starts_process_noise_where_the_filter_has_it() -> None:
+    estimator = estimator_of("cnn_ukf")
+    stopping = iter([False])
+    estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=lambda: next(stopping, True)))  # before its first step
+    assert isinstance(estimator, CnnUkf)
+    estimator.network.get_parameter("weight_3").data.zero_()
+    word = estimator.word(DATA.validation[0].stack(estimator.inputs)[:3])
+    np.testing.assert_allclose(np.sqrt(word.process), [[2e-3, 2e-3]] * 3, rtol=1e-4)
+    np.testing.assert_allclose(word.variance, float(estimator.network.unit) ** 2 + LEAST_VARIANCE, rtol=1e-4)
+
+
+@BOTH
+def test_a_stopped_training_goes_on_to_the_same_weights(name: str, tmp_path: Path) -> None:
+    whole = estimator_of(name)
+    whole.fit(DATA, TRAININGS[name])
+    for answers in (iter([False] * 9), iter([False] * 10_000)):
+        estimator = estimator_of(name)
+        record = estimator.fit(DATA, TRAININGS[name], FitContext([tmp_path], lambda own=answers: next(own, True)))
+    assert not record.interrupted
+    for key, values in whole.weights().items():
+        assert np.array_equal(values, estimator.weights()[key]), key
+
+
+def test_what_makes_no_sense_is_said() -> None:
+    for name, config in (("ensemble_ukf", {"members": 1}), ("ensemble_ukf", {"variance": "all"}), ("cnn_ukf", {"hidden": [0, 3]})):
+        with pytest.raises(ConfigurationError, match="estimator"):
+            estimator_of(name, **config)
+    with pytest.raises(DataError, match="no training recording is 900 samples long"):
+        estimator_of("cnn_ukf").fit(DATA, EndToEndSettings(steps=900, identification=NOTHING))
+    estimator = estimator_of("cnn_ukf")
+    with pytest.raises(DataError, match="'unit' is missing, unknown or of another shape"):
+        estimator.load_weights({name: values for name, values in estimator.weights().items() if name != "network.unit"})

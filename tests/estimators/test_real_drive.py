@@ -1,0 +1,96 @@
+"""What has to come out on the real recording of the Ferrari 250 LM; skipped where it is not at hand."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vehest.cli import main
+from vehest.data.splits import Span
+from vehest.data.transforms import Resample
+from vehest.estimators.base import FitData
+from vehest.estimators.registry import estimator_class
+from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.sources.base import open_source
+from vehest.stages.config import compose_config
+from vehest.training.search import DirectSearchSettings
+from vehest.training.supervised import SupervisedSettings
+
+SPAN = Span("ferrari_250lm", "20140222_01_01_03_250lm", 550.0, 700.0)
+
+
+@pytest.fixture(scope="module")
+def ferrari(request):
+    root = request.getfixturevalue("data_root")
+    dataset = compose_config("ingest", ["dataset=ferrari_250lm", f"root={root}"])["dataset"]
+    return open_source(dataset).read(SPAN.recording)
+
+
+def _tested(estimator, recording, reference):
+    estimate = estimator.estimate([recording.cut(540.0, 700.0).without_references()])[0]
+    return accuracy([score(estimate, reference, SPAN, Protocol(20.0))])
+
+
+def test_luenberger_on_the_ferrari_is_below_0_80_degrees(ferrari):
+    """Published on the neighbouring set: 0.73°; a throw-away script had 0.78° at 100 Hz."""
+    estimator = estimator_class("luenberger").from_config({})
+    estimator.fit(FitData([ferrari.cut(150.0, 450.0)], [ferrari.cut(450.0, 550.0)]), DirectSearchSettings())
+    assert _tested(estimator, ferrari, Resample(20.0)(ferrari))["rmse_sideslip"] <= 0.80
+    assert 0.0 <= estimator.gain <= 50.0
+    assert 0.0 <= estimator.threshold <= 0.5 * np.abs(ferrari["yaw_rate"]).max()
+
+
+def test_short_training_of_the_linear_ksnn_beats_the_luenberger_observer(ferrari):
+    slow = Resample(20.0)(ferrari)
+    estimator = estimator_class("ksnn").from_config({"n_hidden": 0, "bias": True})
+    estimator.seed(0)
+    estimator.fit(FitData([slow.cut(150.0, 450.0)], [slow.cut(450.0, 550.0)]), SupervisedSettings(max_epochs=30))
+    figures = _tested(estimator, slow, slow)
+    assert figures["rmse_sideslip"] < 0.50
+    assert figures["fvu"] < 0.10
+
+
+def _over_the_whole_drive(name, recording, **config):
+    """Figures over the whole recording by the common protocol; nothing of it was learnt from or tuned on."""
+    estimator = estimator_class(name).from_config(config)
+    assert not estimator.learns
+    whole = Span(SPAN.dataset, SPAN.recording)
+    estimate = estimator.estimate([recording.without_references()])[0]
+    return accuracy([score(estimate, Resample(20.0)(recording), whole, Protocol(20.0))])
+
+
+def test_kalman_filter_over_the_whole_ferrari_drive_is_the_published_one(ferrari):
+    """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""
+    assert _over_the_whole_drive("kalman", ferrari, noise={"read_from": "recording"})["rmse_sideslip"] == pytest.approx(0.87, abs=0.05)
+
+
+def test_factor_graph_over_the_whole_ferrari_drive_is_the_published_one(ferrari):
+    """Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter."""
+    pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
+    batch = _over_the_whole_drive("factor_graph", ferrari)["rmse_sideslip"]
+    window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
+    assert batch == pytest.approx(0.57, abs=0.02)
+    assert batch < window < 0.87
+
+
+@pytest.mark.slow
+def test_whole_study_on_the_ferrari_reaches_its_figures(data_root, tmp_path, monkeypatch, capsys):
+    """Seed chosen on validation; bounds are those that the study was set out with."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["vehest", "run", "ferrari_drive", f"root={data_root}", "tracking=none", "--json"])
+    main_exit = None
+    try:
+        main()
+    except SystemExit as leave:
+        main_exit = leave.code
+    assert not main_exit
+    board = pd.DataFrame(json.loads(capsys.readouterr().out)["leaderboard"]).set_index(["estimator", "variant"])["rmse_sideslip"]
+    assert board["ksnn", "linear_bias_p2"] <= 0.33
+    assert board["ksnn", "nonlinear_no_bias_p2_q2"] <= 0.36
+    assert board["ksnn", "linear_no_bias_p2"] <= 0.46
+    assert board["luenberger", "luenberger"] <= 0.80
+    assert (tmp_path / "results" / "ferrari_drive" / "report.md").is_file()

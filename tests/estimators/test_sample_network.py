@@ -1,0 +1,170 @@
+"""Networks over single samples: compiled layers, masks of dropout, members that do not touch each other, and the feed-forward network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dugoff_drive import dugoff_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.kernels.sample_network import gaussian_likelihood, kept, losses_of, outputs_of, squared_error
+from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork
+from vehest.estimators.registry import estimator_class
+from vehest.training.context import FitContext
+from vehest.training.samples import SampleSettings
+from vehest.training.sequences import PhaseSettings
+
+QUICK = SampleSettings(PhaseSettings(learning_rate=5e-3, max_epochs=4), batch_size=128)
+LONGER = SampleSettings(PhaseSettings(learning_rate=5e-3, max_epochs=25), batch_size=128)
+SEEDS = torch.tensor([7, 8, 9])
+
+
+def loaded_drive(seconds: float = 8.0, seed: int = 0, name: str = "drive") -> Recording:
+    """A drive on Dugoff's tyres with the forces that it lacks: shared out evenly, or at rest."""
+    drive = dugoff_drive(seconds, seed, name=name)
+    channels = dict(drive.channels)
+    for corner in ("fl", "fr", "rl", "rr"):
+        channels[f"fx_{corner}"], channels[f"fz_{corner}"] = 492.5 * drive["ax"], np.full(len(drive), 4831.0)
+    return Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, channels, drive.kind)
+
+
+DATA = FitData([loaded_drive(seed=1), loaded_drive(4.0, seed=2)], [loaded_drive(4.0, seed=3)])
+
+
+def network(outputs: int, members: int = 3) -> SampleNetwork:
+    made = SampleNetwork(5, (11, 6), outputs, members).double()
+    made.reset([torch.Generator().manual_seed(member) for member in range(members)])
+    with torch.no_grad():
+        for name, parameter in made.named_parameters():
+            if name.startswith("bias"):
+                parameter.copy_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
+    return made
+
+
+def readable(inputs: Tensor, parameters: list[Tensor], member: int, dropout: float) -> Tensor:
+    """One member's outputs in torch, with the masks that its seed stands for."""
+    hidden, scale = inputs, 256.0 / (256.0 - round(256 * dropout))
+    for layer in (0, 1):
+        hidden = torch.relu(hidden @ parameters[2 * layer][member] + parameters[2 * layer + 1][member])
+        mask = kept(int(SEEDS[member]), layer, (len(hidden), hidden.shape[1]), dropout)
+        hidden = hidden * torch.as_tensor(mask) * scale
+    return hidden @ parameters[4][member] + parameters[5][member]
+
+
+def samples(count: int = 40) -> tuple[Tensor, Tensor, Tensor]:
+    """Inputs, targets, and rows that three members see."""
+    generator = torch.Generator().manual_seed(3)
+    table, targets = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((count, 5), (count,)))
+    return table, targets, torch.stack([torch.randperm(count, generator=generator)[:20] for _ in range(3)])
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.4])
+def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout: float) -> None:
+    table, _, rows = samples()
+    parameters = list(network(2).parameters())
+    weights = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    found = outputs_of(table[rows], parameters, SEEDS, dropout)
+    expected = torch.stack([readable(table[rows[member]], parameters, member, dropout) for member in range(3)])
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    gradients = [torch.autograd.grad((outcome * weights).sum(), parameters) for outcome in (found, expected)]
+    for own, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-10, atol=1e-12)
+
+
+def test_losses_and_their_gradients_are_those_of_the_formulas() -> None:
+    table, targets, rows = samples()
+    for outputs, criterion in ((1, squared_error), (2, gaussian_likelihood)):
+        parameters = list(network(outputs).parameters())
+        expected = []
+        for member in range(3):
+            said, wanted = readable(table[rows[member]], parameters, member, 0.2), targets[rows[member]]
+            if outputs == 1:
+                expected.append((said[:, 0] - wanted).square().mean())
+            else:
+                variance = torch.nn.functional.softplus(said[:, 1]) + 1e-6
+                expected.append(torch.nn.functional.gaussian_nll_loss(said[:, 0], wanted, variance, eps=1e-12))
+        found = losses_of(table, targets, rows, parameters, SEEDS, 0.2, criterion)
+        torch.testing.assert_close(found, torch.stack(expected), rtol=1e-10, atol=1e-12)
+        scale = torch.tensor([1.0, 2.0, -1.0], dtype=torch.float64)
+        gradients = [torch.autograd.grad((losses * scale).sum(), parameters) for losses in (found, torch.stack(expected))]
+        for own, other in zip(*gradients, strict=True):
+            torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-12)
+
+
+def test_a_member_learns_the_same_alone() -> None:
+    table, targets, rows = samples()
+    together = list(network(1).parameters())
+    alone = [parameter[1:2].detach().clone().requires_grad_() for parameter in together]
+    losses_of(table, targets, rows, together, SEEDS, 0.2, squared_error).sum().backward()
+    losses_of(table, targets, rows[1:2], alone, SEEDS[1:2], 0.2, squared_error).sum().backward()
+    for both, own in zip(together, alone, strict=True):
+        assert both.grad is not None
+        assert own.grad is not None
+        assert torch.equal(both.grad[1:2], own.grad)
+
+
+def test_masks_hide_their_share_and_follow_from_the_seed() -> None:
+    mask = kept(1, 0, (400, 250), 0.2)
+    assert abs(mask.mean() - 205 / 256) < 3 * np.sqrt(0.2 * 0.8 / mask.size)
+    assert np.array_equal(mask, kept(1, 0, (400, 250), 0.2))
+    for other in (kept(2, 0, (400, 250), 0.2), kept(1, 1, (400, 250), 0.2)):  # as often alike as masks that know nothing of each other
+        assert (mask == other).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
+
+
+def test_inputs_of_training_lie_between_zero_and_one_and_constant_ones_say_nothing() -> None:
+    made = SampleNetwork(2, (4, 3), 1).double()
+    made.scale(np.array([[-2.0, 5.0], [6.0, 5.0]]), np.array([0.3, -0.4]))
+    seen = made.scaled(torch.tensor([[-2.0, 5.0], [6.0, 5.0], [10.0, 7.0]], dtype=torch.float64))
+    torch.testing.assert_close(seen, torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.5, 0.0]], dtype=torch.float64))
+    assert float(made.unit) == pytest.approx(np.sqrt(0.125))
+
+
+def fitted(training: SampleSettings = QUICK, **config: object):  # type: ignore[no-untyped-def]
+    estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05} | config)
+    estimator.seed(1)
+    return estimator, estimator.fit(DATA, training)
+
+
+@pytest.mark.parametrize("inputs", ["full", "imu"])
+def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs: str, tmp_path: Path) -> None:
+    estimator, record = fitted(LONGER, inputs=inputs)
+    assert estimator.channels == INPUTS[inputs]
+    assert len(INPUTS["full"]) == 17
+    drive = DATA.validation[0]
+    assert record.metrics["best_validation_loss"] < 0.3 * np.mean(np.square(drive["sideslip_ref"]))
+    estimate = estimator.estimate([drive.without_references()])[0]
+    error = np.mean(np.square(estimate["sideslip"] - drive["sideslip_ref"]))
+    assert error == pytest.approx(record.metrics["best_validation_loss"], rel=1e-4)
+    save_model(estimator, tmp_path)
+    stepper = load_model(tmp_path).online()
+    steps = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(50)]
+    np.testing.assert_allclose([step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6)
+
+
+def test_a_stopped_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+    whole, _ = fitted()
+    halves = [iter([False] * 20), iter(())]
+    for answers in halves:  # the first run is stopped within its third epoch
+        estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05})
+        estimator.seed(1)
+        stopping = (lambda own=answers: next(own, True)) if answers is halves[0] else (lambda: False)
+        record = estimator.fit(DATA, QUICK, FitContext([tmp_path], stopping))
+        assert record.interrupted == (answers is halves[0])
+    for name, values in whole.weights().items():
+        assert np.array_equal(values, estimator.weights()[name]), name
+
+
+def test_what_is_missing_or_makes_no_sense_is_said() -> None:
+    drive = dugoff_drive(2.0)
+    with pytest.raises(DataError, match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu"):
+        estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
+    for config in ({"inputs": "all"}, {"hidden": [5]}, {"hidden": "ab"}, {"dropout": 1.0}):
+        with pytest.raises(ConfigurationError, match="estimator"):
+            estimator_class("sideslip_ffnn").from_config(config)

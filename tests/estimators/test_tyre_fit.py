@@ -1,0 +1,118 @@
+"""Fits of tyre curves against cars whose curves are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_tyres
+from vehest.vehicle.parameters import SingleTrackParameters
+
+TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
+CURVES = {"linear": np.array([[3.0e5], [4.0e5]]), "rational": np.array([[0.01286, 486735.0], [0.00769, 622319.0]])}
+
+
+@cache
+def car(kind: str, seconds: float, rate_hz: float, size: float) -> dict[str, np.ndarray]:
+    """What a single track with these curves does, integrated at 200 Hz."""
+    every = round(200.0 / rate_hz)
+    step = 1.0 / (every * rate_hz)
+    time = np.arange(round(seconds / step)) * step
+    speed = 12.0 + 4.0 * np.sin(0.11 * time)
+    angle = size * (0.10 * np.sin(0.5 * time) + 0.06 * np.sin(0.83 * time))
+    curves = CURVES[kind].tolist()
+    front_arm, rear_arm = TRUCK.cg_to_front_axle, TRUCK.cg_to_rear_axle
+    beta, r, rows = 0.0, 0.0, []
+    for u, steer in zip(speed.tolist(), angle.tolist(), strict=True):
+        front = axle_force(kind, curves[0], steer - beta - front_arm * r / u)
+        rear = axle_force(kind, curves[1], rear_arm * r / u - beta)
+        lateral = (front + rear) / TRUCK.mass
+        rows.append((r, lateral, steer, beta, u))
+        beta += step * (lateral / u - r)
+        r += step * (front_arm * front - rear_arm * rear) / TRUCK.yaw_inertia
+    return dict(zip(("yaw_rate", "ay", "steer", "sideslip_ref", "vx"), np.array(rows)[::every].T, strict=True))
+
+
+def drive(
+    kind: str = "rational", seed: int = 0, noise: float = 1.0, seconds: float = 100.0, rate_hz: float = 50.0, size: float = 1.0
+) -> Recording:
+    """That car with noisy sensors."""
+    generator = np.random.default_rng(seed)
+    levels = {"yaw_rate": 0.002, "ay": 0.1, "steer": 0.001, "sideslip_ref": 0.001, "vx": 0.0}
+    true = car(kind, seconds, rate_hz, size)
+    channels = {name: samples + noise * levels[name] * generator.standard_normal(len(samples)) for name, samples in true.items()}
+    return Recording("known", "truck", rate_hz, 0.0, channels, "simulated")
+
+
+@pytest.mark.parametrize("kind", ["linear", "rational"])
+def test_fit_finds_the_curves_of_a_car_that_has_such_curves(kind):
+    fit = fit_tyres([drive(kind, seconds=200.0)], TRUCK, kind)
+    found = np.stack([fit.front, fit.rear])
+    np.testing.assert_allclose(found, CURVES[kind], rtol=0.03)
+    assert (np.abs(found - CURVES[kind]) < 2.0 * fit.interval).all()
+    assert (fit.interval / CURVES[kind] < 0.1).all()
+
+
+def test_without_noise_the_forces_are_those_of_the_car():
+    clean = drive(noise=0.0)
+    motion = axle_motion([clean], TRUCK)
+    for curve, slip, force in zip(CURVES["rational"], motion.slip, motion.force, strict=True):
+        assert np.sqrt(np.mean((axle_force("rational", curve, slip) - force) ** 2)) < 0.005 * np.abs(force).max()
+
+
+def test_intervals_hold_the_truth_about_as_often_as_they_say():
+    inside = []
+    for seed in range(12):
+        fit = fit_tyres([drive(seed=seed, rate_hz=20.0)], TRUCK)
+        inside.append(np.abs(np.stack([fit.front, fit.rear]) - CURVES["rational"]) < fit.interval)
+    assert 0.7 < np.mean(inside) <= 1.0
+
+
+def test_wider_intervals_where_tyres_stay_in_their_linear_range():
+    gentle, hard = fit_tyres([drive(size=0.3)], TRUCK), fit_tyres([drive()], TRUCK)
+    assert (gentle.interval[:, 0] > 5.0 * hard.interval[:, 0]).all()  # c1, which bends the curve
+
+
+def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
+    """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
+    fit = fit_tyres([drive(size=0.05)], TRUCK)
+    assert (np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]).all()
+    found, interval = np.array([fit.front[0], fit.rear[0]]), fit.interval[:, 0]
+    np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
+    np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
+
+
+def test_forces_that_were_measured_are_taken_as_they_are():
+    own = drive(noise=0.0)
+    wheels = {f"fy_{wheel}": np.full(len(own), value) for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))}
+    motion = axle_motion([replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True)
+    np.testing.assert_allclose(motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1))
+
+
+def test_several_drives_count_together():
+    both = fit_tyres([drive(seed=1), drive(seed=2)], TRUCK)
+    assert both.slip.shape[1] == 2 * fit_tyres([drive(seed=1)], TRUCK).slip.shape[1]
+
+
+def test_slow_and_missing_samples_are_left_out():
+    own = drive()
+    slow, unknown = np.array(own["vx"]), np.array(own["ay"])
+    slow[:500], unknown[1000:1100] = 1.0, np.nan
+    motion = axle_motion([replace(own, channels={**own.channels, "vx": slow, "ay": unknown}, gappy=frozenset({"ay"}))], TRUCK)
+    assert motion.slip.shape == motion.force.shape == (2, len(motion.block))
+    assert len(motion.block) == len(own) - 500 - 100 - 24 - 12  # the smoothing reaches 12 samples to either side
+
+
+def test_refusals_say_what_to_do():
+    own = drive()
+    with pytest.raises(ConfigurationError, match="'magic' is not one of: linear, rational"):
+        fit_tyres([own], TRUCK, "magic")
+    with pytest.raises(DataError, match="100 are needed"):
+        fit_tyres([own.cut(0.0, 1.0)], TRUCK)
+    with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
+        fit_tyres([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK)

@@ -1,0 +1,156 @@
+"""Blocks, intervals of single figures, and who may be called best, on errors whose outcome is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arch.bootstrap import optimal_block_length
+from scipy import signal
+
+from vehest.data.errors import DataError
+from vehest.evaluation.blocks import (
+    COLUMNS,
+    Segments,
+    _length,
+    _pooled_covariances,
+    _window,
+    block_labels,
+    block_sums,
+    effective_blocks,
+    politis_white_length,
+    read_segments,
+    segments_of,
+    write_segments,
+)
+from vehest.evaluation.metrics import Scored, accuracy
+from vehest.evaluation.ranking import rank
+from vehest.evaluation.significance import holm, root_interval, unexplained_interval
+
+RATE = 20.0
+
+
+def scored(error: np.ndarray, vy_ref: np.ndarray | None = None) -> Scored:
+    """A range whose lateral velocity is off by ``error`` [m/s] at 20 m/s."""
+    reference = np.zeros_like(error) if vy_ref is None else vy_ref
+    time = np.arange(len(error)) / RATE
+    beta, beta_ref = np.arctan2(reference + error, 20.0), np.arctan2(reference, 20.0)
+    return Scored(time, reference + error, reference, beta, beta_ref, np.zeros_like(error))
+
+
+def coloured(generator: np.random.Generator, n: int, memory: float = 0.95) -> np.ndarray:
+    return signal.lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(n + 400))[400:]
+
+
+def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
+    generator = np.random.default_rng(0)
+    parts = [scored(0.1 * coloured(generator, n), coloured(generator, n)) for n in (330, 95)]
+    segments = segments_of(parts, RATE)
+    figures = accuracy(parts)
+    n = segments.samples.sum()
+    assert n == 425
+    assert list(segments.piece) == [0.0] * 17 + [1.0] * 5
+    assert np.sqrt(segments.squared_error_vy.sum() / n) == pytest.approx(figures["rmse_vy"], rel=1e-12)
+    assert np.sqrt(segments.squared_error_sideslip.sum() / n) == pytest.approx(figures["rmse_sideslip"], rel=1e-12)
+    sums = [getattr(segments, name) for name in ("squared_error_vy", "error_vy", "squared_vy_ref", "vy_ref", "samples")]
+    assert unexplained_interval(*sums).value == pytest.approx(figures["fvu"], rel=1e-9)
+    write_segments(tmp_path / "blocks.csv", {"test": segments})
+    back = read_segments(tmp_path / "blocks.csv")["test"]
+    assert all(np.array_equal(getattr(back, name), getattr(segments, name)) for name in COLUMNS)
+    (tmp_path / "blocks.csv").write_text("test_set,piece\ntest,0\n")
+    with pytest.raises(DataError, match="start"):
+        read_segments(tmp_path / "blocks.csv")
+
+
+@pytest.mark.parametrize("memory", [0.3, 0.5, 0.9, 0.95])
+def test_block_length_is_that_of_another_library(memory):
+    """Which begins to look for insignificant autocorrelations one lag earlier than the paper says, and so has a window wider by two."""
+    values = np.square(coloured(np.random.default_rng(7), 900, memory))
+    expected = float(optimal_block_length(values)["circular"].iloc[0])
+    covariances = _pooled_covariances([values])
+    window = _window(covariances, 900)
+    assert _length(covariances, min(window + 2, len(covariances) - 1), 900) == pytest.approx(expected, rel=1e-9)
+    assert politis_white_length([values]) == _length(covariances, window, 900)
+
+
+def test_block_length_grows_with_the_memory_of_the_errors():
+    lengths = [politis_white_length([np.square(coloured(np.random.default_rng(8), 3000, memory))]) for memory in (0.0, 0.5, 0.9, 0.98)]
+    assert lengths == sorted(lengths)
+    assert lengths[0] < 3.0
+    assert lengths[-1] > 20.0
+    assert politis_white_length([np.ones(50)]) == 1.0
+
+
+def test_many_ranges_are_blocks_and_few_are_cut():
+    generator = np.random.default_rng(1)
+    many = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
+    assert list(block_labels(many, many.squared_error_vy[None])) == [label for label in range(9) for _ in range(5)]
+    few = segments_of([scored(coloured(generator, 4000)) for _ in range(2)], RATE)
+    labels = block_labels(few, few.squared_error_vy[None])
+    assert 2 < labels.max() + 1 < 400
+    assert not set(labels[few.piece == 0]) & set(labels[few.piece == 1])
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.98])
+def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
+    generator = np.random.default_rng(2)
+    covered = []
+    for _ in range(200):
+        segments = segments_of([scored(coloured(generator, 6000, memory))], RATE)
+        labels = block_labels(segments, segments.squared_error_vy[None])
+        found = root_interval(block_sums(segments.squared_error_vy[None], labels), block_sums(segments.samples, labels), n_resamples=400)
+        covered.append(found.low <= 1.0 <= found.high)
+    assert 0.90 <= np.mean(covered) <= 0.99
+
+
+def test_holm_is_the_textbook_example():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+
+
+def test_effective_blocks_count_what_carries_the_error():
+    assert effective_blocks(np.ones(20)) == pytest.approx(20.0)
+    assert effective_blocks(np.array([1.0, *[0.0] * 19])) == pytest.approx(1.0)
+
+
+def candidates(generator: np.random.Generator, **levels: float) -> dict[tuple[str, str], list[Segments]]:
+    """Three seeds each with errors of these sizes, partly common, over one drive of 300 s."""
+    common = coloured(generator, 6000)
+    return {
+        (name, name): [segments_of([scored(level * (0.6 * common + 0.8 * coloured(generator, 6000)))], RATE) for _ in range(3)]
+        for name, level in levels.items()
+    }
+
+
+def test_a_clear_winner_is_named():
+    found = rank(candidates(np.random.default_rng(3), good=0.1, other=0.3, zero=2.0, static_map=1.0), RATE)
+    assert found.winner == ("good", "good")
+    assert found.order[0] == ("good", "good")
+    assert found.beats(("other", "other"), "zero")
+    assert found.against_best[("other", "other")].high < 0.0
+    low, high = found.intervals[("good", "good")]
+    assert low < found.rmse[("good", "good")] < high
+
+
+def test_equals_are_not_told_apart_and_no_winner_is_named():
+    wrongly = 0
+    generator = np.random.default_rng(4)
+    for _ in range(20):
+        found = rank(candidates(generator, a=0.2, b=0.2, c=0.2, zero=2.0, static_map=1.0), RATE)
+        wrongly += found.winner is not None
+    assert wrongly <= 2
+
+
+def test_whoever_does_not_beat_the_static_map_is_no_winner():
+    found = rank(candidates(np.random.default_rng(5), a=1.0, b=3.0, zero=5.0, static_map=1.0), RATE)
+    assert found.winner is None
+    assert found.beats(("b", "b"), "static_map") is False
+    without = rank(candidates(np.random.default_rng(5), a=0.1, b=3.0, zero=5.0), RATE)
+    assert without.winner is None
+    assert without.missing_baselines == ["static_map"]
+
+
+def test_too_few_blocks_give_no_verdict():
+    short = {name: [segments_of([scored(0.1 * np.ones(40))], RATE)] for name in (("a", "a"), ("zero", "zero"))}
+    found = rank(short, RATE)
+    assert found.n_blocks < 3
+    assert found.winner is None
+    assert not found.intervals

@@ -1,0 +1,136 @@
+"""The compiled extended filter against the readable one, the Kalman filter, and Jacobians by hand."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+import torch
+from test_filters_kalman import example
+from test_filters_nonlinear import STEP, measured_pendulum, pendulum_with_radar
+
+from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.kalman_scan import kalman_scan
+from vehest.filters.nonlinear import extended_filter
+
+
+@numba.njit
+def swing(x, u, parameters):
+    out = np.empty(3, x.dtype)
+    out[0] = x[0] + STEP * x[1]
+    out[1] = x[1] + STEP * (u[0] - parameters[0] * np.sin(x[0]) - x[2] * x[1])
+    out[2] = x[2]
+    return out
+
+
+@numba.njit
+def radar(x, u, parameters):
+    out = np.empty(2, x.dtype)
+    out[0] = 1.0 - np.cos(x[0])
+    out[1] = np.sin(x[0]) * x[1]
+    return out
+
+
+def compiled_pendulum() -> CompiledModel:
+    readable, none = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
+    noises = (readable.process_noise(none, none).numpy(), readable.observation_noise(none, none).numpy())
+    return CompiledModel(with_jacobian(swing), with_jacobian(radar), np.array([9.81]), *noises)
+
+
+def as_arrays(state: Gaussian) -> Gaussian:
+    return Gaussian(state.mean.numpy(), state.covariance.numpy())
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_compiled_filter_is_the_readable_one_with_and_without_measurements(missing):
+    measurements, inputs, initial = measured_pendulum(60)
+    y = measurements[0]
+    if missing:
+        y[torch.rand(y.shape, generator=torch.Generator().manual_seed(3)) < missing] = torch.nan
+        y[10:13] = torch.nan
+        assert y.isnan().any(1).sum() > y.isnan().all(1).sum() > 3
+    theirs = extended_filter(pendulum_with_radar(), y, inputs[0], initial).steps
+    ours = extended_scan(compiled_pendulum(), y.numpy(), inputs[0].numpy(), as_arrays(initial))
+    for part in ("predicted", "filtered"):
+        for own, their in zip(getattr(ours, part), getattr(theirs, part), strict=True):
+            assert np.abs(own - their.numpy()).max() < 1e-9
+    for part in ("innovation", "innovation_covariance", "log_likelihood"):
+        assert np.abs(getattr(ours, part) - getattr(theirs, part).numpy()).max() < 1e-9
+    assert np.array_equal(ours.measured, theirs.measured.numpy())
+
+
+@numba.njit
+def drift(x, u, parameters):
+    matrix = parameters.reshape(len(x), len(x))
+    return matrix @ x + u, matrix
+
+
+@numba.njit
+def direct(x, u, parameters):
+    matrix = np.eye(len(x))[:2]
+    return matrix @ x, matrix
+
+
+def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with_time():
+    model, measurements, initial = example(30, missing=0.3)
+    model = type(model)(*(np.array(part) for part in model))
+    steps, n = 30, model.transition.shape[-1]
+    A, C = np.broadcast_to(model.transition, (steps, n, n))[0].copy(), np.eye(n)[:2]
+    offsets = np.broadcast_to(model.transition_offset, (steps, n)).copy()
+    Q = np.broadcast_to(model.process_noise, (steps, n, n)) * np.linspace(0.5, 2.0, steps)[:, None, None]
+    R = np.diag([0.2, 0.3]) * np.linspace(2.0, 0.5, steps)[:, None, None]
+    y = np.array(measurements)[:, :2]
+    linear = type(model)(A, offsets, Q, C, np.zeros(2), R)
+    theirs = kalman_scan(linear, y, as_arrays(initial))
+    ours = extended_scan(CompiledModel(drift, direct, A.ravel(), Q, R), y, offsets, as_arrays(initial))
+    assert np.abs(ours.filtered.mean - theirs.filtered.mean).max() < 1e-9
+    assert np.abs(ours.filtered.covariance - theirs.filtered.covariance).max() < 1e-9
+    assert np.abs(ours.log_likelihood - theirs.log_likelihood).max() < 1e-9
+
+
+@numba.njit
+def several(x, u, parameters):
+    out = np.empty(4, x.dtype)
+    out[0] = parameters[0] * np.tanh(x[0] / u[0])
+    out[1] = np.arctan((x[0] + parameters[1] * x[1]) / u[0])
+    out[2] = np.exp(-x[1]) * np.sqrt(x[0])
+    out[3] = x[0] ** 2 / x[1]
+    return out
+
+
+def test_jacobian_is_that_of_automatic_differentiation():
+    x, u, parameters = np.array([0.7, 1.3]), np.array([2.0]), np.array([1.5, 0.4])
+
+    def in_torch(state):
+        a, b = state
+        return torch.stack([1.5 * torch.tanh(a / 2.0), torch.atan((a + 0.4 * b) / 2.0), torch.exp(-b) * torch.sqrt(a), a**2 / b])
+
+    value, slope = with_jacobian(several)(x, u, parameters)
+    assert np.abs(value - in_torch(torch.from_numpy(x)).numpy()).max() < 1e-15
+    assert np.abs(slope - torch.func.jacrev(in_torch)(torch.from_numpy(x)).numpy()).max() < 1e-14
+
+
+def test_states_go_on_one_sample_at_a_time_as_all_at_once():
+    measurements, inputs, initial = measured_pendulum(20)
+    y, u, model = measurements[0].numpy(), inputs[0].numpy(), compiled_pendulum()
+    whole = extended_scan(model, y, u, as_arrays(initial)).filtered
+    state = Gaussian(*(part[0] for part in extended_scan(model, y[:1], u[:1], as_arrays(initial)).filtered))
+    for k in range(1, 20):
+        pair = np.stack([np.full(2, np.nan), y[k]])
+        state = Gaussian(*(part[-1] for part in extended_scan(model, pair, u[k - 1 : k + 1], state).filtered))
+        assert np.abs(state.mean - whole.mean[k]).max() < 1e-12
+        assert np.abs(state.covariance - whole.covariance[k]).max() < 1e-12
+
+
+def test_what_does_not_fit_is_refused():
+    measurements, inputs, initial = measured_pendulum(5)
+    y, u, model, first = measurements[0].numpy(), inputs[0].numpy(), compiled_pendulum(), as_arrays(initial)
+    with pytest.raises(ValueError, match=r"measurements must be of shape \(T, m\) with T > 0"):
+        extended_scan(model, y[:0], u[:0], first)
+    with pytest.raises(ValueError, match=r"inputs of shape \(4, 1\) do not fit"):
+        extended_scan(model, y, u[:4], first)
+    with pytest.raises(ValueError, match=r"observation_noise of shape \(3, 3\) does not fit \(5, 2, 2\)"):
+        extended_scan(model._replace(observation_noise=np.eye(3)), y, u, first)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite at sample 0"):
+        extended_scan(model._replace(observation_noise=-np.eye(2)), y, u, first)

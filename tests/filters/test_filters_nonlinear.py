@@ -1,0 +1,350 @@
+"""Extended and unscented Kalman filters against the linear one, an independent library, closed forms and finite differences."""
+
+from __future__ import annotations
+
+import filterpy.kalman as filterpy
+import numpy as np
+import pytest
+import torch
+from test_filters_kalman import example
+
+from vehest.filters.definiteness import MARGIN, factorised
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.kalman import kalman_filter
+from vehest.filters.nonlinear import NonlinearModel, extended_filter, unscented_filter
+from vehest.filters.sigma_points import SigmaRule, cubature_rule, scaled_rule, symmetric_rule
+
+RULES = {"symmetric": symmetric_rule(3, 0.5), "scaled": scaled_rule(3, 0.5, 2.0, 1.0), "cubature": cubature_rule(3)}
+STEP = 0.1
+
+
+def constant(matrix: torch.Tensor):
+    return lambda state, u: matrix.expand(*state.shape[:-1], *matrix.shape)
+
+
+def linear_as_nonlinear(model) -> NonlinearModel:
+    """A linear model that varies in time, with the sample's number as the input."""
+
+    def at(part: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+        return part[u[..., :1].long()].select(u.dim() - 1, 0)
+
+    return NonlinearModel(
+        lambda x, u: (at(model.transition, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.transition_offset, u),
+        lambda x, u: (at(model.observation, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.observation_offset, u),
+        lambda x, u: at(model.process_noise, u),
+        lambda x, u: at(model.observation_noise, u),
+    )
+
+
+def pendulum_with_radar() -> NonlinearModel:
+    """Angle, rate and an unknown damping; measured are the bob's height and its rate. Inputs push."""
+
+    def transition(x, u):
+        angle, rate, damping = x.unbind(-1)
+        return torch.stack([angle + STEP * rate, rate + STEP * (u[..., 0] - 9.81 * torch.sin(angle) - damping * rate), damping], -1)
+
+    def observation(x, u):
+        return torch.stack([1.0 - torch.cos(x[..., 0]), torch.sin(x[..., 0]) * x[..., 1]], -1)
+
+    process = torch.diag(torch.tensor([1e-4, 1e-3, 1e-5], dtype=torch.float64))
+    process[0, 1] = process[1, 0] = 1e-4
+    noise = torch.tensor([[0.02, 0.005], [0.005, 0.05]], dtype=torch.float64)
+    return NonlinearModel(transition, observation, constant(process), constant(noise))
+
+
+def measured_pendulum(steps: int = 40, sequences: int = 1, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor, Gaussian]:
+    generator = torch.Generator().manual_seed(seed)
+    model = pendulum_with_radar()
+    x = torch.tensor([0.6, 0.0, 0.3], dtype=torch.float64).expand(sequences, 3)
+    inputs = torch.randn(sequences, steps, 1, generator=generator, dtype=torch.float64)
+    ys = []
+    for k in range(steps):
+        ys.append(model.observation(x, inputs[:, k]) + 0.15 * torch.randn(sequences, 2, generator=generator, dtype=torch.float64))
+        x = model.transition(x, inputs[:, k])
+    first = Gaussian(torch.tensor([0.4, 0.1, 0.2], dtype=torch.float64), torch.diag(torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)))
+    return torch.stack(ys, 1), inputs, first
+
+
+# Sigma points
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_sigma_points_have_the_mean_and_covariance_they_stand_for(name):
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(4, 3, 3, generator=generator, dtype=torch.float64)
+    covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
+    mean = torch.randn(4, 3, generator=generator, dtype=torch.float64)
+    rule = RULES[name]
+    points = rule.points(mean, torch.linalg.cholesky(covariance))
+    deviations = points - mean.unsqueeze(-2)
+    assert torch.allclose(rule.mean(points), mean, atol=1e-12)
+    assert torch.allclose(rule.covariance(deviations, deviations), covariance, atol=1e-12)
+
+
+def test_kappa_of_the_learned_dynamics_paper_meets_the_fourth_moments_of_a_normal_distribution():
+    rule = symmetric_rule(5, -2.0)
+    points = rule.points(torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64))
+    assert rule.centre_mean == pytest.approx(-2.0 / 3.0)
+    assert rule.mean(points**4) == pytest.approx(torch.full((5,), 3.0), abs=1e-12)
+
+
+def test_rules_are_those_of_an_independent_library():
+    mean, covariance = np.array([0.3, -0.2, 0.7]), np.array([[0.5, 0.1, 0.0], [0.1, 0.4, -0.1], [0.0, -0.1, 0.3]])
+    theirs = {"symmetric": filterpy.JulierSigmaPoints(3, 0.5), "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0)}
+    for name, known in theirs.items():
+        rule = RULES[name]
+        points = rule.points(torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance)))
+        assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
+        assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
+        assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)
+
+
+@pytest.mark.parametrize("make", [lambda: symmetric_rule(4, -4.0), lambda: scaled_rule(3, 0.0), lambda: SigmaRule(0.0, 1.0, 1.0, 0.1)])
+def test_rules_without_a_spread_are_refused(make):
+    with pytest.raises(ValueError, match="spread"):
+        make()
+
+
+# Filters on linear models
+
+
+@pytest.mark.parametrize("name", [*RULES, "extended"])
+@pytest.mark.parametrize("missing", [0.0, 0.4])
+def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
+    model, measurements, initial = example(30, missing=missing)
+    known = kalman_filter(model, measurements, initial)
+    inputs = torch.arange(30, dtype=torch.float64).unsqueeze(-1)
+    nonlinear = linear_as_nonlinear(model)
+    if name == "extended":
+        ours = extended_filter(nonlinear, measurements, inputs, initial)
+    else:
+        ours = unscented_filter(nonlinear, measurements, inputs, initial, RULES[name])
+    assert not ours.repaired.any()
+    for part in ("predicted", "filtered"):
+        for own, theirs in zip(getattr(ours.steps, part), getattr(known, part), strict=True):
+            assert torch.allclose(own, theirs, rtol=1e-9, atol=1e-9)
+    assert torch.allclose(ours.steps.innovation, known.innovation, atol=1e-9)
+    assert torch.allclose(ours.steps.innovation_covariance, known.innovation_covariance, atol=1e-9)
+    assert torch.allclose(ours.steps.log_likelihood, known.log_likelihood, atol=1e-9)
+
+
+# Filters on a nonlinear model
+
+
+@pytest.mark.parametrize(
+    ("rule", "points"),
+    [
+        (symmetric_rule(3, 0.5), lambda: filterpy.JulierSigmaPoints(3, 0.5)),
+        (symmetric_rule(3, 0.0), lambda: filterpy.JulierSigmaPoints(3, 0.0)),
+        (scaled_rule(3, 0.3, 2.0, 0.0), lambda: filterpy.MerweScaledSigmaPoints(3, 0.3, 2.0, 0.0)),
+    ],
+    ids=["symmetric", "cubature", "scaled"],
+)
+def test_unscented_filter_is_that_of_an_independent_library(rule, points):
+    """Theirs updates with the propagated points; drawn again after each prediction, its equations are ours."""
+    model = pendulum_with_radar()
+    measurements, inputs, initial = measured_pendulum()
+    ours = unscented_filter(model, measurements[0], inputs[0], initial, rule).steps
+
+    def as_numpy(function):
+        return lambda x, *rest, u: function(torch.from_numpy(np.asarray(x)), torch.from_numpy(u)).numpy()
+
+    drawn = points()
+    theirs = filterpy.UnscentedKalmanFilter(3, 2, STEP, as_numpy(model.observation), as_numpy(model.transition), drawn)
+    theirs.x, theirs.P = initial.mean.numpy().copy(), initial.covariance.numpy().copy()
+    none = torch.zeros(3, dtype=torch.float64)
+    theirs.Q, theirs.R = model.process_noise(none, none).numpy(), model.observation_noise(none, none).numpy()
+    for k, y in enumerate(measurements[0].numpy()):
+        if k > 0:
+            theirs.predict(u=inputs[0, k - 1].numpy())
+        assert ours.predicted.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
+        theirs.sigmas_f = drawn.sigma_points(theirs.x, theirs.P)
+        theirs.update(y, u=inputs[0, k].numpy())
+        assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
+        assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
+        assert float(ours.log_likelihood[k]) == pytest.approx(theirs.log_likelihood, abs=1e-6)
+
+
+def test_extended_filter_is_that_of_an_independent_library():
+    model = pendulum_with_radar()
+    measurements, inputs, initial = measured_pendulum()
+    ours = extended_filter(model, measurements[0], inputs[0], initial).steps
+    theirs = filterpy.ExtendedKalmanFilter(3, 2)
+    theirs.x, theirs.P = initial.mean.numpy().copy(), initial.covariance.numpy().copy()
+    none = torch.zeros(3, dtype=torch.float64)
+    theirs.Q, theirs.R = model.process_noise(none, none).numpy(), model.observation_noise(none, none).numpy()
+
+    def slope_of_observation(x):
+        return np.array([[np.sin(x[0]), 0.0, 0.0], [np.cos(x[0]) * x[1], np.sin(x[0]), 0.0]])
+
+    def height_and_rate(x):
+        return np.array([1.0 - np.cos(x[0]), np.sin(x[0]) * x[1]])
+
+    for k, y in enumerate(measurements[0].numpy()):
+        if k > 0:
+            angle, rate, damping = theirs.x
+            slope = np.array([[1, STEP, 0], [-STEP * 9.81 * np.cos(angle), 1 - STEP * damping, -STEP * rate], [0, 0, 1]])
+            push = float(inputs[0, k - 1, 0])
+            theirs.x = np.array([angle + STEP * rate, rate + STEP * (push - 9.81 * np.sin(angle) - damping * rate), damping])
+            theirs.P = slope @ theirs.P @ slope.T + theirs.Q
+        theirs.update(y, slope_of_observation, height_and_rate)
+        assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
+        assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", ["unscented", "extended"])
+def test_gradients_are_those_of_finite_differences(name):
+    measurements, inputs, initial = measured_pendulum(steps=6, sequences=2)
+    measurements[0, 2, 1] = measurements[1, 4] = torch.nan
+    base = pendulum_with_radar()
+
+    def loss(mean, spread, process_root, gain):
+        model = NonlinearModel(
+            lambda x, u: base.transition(x, gain * u),
+            base.observation,
+            constant(process_root @ process_root.mT + 1e-4 * torch.eye(3, dtype=torch.float64)),
+            base.observation_noise,
+        )
+        first = Gaussian(mean, torch.diag(spread))
+        steps = (
+            unscented_filter(model, measurements, inputs, first, scaled_rule(3, 0.7)).steps
+            if name == "unscented"
+            else extended_filter(model, measurements, inputs, first).steps
+        )
+        return steps.filtered.mean.square().sum() + steps.log_likelihood.sum()
+
+    generator = torch.Generator().manual_seed(3)
+    root = 0.1 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    wanted = (initial.mean, initial.covariance.diagonal(), root, torch.tensor(1.1, dtype=torch.float64))
+    assert torch.autograd.gradcheck(loss, tuple(value.clone().requires_grad_() for value in wanted), atol=1e-6, rtol=1e-4)
+
+
+def test_sequences_of_a_batch_do_not_know_each_other():
+    measurements, inputs, initial = measured_pendulum(sequences=3)
+    together = unscented_filter(pendulum_with_radar(), measurements, inputs, initial, cubature_rule(3)).steps
+    for position in range(3):
+        alone = unscented_filter(pendulum_with_radar(), measurements[position], inputs[position], initial, cubature_rule(3)).steps
+        assert torch.allclose(together.filtered.mean[position], alone.filtered.mean, atol=1e-12)
+
+
+def test_where_nothing_is_measured_the_prediction_stands():
+    measurements, inputs, initial = measured_pendulum()
+    measurements[:, 10:15] = torch.nan
+    steps = unscented_filter(pendulum_with_radar(), measurements, inputs, initial, cubature_rule(3)).steps
+    assert torch.equal(steps.filtered.mean[:, 10:15], steps.predicted.mean[:, 10:15])
+    assert torch.allclose(steps.filtered.covariance[:, 10:15], steps.predicted.covariance[:, 10:15], rtol=1e-12)
+    assert (steps.log_likelihood[:, 10:15] == 0).all()
+    assert (steps.innovation[:, 10:15] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["unscented", "extended"])
+def test_constrained_states_stay_where_they_may_be(name):
+    """Without damping in the data, the estimate of the damping goes below zero unless it is kept."""
+    measurements, inputs, initial = measured_pendulum(steps=80)
+    generator = torch.Generator().manual_seed(5)
+    measurements = measurements + 0.3 * torch.randn(measurements.shape, generator=generator, dtype=torch.float64)
+    free = pendulum_with_radar()
+    kept = NonlinearModel(
+        free.transition,
+        free.observation,
+        free.process_noise,
+        free.observation_noise,
+        lambda x: torch.cat([x[..., :2], x[..., 2:].clamp(min=0.19)], -1),
+    )
+    damping = []
+    for model in (free, kept):
+        steps = (
+            unscented_filter(model, measurements, inputs, initial, cubature_rule(3)).steps
+            if name == "unscented"
+            else extended_filter(model, measurements, inputs, initial).steps
+        )
+        damping.append(float(steps.filtered.mean[..., 2].min()))
+    assert damping[0] < 0.19
+    assert damping[1] >= 0.19
+
+
+# Definiteness
+
+
+def test_a_covariance_that_is_not_definite_is_lifted_just_enough():
+    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    eigenvalues = torch.tensor([[2.0, 1.0, 0.5], [2.0, 1.0, -0.3]], dtype=torch.float64)
+    covariance = rotation @ torch.diag_embed(eigenvalues) @ rotation.mT
+    repaired = factorised(covariance)
+    assert repaired.repaired.tolist() == [False, True]
+    assert torch.equal(repaired.covariance[0], covariance[0])
+    assert torch.linalg.eigvalsh(repaired.covariance[1])[0] == pytest.approx(2.0 * MARGIN, rel=1e-3)
+    assert torch.allclose(repaired.covariance[1] - covariance[1], (0.3 + 2.0 * MARGIN) * torch.eye(3, dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(repaired.factor @ repaired.factor.mT, repaired.covariance, atol=1e-12)
+    left = factorised(covariance, repair=False)
+    assert left.repaired.tolist() == [False, True]
+    assert torch.isfinite(left.factor[0]).all()
+    assert torch.isnan(left.factor[1]).all()
+
+
+def test_a_covariance_that_is_not_finite_stays_nan_and_harms_no_other():
+    covariance = torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
+    covariance[1, 0, 1] = torch.nan
+    covariance[2, 1, 1] = torch.inf
+    covariance.requires_grad_()
+    factor = factorised(covariance)
+    assert torch.isfinite(factor.factor[0]).all()
+    assert torch.isnan(factor.factor[1:]).all()
+    assert not factor.repaired.any(), "what is not finite cannot be repaired, and is not counted as if it had been"
+    factor.factor[0].sum().backward()
+    assert torch.isfinite(covariance.grad).all()
+
+
+def sharp() -> NonlinearModel:
+    """A model whose curvature makes a negative centre weight lose the covariance's definiteness."""
+    return NonlinearModel(
+        lambda x, u: torch.cat([x[..., :1] + 0.5 * x.square().sum(-1, keepdim=True), 0.9 * x[..., 1:]], -1).clamp(-5.0, 5.0),
+        lambda x, u: x[..., :2],
+        constant(1e-6 * torch.eye(5, dtype=torch.float64)),
+        constant(1e-2 * torch.eye(2, dtype=torch.float64)),
+    )
+
+
+def test_lost_definiteness_is_repaired_and_counted_or_shown_as_divergence():
+    generator = torch.Generator().manual_seed(2)
+    measurements = 0.1 * torch.randn(2, 20, 2, generator=generator, dtype=torch.float64)
+    inputs = torch.zeros(2, 20, 1, dtype=torch.float64)
+    spreads = torch.tensor([1.0, 1e-3], dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
+    initial = Gaussian(torch.zeros(2, 5, dtype=torch.float64), spreads)
+    rule = symmetric_rule(5, -2.0)
+    repaired = unscented_filter(sharp(), measurements, inputs, initial, rule)
+    assert repaired.repaired[0].any()
+    assert not repaired.repaired[1].any(), "the other sequence is tame"
+    assert torch.isfinite(repaired.steps.filtered.mean).all()
+    assert (torch.linalg.eigvalsh(repaired.steps.innovation_covariance) > 0).all()
+    left = unscented_filter(sharp(), measurements, inputs, initial, rule, repair=False)
+    first = int(left.repaired[0].int().argmax())
+    assert torch.isnan(left.steps.filtered.mean[0, first:]).all()
+    assert torch.isfinite(left.steps.filtered.mean[0, :first]).all()
+    assert torch.equal(left.steps.filtered.mean[1], repaired.steps.filtered.mean[1])
+
+
+def test_gradients_pass_a_repair():
+    generator = torch.Generator().manual_seed(2)
+    measurements = 0.1 * torch.randn(1, 20, 2, generator=generator, dtype=torch.float64)
+    start = torch.zeros(1, 5, dtype=torch.float64, requires_grad=True)
+    initial = Gaussian(start, torch.eye(5, dtype=torch.float64))
+    outcome = unscented_filter(sharp(), measurements, torch.zeros(1, 20, 1, dtype=torch.float64), initial, symmetric_rule(5, -2.0))
+    assert outcome.repaired.any()
+    outcome.steps.filtered.mean.square().sum().backward()
+    assert torch.isfinite(start.grad).all()
+    assert start.grad.abs().sum() > 0
+
+
+# What is refused
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    measurements, inputs, initial = measured_pendulum(sequences=2)
+    model, rule = pendulum_with_radar(), cubature_rule(3)
+    with pytest.raises(ValueError, match=r"T > 0"):
+        unscented_filter(model, measurements[:, :0], inputs[:, :0], initial, rule)
+    with pytest.raises(ValueError, match="do not fit measurements"):
+        unscented_filter(model, measurements, inputs[:, 1:], initial, rule)
+    with pytest.raises(ValueError, match="does not fit"):
+        extended_filter(model, measurements, inputs, Gaussian(torch.zeros(5, 3), torch.eye(3)))

@@ -1,0 +1,256 @@
+"""The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import pytest
+import torch
+from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
+from torch import Tensor
+
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.nonlinear import NonlinearFiltered, NonlinearModel, unscented_filter
+from vehest.filters.sigma_points import SigmaRule, symmetric_rule
+from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan
+
+FREE = [-1e9, -1e9, -1e9]
+ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
+
+
+class Learnt(NamedTuple):
+    """What gradients are wanted for."""
+
+    process: Tensor
+    observation: Tensor
+    mean: Tensor
+    covariance: Tensor
+    gravity: Tensor
+
+
+def learnt(first: Gaussian[Tensor]) -> Learnt:
+    model, nothing = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
+    parts = (model.process_noise(nothing, nothing), model.observation_noise(nothing, nothing), *first)
+    return Learnt(*(part.clone().requires_grad_() for part in (*parts, torch.tensor(9.81, dtype=torch.float64))))
+
+
+def both_ways(rule: SigmaRule, measurements: Tensor, inputs: Tensor, first: Gaussian[Tensor], lower=FREE, share=None):
+    """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances.
+
+    Those of the measurements come last.
+    """
+    generator = torch.Generator().manual_seed(5)
+    sequences, steps = measurements.shape[:2]
+    weights = [torch.randn(sequences, steps, *size, generator=generator, dtype=torch.float64) for size in ((3,), (3, 3))]
+    least = torch.tensor(lower, dtype=torch.float64)
+    pairs = []
+    for way in (by_the_filter, by_the_scan):
+        parameters, measurements = learnt(first), measurements.detach().requires_grad_()
+        filtered = way(parameters, rule, measurements, inputs, least, share)
+        state = filtered.steps.filtered
+        loss = (state.mean * weights[0]).sum() + (state.covariance * weights[1]).sum()
+        pairs.append((filtered, torch.autograd.grad(loss, (*parameters, measurements))))
+    return pairs
+
+
+def by_the_filter(p: Learnt, rule, measurements, inputs, least, _) -> NonlinearFiltered:
+    model = dataclasses.replace(
+        pendulum_with_radar(),
+        transition=partial(swung, p.gravity),
+        process_noise=constant(p.process),
+        observation_noise=constant(p.observation),
+        constrain=lambda x: torch.where(x >= least, x, least),
+    )
+    return unscented_filter(model, measurements, inputs, Gaussian(p.mean, p.covariance), rule)
+
+
+def by_the_scan(p: Learnt, rule, measurements, inputs, least, share) -> NonlinearFiltered:
+    model = TorchModel(partial(swung, p.gravity), pendulum_with_radar().observation, [p.gravity], least.tolist())
+    return unscented_scan(model, measurements, inputs, Gaussian(p.mean, p.covariance), p.process, p.observation, rule, share=share)
+
+
+def swung(gravity: Tensor, x: Tensor, u: Tensor) -> Tensor:
+    angle, rate, damping = x.unbind(-1)
+    return torch.stack([angle + STEP * rate, rate + STEP * (u[..., 0] - gravity * torch.sin(angle) - damping * rate), damping], -1)
+
+
+def assert_equal(one: NonlinearFiltered, other: NonlinearFiltered) -> None:
+    for name in ("filtered", "predicted"):
+        for a, b in zip(getattr(one.steps, name), getattr(other.steps, name), strict=True):
+            assert torch.allclose(a, b, rtol=0, atol=1e-11, equal_nan=True), name
+    for name in ("innovation", "innovation_covariance", "log_likelihood"):
+        assert torch.allclose(getattr(one.steps, name), getattr(other.steps, name), rtol=0, atol=1e-11, equal_nan=True), name
+    assert torch.equal(one.steps.measured, other.steps.measured)
+    assert torch.equal(one.repaired, other.repaired)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_scan_is_the_unscented_filter_in_values_and_gradients(name: str) -> None:
+    (filtered, gradients), (scanned, own) = both_ways(RULES[name], *measured_pendulum(30, 4))
+    assert_equal(filtered, scanned)
+    for field, a, b in zip((*Learnt._fields, "measurements"), gradients, own, strict=True):
+        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max())), field
+        assert a.abs().sum() > 0, field
+
+
+def test_missing_measurements_are_skipped_as_by_the_filter() -> None:
+    measurements, inputs, first = measured_pendulum(30, 3)
+    measurements[0, 3, 0] = measurements[1, 5] = measurements[2, 10:20, 1] = torch.nan
+    (filtered, gradients), (scanned, own) = both_ways(RULES["symmetric"], measurements, inputs, first)
+    assert_equal(filtered, scanned)
+    for a, b in zip(gradients, own, strict=True):
+        assert torch.isfinite(b).all()
+        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
+
+
+def test_states_stay_within_their_bounds_as_by_the_filter() -> None:
+    lower = [-1e9, -1e9, 0.25]
+    (filtered, gradients), (scanned, own) = both_ways(RULES["scaled"], *measured_pendulum(30, 4), lower=lower)
+    assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"
+    assert (scanned.steps.filtered.mean[..., 2] >= 0.25).all()
+    assert_equal(filtered, scanned)
+    for a, b in zip(gradients, own, strict=True):
+        assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    measurements, inputs, first = measured_pendulum(12, 2)
+    weights = torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    start = learnt(first)
+    directions = [torch.randn(part.shape, generator=torch.Generator().manual_seed(k), dtype=torch.float64) for k, part in enumerate(start)]
+    directions = [direction if direction.dim() < 2 else 1e-3 * (direction + direction.mT) for direction in directions]
+
+    def loss(shift: float) -> Tensor:
+        moved_there = Learnt(*(part.detach() + shift * way for part, way in zip(start, directions, strict=True)))
+        own = Learnt(*(part.requires_grad_() for part in moved_there))
+        filtered = by_the_scan(own, RULES["symmetric"], measurements, inputs, torch.tensor(FREE), None)
+        return (filtered.steps.filtered.mean * weights).sum(), own
+
+    value, at = loss(0.0)
+    slope = sum(float((g * way).sum()) for g, way in zip(torch.autograd.grad(value, at), directions, strict=True))
+    numeric = float((loss(1e-5)[0] - loss(-1e-5)[0]).detach()) / 2e-5
+    assert slope == pytest.approx(numeric, rel=1e-7)
+
+
+def spread(*sizes: float) -> Gaussian[Tensor]:
+    """Sequences of `sharp` that are more or less spread to begin with."""
+    covariances = torch.tensor(sizes, dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
+    return Gaussian(torch.zeros(len(sizes), 5, dtype=torch.float64), covariances)
+
+
+def sharply_scanned(initial: Gaussian[Tensor], repair: bool = True) -> NonlinearFiltered:
+    sequences = len(initial.mean)
+    measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)[:sequences]
+    model, nothing = sharp(), torch.zeros(5, dtype=torch.float64)
+    noises = [noise(nothing, nothing) for noise in (model.process_noise, model.observation_noise)]
+    points = TorchModel(model.transition, model.observation)
+    inputs = torch.zeros(sequences, 20, 1, dtype=torch.float64)
+    return unscented_scan(points, measurements, inputs, initial, *noises, symmetric_rule(5, -2.0), repair=repair)
+
+
+def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter() -> None:
+    initial = spread(1.0, 1e-3)
+    measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    inputs = torch.zeros(2, 20, 1, dtype=torch.float64)
+    filtered = unscented_filter(sharp(), measurements, inputs, initial, symmetric_rule(5, -2.0))
+    scanned = sharply_scanned(initial)
+    assert scanned.repaired[0].any()
+    assert torch.equal(filtered.repaired, scanned.repaired)
+    assert torch.allclose(filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-6)
+    slopes = []
+    for way in (lambda first: unscented_filter(sharp(), measurements, inputs, first, symmetric_rule(5, -2.0)), sharply_scanned):
+        start = initial.mean.clone().requires_grad_()
+        way(Gaussian(start, initial.covariance)).steps.filtered.mean.square().sum().backward()
+        slopes.append(start.grad)
+    assert torch.allclose(*slopes, rtol=0, atol=1e-6 * float(slopes[0].abs().max()))
+
+
+def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone() -> None:
+    initial = spread(1.0, 1e-3)
+    start = initial.mean.clone().requires_grad_()
+    left = sharply_scanned(Gaussian(start, initial.covariance), repair=False)
+    mean = left.steps.filtered.mean
+    first = int(left.repaired[0].int().argmax())
+    assert torch.isnan(mean[0, first:]).all()
+    assert torch.isfinite(mean[0, :first]).all()
+    tame = sharply_scanned(Gaussian(initial.mean, initial.covariance))
+    assert torch.equal(mean[1], tame.steps.filtered.mean[1])
+    mean[1].square().sum().backward()
+    assert torch.isfinite(start.grad[1]).all()
+
+
+def test_sequences_shared_out_are_what_they_are_together() -> None:
+    """Each in two pieces, one after the other."""
+
+    def halves(work, sequences: int) -> None:
+        for first, end in ((0, sequences // 2), (sequences // 2, sequences)):
+            work(first, end)
+
+    problem = measured_pendulum(20, 5)
+    together = both_ways(RULES["cubature"], *problem)[1]
+    shared = both_ways(RULES["cubature"], *problem, share=halves)[1]
+    assert torch.equal(together[0].steps.filtered.mean, shared[0].steps.filtered.mean)
+    assert torch.equal(together[0].steps.innovation_covariance, shared[0].steps.innovation_covariance)
+    for a, b in zip(together[1], shared[1], strict=True):
+        assert torch.allclose(a, b, rtol=1e-13, atol=0)
+
+
+def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gradients() -> None:
+    measurements, inputs, first = measured_pendulum(20, 2)
+
+    def noise(base):
+        return lambda x, u: base * (1.0 + x[..., :1, None] ** 2)
+
+    model, p = pendulum_with_radar(), learnt(first)
+    process, observation = noise(p.process.detach()), noise(p.observation.detach())
+    readable = dataclasses.replace(model, process_noise=process, observation_noise=observation)
+    filtered = unscented_filter(readable, measurements, inputs, first, RULES["symmetric"])
+    start = Gaussian(first.mean.clone().requires_grad_(), first.covariance)
+    own = [noise(base.detach().numpy()) for base in (p.process, p.observation)]
+    scanned = unscented_scan(TorchModel(model.transition, model.observation), measurements, inputs, start, *own, RULES["symmetric"])
+    assert torch.allclose(filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-11)
+    with pytest.raises(RuntimeError, match="has no gradients; give it as a tensor"):
+        scanned.steps.filtered.mean.sum().backward()
+
+
+def test_one_sample_at_a_time_it_is_the_same_filter() -> None:
+    measurements, inputs, first = measured_pendulum(20, 1)
+    measurements[0, 4, 0] = measurements[0, 9] = torch.nan
+    model, p = pendulum_with_radar(), learnt(first)
+    points, noises = TorchModel(model.transition, model.observation), [part.detach() for part in (p.process, p.observation)]
+    state = unscented_scan(points, measurements, inputs, first, *noises, RULES["symmetric"]).steps.filtered
+    stepper = UnscentedStepper(points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"])
+    process, observation = (noise[None].numpy() for noise in noises)
+    for k in range(20):
+        mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, lambda x, u: observation)
+        assert mean == pytest.approx(state.mean[0, k].numpy(), abs=1e-12), k
+        assert stepper.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
+
+
+def test_one_step_alone_is_the_model() -> None:
+    gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
+    model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
+    states, inputs = (torch.randn(6, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (3, 1))
+    after = moved(model, states, inputs)
+    assert torch.equal(after, swung(gravity.detach(), states, inputs))
+    (slope,) = torch.autograd.grad(after[:, 1].sum(), gravity)
+    assert slope == pytest.approx(float(-STEP * torch.sin(states[:, 0]).sum()))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"measurements": torch.zeros(5, 2)}, r"of shape \(B, T, m\) with T > 0, not \(5, 2\)"),
+        ({"measurements": torch.zeros(2, 0, 2), "inputs": torch.zeros(2, 0, 1)}, r"T > 0"),
+        ({"inputs": torch.zeros(2, 4, 1)}, "do not fit measurements"),
+        ({"initial": Gaussian(torch.zeros(3, 3), torch.eye(3))}, "does not fit 2 sequences"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(wrong: dict, message: str) -> None:
+    model: NonlinearModel = pendulum_with_radar()
+    known = ANY | {"initial": Gaussian(torch.zeros(3), torch.eye(3))} | wrong
+    points = TorchModel(model.transition, model.observation)
+    with pytest.raises(ValueError, match=message):
+        unscented_scan(points, **known, process_noise=torch.eye(3), observation_noise=torch.eye(2), rule=RULES["cubature"])

@@ -1,0 +1,64 @@
+"""``python -m fuzz``: try malformed inputs, write a row for each, and fail if any of them ends badly."""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "MPLBACKEND": "agg"}
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+
+def main() -> int:
+    """Exit code 1 if any row is bad."""
+    options = _options()
+    from fuzz.runner import Fuzzer, Row, described, summary, write_rows
+
+    with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as made:
+        started = time.monotonic()
+        folder = Path(options.folder) if options.folder else Path(made)
+        folder.mkdir(parents=True, exist_ok=True)
+        fuzzer = Fuzzer(folder, options.seed, options.family, options.generator, keep=bool(options.folder), seconds=options.seconds)
+        fuzzer.prepare()
+        indices = options.only or list(range(options.first, options.first + options.inputs))
+        print(f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after {time.monotonic() - started:.0f} s", flush=True)
+        rows: list[Row] = []
+
+        def report(row: Row) -> None:
+            rows.append(row)
+            if options.out and len(rows) % 50 == 0:
+                write_rows(rows, Path(options.out))
+            if row.verdict != "ok" or options.only:
+                print(described(row), flush=True)
+
+        fuzzer.run(indices, options.jobs, report)
+        if options.out:
+            write_rows(rows, Path(options.out))
+        if options.only and options.folder:
+            print(f"files: {', '.join(str(folder / f'{index:06d}') for index in indices)}")
+        bad = sum(row.verdict != "ok" for row in rows)
+        print(f"\n{summary(rows)}\n\n{bad} of {len(rows)} inputs ended badly; {time.monotonic() - started:.0f} s, seed {options.seed}")
+    return 1 if bad else 0
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
+    parser.add_argument("--inputs", type=int, default=3000, help="how many")
+    parser.add_argument("--seed", type=int, default=0, help="another seed makes other inputs")
+    parser.add_argument("--first", type=int, default=0, help="index to begin with")
+    parser.add_argument("--only", type=int, nargs="+", help="indices of single inputs to try again")
+    parser.add_argument("--jobs", type=int, default=2, help="children at a time")
+    parser.add_argument("--seconds", type=float, default=20.0, help="that a command may take")
+    parser.add_argument("--family", nargs="+", default=[], help="families to use; indices then count other inputs")
+    parser.add_argument("--generator", nargs="+", default=[], help="generators to use; indices then count other inputs")
+    parser.add_argument("--out", help="CSV file to write")
+    parser.add_argument("--folder", help="work here and keep every input's files")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

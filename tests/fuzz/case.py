@@ -1,0 +1,157 @@
+"""What a generator is given and what it returns, and the register of all generators."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import random
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+CANARY = "EXECUTED"
+"""Name of the file that every payload tries to make."""
+
+# so deep that some steps upwards still end inside the case's own folder, where they are noticed
+_DEPTH = ("up", "up", "up", "place")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command line to try.
+
+    Args:
+        argv: words after ``vehest``, as the operating system would hand them over (bytes where they are no UTF-8).
+        targets: files and folders, beside the output root, that the command may write, relative to the place.
+        environment: variables to set (None: to remove).
+        stdout: where standard output goes to instead of a file, for example ``/dev/full``.
+        unprivileged: whether it runs as a user without rights, so that permissions matter.
+    """
+
+    argv: tuple[str | bytes, ...]
+    targets: tuple[str, ...] = ()
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+    stdout: str | None = None
+    unprivileged: bool = False
+
+
+@dataclass(frozen=True)
+class Case:
+    """One input to make.
+
+    Args:
+        folder: the case's own; nothing above it may be touched.
+        templates: honest files made once, by the name of their template; to be copied.
+        rng: of everything that is drawn.
+        honest: whether the input is to be left as it should be, so that the command must succeed.
+        visit: how often its generator has been called before, to go through a list of ideas.
+        seconds: that its command may take.
+    """
+
+    folder: Path
+    templates: Path
+    rng: random.Random
+    honest: bool
+    visit: int
+    seconds: float = 20.0
+
+    @property
+    def place(self) -> Path:
+        """Working folder of the command."""
+        return self.folder.joinpath(*_DEPTH)
+
+    @property
+    def numbers(self) -> np.random.Generator:
+        """Random numbers by the array."""
+        return np.random.default_rng(self.rng.getrandbits(63))
+
+    def copy(self, template: str, to: str = ".") -> Path:
+        """Copy a template's folder or file into the place, and say where."""
+        source, target = self.templates / template, self.place / to
+        if source.is_dir():
+            shutil.copytree(source, target, symlinks=True, dirs_exist_ok=True)
+            return target
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target = target / source.name if target.is_dir() else target
+        shutil.copy2(source, target)
+        return target
+
+    def write(self, name: str | bytes, content: bytes | str) -> Path:
+        """Write a file into the place."""
+        import os
+
+        path = self.place / os.fsdecode(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
+        return path
+
+    def idea(self, *ideas: object) -> object:
+        """One of several ideas: all of them in turn, visit after visit."""
+        return ideas[self.visit % len(ideas)]
+
+
+Build = Callable[[Case], Command]
+
+
+@dataclass(frozen=True)
+class Generator:
+    """A way to make inputs.
+
+    Args:
+        family: module it stands in.
+        name: of the function.
+        build: writes the files of a case and returns the command.
+        needs: names of templates.
+        weight: how often it is taken, beside 1.
+        has_honest: whether there is an honest variant at all.
+    """
+
+    family: str
+    name: str
+    build: Build
+    needs: tuple[str, ...]
+    weight: int
+    has_honest: bool
+
+
+GENERATORS: list[Generator] = []
+TEMPLATES: dict[str, Callable[[Path], None]] = {}
+
+
+def generator(*needs: str, weight: int = 1, has_honest: bool = True) -> Callable[[Build], Build]:
+    """Register a generator with the templates that it copies from."""
+
+    def register(build: Build) -> Build:
+        family = build.__module__.rpartition(".")[2]
+        GENERATORS.append(Generator(family, build.__name__, build, needs, weight, has_honest))
+        return build
+
+    return register
+
+
+def template(build: Callable[[Path], None]) -> Callable[[Path], None]:
+    """Register what fills a template's folder, under the function's name."""
+    TEMPLATES[build.__name__] = build
+    return build
+
+
+def load_families() -> None:
+    """Import every module of `fuzz.families`, which registers its generators."""
+    from fuzz import families
+
+    for module in sorted(pkgutil.iter_modules(families.__path__), key=lambda one: one.name):
+        importlib.import_module(f"{families.__name__}.{module.name}")
+
+
+def schedule(chosen: list[Generator]) -> list[Generator]:
+    """The generators in the order in which they take turns; heavier ones come more than once a round."""
+    rounds = [one for turn in range(max(one.weight for one in chosen)) for one in chosen if one.weight > turn]
+    return rounds
+
+
+def is_honest(one: Generator, position: int, visit: int) -> bool:
+    """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
+    return one.has_honest and (visit + position) % 8 == 0

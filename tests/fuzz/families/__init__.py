@@ -1,0 +1,1 @@
+"""A module a family of inputs; importing it registers its generators."""

@@ -1,0 +1,260 @@
+"""MDF files of versions 3 and 4: conversions, formulas that hold code, packed blocks, links that go round, flipped bytes."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fuzz.case import CANARY, Case, Command, generator, template
+from fuzz.mutations import NAMES, spoil_bytes
+
+TIME = np.arange(0, 301) / 50.0
+FORMULA = "X1*1+000000000000000000000000000000000000000000000000000000000000000000"
+CHANNELS = {
+    "vx": {"column": "v", "unit": "m/s"},
+    "yaw_rate": {"column": "r", "unit": "rad/s"},
+    "ay": {"column": "a", "unit": "m/s²"},
+}
+DECLARED = {
+    "name": "measured",
+    "kind": "real",
+    "vehicle": "car",
+    "licence": "none",
+    "citation": "none",
+    "source": "mdf",
+    "path": "${root}",
+    "files": "*.m*",
+    "rate_hz": 50,
+    "raster": None,
+    "channels": CHANNELS,
+    "gappy": [],
+    "file_units": "check",
+    "accept": [],
+}
+
+
+def _signals(conversion: Any = None, **more: Any) -> list[Any]:
+    import asammdf
+
+    return [
+        asammdf.Signal(20.0 + np.sin(TIME), TIME, name="v", unit="m/s", conversion=conversion, **more),
+        asammdf.Signal(0.1 * np.sin(TIME + 0.2), TIME, name="r", unit="rad/s"),
+        asammdf.Signal(2.0 * np.sin(TIME + 0.3), TIME, name="a", unit="m/s^2"),
+    ]
+
+
+def _write(file: Path, signals: list[Any], version: str = "4.10", **options: Any) -> None:
+    import asammdf
+
+    with asammdf.MDF(version=version) as measurement:
+        measurement.append(signals, acq_name="Only", comment="made", common_timebase=True)
+        saved = Path(measurement.save(file, overwrite=True, **options))
+    saved.rename(file)
+
+
+@template
+def mdf(folder: Path) -> None:
+    """Measurements of versions 3 and 4, plain, packed, with every kind of conversion."""
+    (folder / "raw").mkdir()
+    (folder / "conf" / "dataset").mkdir(parents=True)
+    (folder / "conf" / "dataset" / "measured.yaml").write_text(yaml.safe_dump(DECLARED, allow_unicode=True), encoding="utf-8")
+    (folder / "files").mkdir()
+    for name, version, options in (
+        ("v4", "4.10", {}),
+        ("v4dz", "4.10", {"compression": 2}),
+        ("v42", "4.20", {"compression": 1}),
+        ("v3", "3.30", {}),
+        ("v2", "2.14", {}),
+    ):
+        _write(folder / "files" / name, _signals(), version, **options)
+    linear, pairs = {"a": 0.5, "b": 1.0}, {"raw_0": 0, "phys_0": 5.0, "raw_1": 50, "phys_1": 90.0, "interpolation": True}
+    rational = {"P1": 0.0, "P2": 2.0, "P3": 1.0, "P4": 0.0, "P5": 0.0, "P6": 1.0}
+    for version, name in (("4.10", "v4"), ("3.30", "v3")):
+        for kind, conversion in (("linear", linear), ("table", pairs), ("rational", rational)):
+            _write(folder / "files" / f"{name}_{kind}", _signals(conversion), version)
+        _write(folder / "files" / f"{name}_formula", _signals({"formula": FORMULA}), version)
+
+
+def _place(case: Case, name: str) -> Path:
+    case.copy("mdf/conf", "conf")
+    (case.place / "raw").mkdir()
+    file = case.place / "raw" / ("drive.mf4" if name.startswith("v4") else "drive.mdf")
+    file.write_bytes((case.templates / "mdf" / "files" / name).read_bytes())
+    return file
+
+
+def _reads(case: Case) -> Command:
+    return Command(("data", str(case.idea("check", "show")), "measured") if case.rng.random() < 0.6 else ("ingest", "measured"))
+
+
+KINDS = ("v4", "v4dz", "v42", "v3", "v2", "v4_linear", "v4_table", "v4_rational", "v3_linear", "v3_table", "v3_rational")
+
+
+@generator("mdf", weight=6)
+def bytes_of_mdf(case: Case) -> Command:
+    file = _place(case, case.rng.choice(KINDS))
+    if not case.honest:
+        content = file.read_bytes()
+        at = case.rng.choice([0, 0, 64, len(content) // 2])
+        file.write_bytes(content[:at] + spoil_bytes(content[at:], case.rng))
+    return _reads(case)
+
+
+PAYLOADS = (
+    f"__import__('os').system('touch {CANARY}')",
+    f"open('{CANARY}','w')",
+    "().__class__.__base__.__subclasses__()",
+    "9**9**9**9",
+    "exec('1')",
+    "eval('1')",
+    "X1+__import__('sly').x",
+    "[x for x in range(10**9)]",
+    "lambda: 1",
+    "X1.__class__",
+    "sin(X1)+cos(X2)/0",
+    "factorial(10**6)",
+    "(" * 30 + "X1" + ")" * 30,
+    "print(1)",
+    "1e400*X1",
+    "X1 if X1 else 1",
+    "'a'*10**9",
+    "X1;import os",
+    "\x1b[2J",
+    "",
+)
+
+
+@generator("mdf", weight=3)
+def formulas(case: Case) -> Command:
+    """The text of a formula is overwritten in its place."""
+    name = "v4" if case.visit % 2 else "v3"
+    if case.honest:
+        _place(case, f"{name}_linear")
+        return _reads(case)
+    file = _place(case, f"{name}_formula")
+    text = PAYLOADS[case.visit // 2 % len(PAYLOADS)].encode()
+    file.write_bytes(
+        file.read_bytes().replace(FORMULA.encode(), text[: len(FORMULA)].ljust(len(FORMULA), b" " if case.rng.random() < 0.5 else b"\0"))
+    )
+    return _reads(case)
+
+
+def _blocks(content: bytes) -> list[tuple[int, bytes, int, int]]:
+    """Offset, kind, length and number of links of every block of an MDF 4 file."""
+    found, at = [], content.find(b"##")
+    while at >= 0:
+        length, links = struct.unpack("<QQ", content[at + 8 : at + 24]) if at + 24 <= len(content) else (0, 0)
+        if at % 8 == 0 and 24 <= length <= len(content) and links < 1000:
+            found.append((at, content[at : at + 4], length, links))
+        at = content.find(b"##", at + 2)
+    return found
+
+
+@generator("mdf", weight=6)
+def links(case: Case) -> Command:
+    """A link leads back, to another kind of block, into the middle of nowhere, or behind the end."""
+    file = _place(case, case.rng.choice(["v4", "v4dz", "v4_table", "v4_rational", "v4_formula"] if not case.honest else ["v4"]))
+    if not case.honest:
+        content = bytearray(file.read_bytes())
+        blocks = [block for block in _blocks(content) if block[3]]
+        for _ in range(case.rng.choice([1, 1, 2])):
+            at, _kind, _length, count = case.rng.choice(blocks)
+            target = case.rng.choice(
+                [at, case.rng.choice(blocks)[0], case.rng.choice(blocks)[0], 0, 64, len(content), 2**62, case.rng.randrange(len(content))]
+            )
+            struct.pack_into("<Q", content, at + 24 + 8 * case.rng.randrange(count), target)
+        file.write_bytes(content)
+    return _reads(case)
+
+
+@generator("mdf", weight=3)
+def fields_of_blocks(case: Case) -> Command:
+    """A number in a block becomes another: lengths, counts, types, flags, offsets of bits."""
+    file = _place(case, case.rng.choice(KINDS))
+    if not case.honest:
+        content = bytearray(file.read_bytes())
+        if content[:3] == b"MDF" and _blocks(content):
+            wanted = [b"##CN", b"##CG", b"##DG", b"##DZ", b"##DT", b"##CC", b"##HD", b"##DL", b"##HL", b"##SI", b"##TX"]
+            blocks = [block for block in _blocks(content) if block[1] in wanted]
+            at, _kind, length, count = case.rng.choice(blocks)
+            body = case.rng.choice([at + 8, at + 16, at + 24 + 8 * count + case.rng.randrange(max(1, min(64, length - 24 - 8 * count)))])
+        else:
+            body = case.rng.randrange(64, min(2000, len(content)))
+        value = case.rng.choice([0, 1, 255, 2**15, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1])
+        width = case.rng.choice([1, 2, 4, 8])
+        content[body : body + width] = (value % 2 ** (8 * width)).to_bytes(width, "little")
+        file.write_bytes(content)
+    return _reads(case)
+
+
+@generator("mdf", weight=2)
+def packed_blocks(case: Case) -> Command:
+    """A packed block unpacks to much more, or to less, than it says."""
+    file = _place(case, "v4dz")
+    if not case.honest:
+        content = bytearray(file.read_bytes())
+        (at, *_rest), *_more = [block for block in _blocks(content) if block[1] == b"##DZ"]
+        packer = zlib.compressobj(9)
+        size = case.rng.choice([10, 100, 500]) * 2**20
+        packed = b"".join(packer.compress(bytes(2**20)) for _ in range(size // 2**20)) + packer.flush()
+        if case.rng.random() < 0.3:
+            packed = spoil_bytes(packed, case.rng)
+        said = case.rng.choice([size, size, 2**40, 100, 0])
+        head = struct.pack("<4sIQQ", b"##DZ", 0, 48 + len(packed), 0) + struct.pack("<2sBBIQQ", b"DT", 0, 0, 0, said, len(packed))
+        moved = len(content) + (-len(content) % 8)
+        content += bytes(moved - len(content)) + head + packed
+        for place, _kind, _length, count in _blocks(bytes(content[:moved])):
+            for link in range(count):
+                if struct.unpack_from("<Q", content, place + 24 + 8 * link)[0] == at:
+                    struct.pack_into("<Q", content, place + 24 + 8 * link, moved)
+        if case.rng.random() < 0.6:  # and as many records as would fit
+            for place, kind, _length, count in _blocks(bytes(content[:moved])):
+                if kind == b"##CG":
+                    struct.pack_into("<Q", content, place + 24 + 8 * count + 8, size // 32)
+        file.write_bytes(content)
+    return _reads(case)
+
+
+@generator("mdf", weight=2)
+def contents_of_mdf(case: Case) -> Command:
+    """Sound files of the library's own writer whose contents make no sense."""
+    import asammdf
+
+    file = _place(case, "v4")
+    if case.honest:
+        return _reads(case)
+    n, rng = len(TIME), case.rng
+    stamps = [
+        np.where(np.arange(n) == 99, 1e9, TIME),
+        TIME[::-1],
+        np.zeros(n),
+        np.full(n, np.nan),
+        TIME * 1e12,
+        TIME * 1e-12,
+        TIME + 1e17,
+        np.append(TIME[:-1], 1e300),
+    ]
+    ideas: list[Any] = [
+        *(lambda t=t: [asammdf.Signal(np.ones(n), t, name=name) for name in "vra"] for t in stamps),
+        lambda: [asammdf.Signal(np.array([b"text"] * n), TIME, name="v", encoding="utf-8"), *_signals()[1:]],
+        lambda: [asammdf.Signal(np.zeros(n, dtype=[("v", "(3,)<f8")]), TIME, name="v"), *_signals()[1:]],
+        lambda: [asammdf.Signal(np.full(n, np.nan), TIME, name="v"), *_signals()[1:]],
+        lambda: [asammdf.Signal(np.full(n, 2**63, "u8"), TIME, name="v"), *_signals()[1:]],
+        lambda: [
+            asammdf.Signal(np.ones(n), TIME, name="v", unit=rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "")),
+            *_signals()[1:],
+        ],
+        lambda: [asammdf.Signal(np.ones(n), TIME, name=rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "") or "x"), *_signals()[1:]],
+        lambda: _signals({"a": 1e308, "b": 1e308}),
+        lambda: _signals({"P1": 0.0, "P2": 1.0, "P3": 0.0, "P4": 0.0, "P5": 0.0, "P6": 0.0}),
+        lambda: _signals({"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"\x1b[31m", "default": b"?"}),
+        lambda: [*_signals(), *(asammdf.Signal(np.ones(n), TIME, name=f"s{k}") for k in range(400))],
+        lambda: _signals() + _signals(),
+    ]
+    _write(file, ideas[case.visit % len(ideas)]())
+    return _reads(case)

@@ -1,0 +1,292 @@
+"""The Revs database: official CSV and MAT files, a folder of text files, tables of vehicle parameters."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from scipy.io import savemat
+
+from fuzz.case import Case, Command, generator, template
+from fuzz.honest import write_yaml
+from fuzz.mutations import NAMES, spoil_bytes
+from revs_files import PREAMBLE, smooth_drive, write_csv, write_mat, write_vehicle_parameters
+
+NAME = "20140222_01_01_03_250lm"
+SECONDS = 3.0
+DATASET = f"dataset.recordings=[{NAME}]"
+
+
+@template
+def revs(folder: Path) -> None:
+    """A recording in both official layouts, its car's parameters, and a recording as text files."""
+    (folder / "raw" / "revs" / "lap").mkdir(parents=True)
+    drive, truth = smooth_drive(SECONDS, start_time=12.5, decimals=6)
+    write_csv(folder / "raw" / "revs" / f"{NAME}.csv", drive)
+    write_mat(folder / "raw" / "revs" / f"{NAME}.mat", drive)
+    write_mat(folder / "raw" / "revs" / "plain.mat", drive, compressed=False)
+    write_vehicle_parameters(folder / "raw" / "revs" / "250lm.csv")
+    time = 12.5 + np.arange(len(truth["vx"]) // 10) / 100
+    for name, samples in {"t": time, **{name: truth[name][::10] for name in ("vx", "yaw_rate", "ax", "ay", "steer", "vy_ref")}}.items():
+        np.savetxt(folder / "raw" / "revs" / "lap" / f"{name}.txt", samples, fmt="%.6f")
+    declared = {"name": "text", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "revs", "layout": "text"}
+    declared |= {"path": "${root}/revs", "recordings": ["lap"], "time": {"column": "t", "unit": "s"}, "gappy": [], "clock": "strict"}
+    channels = {name: {"column": name, "unit": unit} for name, unit in TEXT.items()}
+    write_yaml(folder / "conf" / "dataset" / "text.yaml", declared | {"channels": channels})
+
+
+TEXT = {"vx": "m/s", "yaw_rate": "rad/s", "ax": "m/s²", "ay": "m/s²", "steer": "rad", "vy_ref": "m/s"}
+
+
+def _ingest(case: Case, *overrides: str) -> Command:
+    words = ("revs_targa_2014", DATASET, *overrides)
+    return Command(("data", "check", *words) if case.rng.random() < 0.5 else ("ingest", *words))
+
+
+def _csv(case: Case) -> Path:
+    case.copy("revs")
+    return case.place / "raw" / "revs" / f"{NAME}.csv"
+
+
+@generator("revs", weight=2)
+def bytes_of_csv(case: Case) -> Command:
+    file = _csv(case)
+    if not case.honest:
+        content = file.read_bytes()
+        at = len(content) if case.rng.random() < 0.5 else 2000
+        file.write_bytes(spoil_bytes(content[:at], case.rng) + content[at:])
+    return _ingest(case)
+
+
+@generator("revs", weight=2)
+def head_of_csv(case: Case) -> Command:
+    file, rng = _csv(case), case.rng
+    if not case.honest:
+        lines = file.read_bytes().split(b"\r\n")
+        at = len(PREAMBLE)
+        spoilt = [
+            lambda: lines[3:],
+            lambda: lines[:at] + lines[at + 1 :],
+            lambda: lines[: at + 1] + lines[at + 2 :],
+            lambda: [b"x" * 3_000_000, *lines],
+            lambda: [b"\xff\xfe\x00", *lines[1:]],
+            lambda: [rng.choice(NAMES).encode("utf-8", "replace"), *lines[1:]],
+            lambda: [*lines[:at], lines[at].replace(b"vxCG", b"vyCG"), *lines[at + 1 :]],
+            lambda: [*lines[:at], lines[at].replace(b"vxCG", b"\x1b[31mvx"), *lines[at + 1 :]],
+            lambda: [
+                *lines[: at + 1],
+                lines[at + 1].replace(b"m/s", rng.choice([b"km/h", b"", b"furlong", b"\x1b[2J", b"x" * 9999])),
+                *lines[at + 2 :],
+            ],
+            lambda: lines[: at + 2],
+            lambda: [b"", b""],
+            lambda: [b",".join(lines[at].split(b",")[:5]), *lines],
+            lambda: [line.replace(b",", b";") for line in lines],
+        ]
+        file.write_bytes(b"\r\n".join(spoilt[case.visit % len(spoilt)]()))
+    more = [] if case.honest else rng.choice([[], [], [f"dataset.preamble_lines={rng.choice([0, -1, 9, 10**9, 'a', 1.5, 'null'])}"]])
+    return _ingest(case, *more)
+
+
+@generator("revs", weight=2)
+def rows_of_csv(case: Case) -> Command:
+    drive, _ = smooth_drive(SECONDS)
+    file = _csv(case)
+    if not case.honest:
+        signals = dict(drive.signals)
+        for name in case.rng.sample(sorted(signals), 2):
+            values = signals[name].copy()
+            values[case.rng.randrange(len(values)) :] *= case.rng.choice([np.nan, np.inf, 1e300, 0.0, -1.0])
+            signals[name] = values
+        write_csv(
+            file,
+            type(drive)(drive.seconds, signals, case.rng.choice([0.0, 1e17, -5.0, 1e9])),
+            blank_rows=case.rng.choice([0, 37, 2999, 3000]),
+        )
+    return _ingest(case)
+
+
+def _mat(case: Case) -> Path:
+    case.copy("revs")
+    file = case.place / "raw" / "revs" / f"{NAME}.mat"
+    if case.rng.random() < 0.5:
+        (case.place / "raw" / "revs" / "plain.mat").replace(file)
+    return file
+
+
+def _ingest_mat(case: Case, *overrides: str) -> Command:
+    return _ingest(case, "dataset.layout=mat", *overrides)
+
+
+@generator("revs", weight=4)
+def bytes_of_mat(case: Case) -> Command:
+    file = _mat(case)
+    if not case.honest:
+        content = file.read_bytes()
+        at = case.rng.choice([len(content), 300, 1000])
+        file.write_bytes(spoil_bytes(content[:at], case.rng) + content[at:])
+    return _ingest_mat(case)
+
+
+@generator("revs", weight=3)
+def inside_compressed_mat(case: Case) -> Command:
+    """The elements are unpacked, spoilt and packed again."""
+    case.copy("revs")
+    file = case.place / "raw" / "revs" / f"{NAME}.mat"
+    if not case.honest:
+        content = file.read_bytes()
+        made, at = content[:128], 128
+        while at < len(content):
+            kind, length = struct.unpack("<II", content[at : at + 8])
+            packed = content[at + 8 : at + 8 + length]
+            if kind == 15 and case.rng.random() < 0.6:
+                packed = zlib.compress(spoil_bytes(zlib.decompress(packed), case.rng), 1)
+            made += struct.pack("<II", kind, len(packed)) + packed
+            at += 8 + length
+        file.write_bytes(made)
+    return _ingest_mat(case)
+
+
+def _element(kind: int, body: bytes) -> bytes:
+    return struct.pack("<II", kind, len(body)) + body + bytes(-len(body) % 8)
+
+
+@generator("revs", weight=2)
+def made_up_mat(case: Case) -> Command:
+    """Files written by hand: bombs, nesting, dimensions that multiply to more than there is."""
+    file = _mat(case)
+    if case.honest:
+        return _ingest_mat(case)
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
+    flags = _element(6, struct.pack("<II", 6, 0))
+
+    def matrix(rows: int, columns: int, data: bytes, name: bytes = b"x") -> bytes:
+        return _element(14, flags + _element(5, struct.pack("<ii", rows, columns)) + _element(1, name) + _element(9, data))
+
+    def nested(depth: int) -> bytes:
+        body = matrix(1, 1, bytes(8), b"")
+        for _ in range(depth):
+            body = _element(14, _element(6, struct.pack("<II", 1, 0)) + _element(5, struct.pack("<ii", 1, 1)) + _element(1, b"") + body)
+        return body
+
+    def packed(body: bytes) -> bytes:
+        short = zlib.compress(body, 9)
+        return struct.pack("<II", 15, len(short)) + short
+
+    def bomb(megabytes: int) -> bytes:
+        packer = zlib.compressobj(9)
+        size = megabytes * 2**20
+        parts = [
+            packer.compress(struct.pack("<II", 14, size + 56) + flags + _element(5, struct.pack("<ii", size // 8, 1)) + _element(1, b"x"))
+        ]
+        parts += (
+            [packer.compress(struct.pack("<II", 9, size))] + [packer.compress(bytes(2**20)) for _ in range(megabytes)] + [packer.flush()]
+        )
+        short = b"".join(parts)
+        return struct.pack("<II", 15, len(short)) + short
+
+    ideas = [
+        lambda: bomb(int(case.rng.choice([100, 600, 1500]))),
+        lambda: nested(20_000),
+        lambda: packed(nested(20_000)),
+        lambda: packed(packed(packed(matrix(1, 1, bytes(8))))),
+        lambda: matrix(2**31 - 1, 2**31 - 1, bytes(8)),
+        lambda: matrix(-1, -1, bytes(8)),
+        lambda: matrix(1, 1, bytes(8), b"x" * 100_000),
+        lambda: matrix(1, 1, bytes(8), b"\x1b[2J"),
+        lambda: struct.pack("<II", 14, 2**32 - 1) + bytes(100),
+        lambda: struct.pack("<II", 15, 2**31) + bytes(100),
+        lambda: struct.pack("<II", 14, 0) * 500_000,
+        lambda: b"".join(matrix(1, 1, bytes(8), b"x%d" % k) for k in range(30_000)),
+        lambda: b"",
+    ]
+    file.write_bytes(head + ideas[case.visit % len(ideas)]())
+    return _ingest_mat(case)
+
+
+@generator("revs", weight=2)
+def contents_of_mat(case: Case) -> Command:
+    """Structs as SciPy writes them, with other shapes, types and clocks than the official ones."""
+    file = _mat(case)
+    if case.honest:
+        return _ingest_mat(case)
+    drive, _ = smooth_drive(SECONDS)
+    rng, names = case.rng, list(drive.signals)
+    structs = {
+        name: {
+            "value": drive.signals[name][:, None],
+            "time": (np.arange(len(drive.signals[name])) * SECONDS / len(drive.signals[name]))[:, None],
+        }
+        for name in names
+    }
+    name, part = rng.choice([one for one in names if "CG" in one or one == "handwheelAngle"]), rng.choice(["value", "time"])
+    n = len(structs[name]["time"])
+    values = [
+        np.zeros((n, 2)), np.zeros((n, 1)) * 1j, np.array(["a"] * n), np.array([], float), np.full((n, 1), np.nan), np.full((n, 1), np.inf),
+        np.zeros((n + 1, 1)), np.arange(n)[::-1, None] / 100, np.where(np.arange(n) == n // 2, 1e9, np.arange(n) / 100.0)[:, None], "text",
+        np.arange(n, dtype="u1")[:, None], {"deeper": {"value": 1.0}}, np.ones((n, 1), bool), np.arange(n)[:, None] * 1e-12,
+        1e300 * np.arange(n)[:, None],
+    ]  # fmt: skip
+    structs[name][part] = values[case.visit % len(values)]
+    savemat(
+        file,
+        {"insData": structs, "driverData": {one: structs.pop(one) for one in names if one == "handwheelAngle"}, "tireData": {}},
+        oned_as="column",
+    )
+    return _ingest_mat(case, *rng.choice([[], ["dataset.rate_hz=1000"], ["dataset.rate_hz=1e12"], ["dataset.clock=interpolate"]]))
+
+
+@generator("revs", weight=2)
+def text_files(case: Case) -> Command:
+    case.copy("revs")
+    folder = case.place / "raw" / "revs" / "lap"
+    file = folder / f"{case.rng.choice(['t', 'vx', 'ay', 'vy_ref'])}.txt"
+    if not case.honest:
+        lines, rng = file.read_text().splitlines(), case.rng
+        ideas = [
+            lambda: file.write_bytes(spoil_bytes(file.read_bytes(), rng)),
+            lambda: file.write_text(
+                "\n".join([*lines, rng.choice(["nan", "inf", "1e400", "a", "1 2", "0x10", "\x1b[2J", "1_0", "9" * 5000])])
+            ),
+            lambda: file.write_text("\n".join(lines[:-1])),
+            lambda: file.write_text(""),
+            lambda: file.write_text("\n" * 100),
+            lambda: (file.unlink(), os.mkfifo(file)),
+            lambda: (file.unlink(), file.symlink_to("/dev/zero")),
+            lambda: (file.unlink(), file.mkdir()),
+            lambda: file.unlink(),
+            lambda: file.write_bytes("\n".join(lines).encode("utf-16")),
+            lambda: file.write_text("1" * 20_000_000),
+            lambda: file.write_text("\n".join([lines[0], str(float(lines[1]) + 1e9), *lines[2:]])),
+            lambda: file.write_text("0\n" * 3_000_000),
+        ]
+        ideas[case.visit % len(ideas)]()
+    return Command(
+        ("data", "check", "text") if case.rng.random() < 0.5 else ("ingest", "text", *case.rng.choice([[], ["dataset.clock=interpolate"]]))
+    )
+
+
+@generator("revs", weight=2)
+def vehicle_parameters(case: Case) -> Command:
+    case.copy("revs")
+    file, rng = case.place / "raw" / "revs" / "250lm.csv", case.rng
+    if not case.honest:
+        content = file.read_bytes()
+        ideas = [
+            lambda: spoil_bytes(content, rng),
+            lambda: b"",
+            lambda: b"a\n",
+            lambda: content.replace(b"982.0", rng.choice([b"nan", b"inf", b"1e400", b"x", b"", b"9" * 5000, b"\x1b[2J"])),
+            lambda: content.replace(b"mass", rng.choice(NAMES).encode("utf-8", "replace")),
+            lambda: content.replace(b"mass", b"wheelbase"),
+            lambda: b",".join(b"c%d" % k for k in range(100_000)) + b"\n",
+            lambda: content.decode("latin-1").encode("utf-16"),
+            lambda: bytes(5_000_000),
+            lambda: content + b"\n".join(b"1" for _ in range(500_000)),
+            lambda: b'"' + content,
+        ]
+        file.write_bytes(ideas[case.visit % len(ideas)]())
+    return Command(("ingest", "revs_targa_2014", DATASET, "dataset.vehicle_parameters=250lm.csv"))

@@ -1,0 +1,301 @@
+"""The process that imports once, and the workers that build inputs and fork a child for each."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import gc
+import io
+import json
+import multiprocessing
+import os
+import random
+import select
+import shlex
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from fuzz.case import GENERATORS, TEMPLATES, Case, Command, Generator, is_honest, load_families, schedule
+from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
+from fuzz.watched import become
+from vehest.data.errors import printable
+
+MOST_WALL_SECONDS = 180.0
+PLANTED = "planted"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One input and what became of it: a line of the CSV file."""
+
+    index: int
+    family: str
+    generator: str
+    honest: bool
+    command: str
+    exit_code: int
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float
+    error: str
+    verdict: str
+    detail: str
+
+
+class Fuzzer:
+    """Everything that is imported and made once.
+
+    Args:
+        folder: to work in; templates and cases go there.
+        seed: of all inputs.
+        families: names of those to use; all if there are none.
+        generators: names of those to use; all if there are none.
+        keep: whether the cases' folders stay.
+        seconds: that a command may take.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        seed: int,
+        families: Sequence[str] = (),
+        generators: Sequence[str] = (),
+        *,
+        keep: bool = False,
+        seconds: float = 20.0,
+    ) -> None:
+        self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
+        load_families()
+        wanted = families or sorted({one.family for one in GENERATORS} - {PLANTED})
+        chosen = [one for one in GENERATORS if one.family in wanted and (not generators or one.name in generators)]
+        if not chosen:
+            raise SystemExit("no generator has such a name")
+        self.turns = schedule(chosen)
+
+    def prepare(self) -> None:
+        """Import what commands import, and make the templates that generators copy from."""
+        self.folder.chmod(0o711)  # for commands that run as a user without rights
+        if all(one.family == PLANTED for one in self.turns):
+            return
+        from fuzz import honest, warming
+
+        warming.import_everything()
+        first = self.folder / "templates" / "first"
+        first.mkdir(parents=True)
+        with _quiet(first):
+            honest.warm_up(first)
+        for name in sorted({name for one in self.turns for name in one.needs}):
+            folder = self.folder / "templates" / name
+            folder.mkdir(parents=True)
+            with _quiet(folder):
+                TEMPLATES[name](folder)
+
+    def generator_of(self, index: int) -> tuple[Generator, int, bool]:
+        """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
+        position, visit = index % len(self.turns), index // len(self.turns)
+        one = self.turns[position]
+        turns_before = self.turns[:position].count(one)
+        return one, visit * one.weight + turns_before, is_honest(one, position, visit)
+
+    def run(self, indices: Sequence[int], jobs: int, report: Callable[[Row], None]) -> None:
+        """Try inputs in ``jobs`` workers, and report each as it ends."""
+        gc.collect()
+        gc.freeze()  # what is here stays; children need not copy it to look through it
+        context = multiprocessing.get_context("fork")
+        at, rows = context.Value("q", 0), context.SimpleQueue()
+        workers = [context.Process(target=self._work, args=(indices, at, rows, os.getpid())) for _ in range(min(jobs, len(indices)))]
+        sys.stdout.flush()
+        for worker in workers:
+            worker.start()
+        for _ in indices:
+            report(rows.get())
+        for worker in workers:
+            worker.join()
+
+    def _work(self, indices: Sequence[int], at: Any, rows: Any, parent: int) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        while os.getppid() == parent:
+            with at.get_lock():
+                position = at.value
+                at.value += 1
+            if position >= len(indices):
+                return
+            rows.put(self.try_one(indices[position]))
+
+    def try_one(self, index: int) -> Row:
+        """Make one input, run its command in a forked child, and judge."""
+        one, visit, honest = self.generator_of(index)
+        case = self.case_of(index, visit, honest)
+        try:
+            command = one.build(case)
+        except Exception:
+            detail = printable(" | ".join(traceback.format_exc().splitlines()[-4:]))
+            return Row(index, one.family, one.name, honest, "", 0, 0.0, 0.0, 0.0, "", "generator failed", detail)
+        outcome = _watch(case, command)
+        verdict, detail = judge(case, command, outcome)
+        if not self.keep:
+            _remove(case.folder)
+        error = last_line("\n".join(refusal_lines(outcome.stderr)))
+        return Row(
+            index,
+            one.family,
+            one.name,
+            honest,
+            _shown(command, case),
+            outcome.exit_code,
+            round(outcome.seconds, 3),
+            round(outcome.cpu_seconds, 3),
+            round(outcome.peak_mb, 1),
+            _line(error.replace(str(case.folder), "…")),
+            verdict,
+            _line(detail.replace(str(case.folder), "…")),
+        )
+
+    def case_of(self, index: int, visit: int, honest: bool) -> Case:
+        """An empty folder for an input; what is drawn depends on seed and index alone."""
+        folder = self.folder / f"{index:06d}"
+        _remove(folder)
+        case = Case(folder, self.folder / "templates", random.Random(f"{self.seed}-{index}"), honest, visit, self.seconds)
+        for made in (case.place, folder / "tmp", folder / "home", folder / "log"):
+            made.mkdir(parents=True)
+        return case
+
+
+def _watch(case: Case, command: Command) -> Outcome:
+    """Run a command in a forked child and see what it does."""
+    if command.unprivileged and os.getuid() == 0:
+        _hand_over(case.folder)
+    before = snapshot(case.folder)
+    started = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        become(case, command)
+    process = os.pidfd_open(child)
+    while not _ends(process, case.seconds + 1.0 - _seconds(child, started)):
+        if _seconds(child, started) > case.seconds or time.monotonic() - started > MOST_WALL_SECONDS:
+            os.killpg(child, signal.SIGKILL)
+            break
+    os.close(process)
+    seconds = _seconds(child, started)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(child, signal.SIGKILL)  # whatever it has started; its number is its own until it is waited for
+    _, status, used = os.wait4(child, 0)
+    logs = case.folder / "log"
+    events = [json.loads(line) for line in _text(logs / "events").splitlines()]
+    imports_kb = next((value for key, value in events if key == "rss"), used.ru_maxrss)
+    return Outcome(
+        exit_code=os.waitstatus_to_exitcode(status),
+        seconds=seconds,
+        cpu_seconds=used.ru_utime + used.ru_stime,
+        peak_mb=max(0, used.ru_maxrss - imports_kb) / 1024,
+        stdout=_text(logs / "stdout"),
+        stderr=_text(logs / "stderr"),
+        events=tuple((key, str(value)) for key, value in events if key != "rss"),
+        changed=differences(before, snapshot(case.folder)),
+        stack=" < ".join(line.strip() for line in _text(logs / "stack").splitlines() if line.startswith("  File"))[:1500],
+    )
+
+
+def _ends(process: int, seconds: float) -> bool:
+    """Whether a process ends within some seconds."""
+    poll = select.poll()
+    poll.register(process, select.POLLIN)
+    return bool(poll.poll(max(seconds, 0.1) * 1000))
+
+
+def _seconds(child: int, started: float) -> float:
+    """Wall clock since the start, less what the child has waited for a core on a machine that has others to serve."""
+    try:
+        waited = int(Path(f"/proc/{child}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):
+        waited = 0.0
+    return time.monotonic() - started - waited
+
+
+def _hand_over(folder: Path) -> None:
+    for path in (folder, *folder.rglob("*")):
+        os.chown(path, 65534, 65534, follow_symlinks=False)
+
+
+def _remove(folder: Path) -> None:
+    if folder.exists():
+        for inside, _, _ in os.walk(folder):
+            with contextlib.suppress(OSError):
+                os.chmod(inside, 0o700)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _text(path: Path) -> str:
+    """A log as text, the first megabytes of it."""
+    try:
+        with open(path, "rb") as stream:
+            return stream.read(4_000_000).decode("utf-8", "backslashreplace")
+    except OSError:
+        return ""
+
+
+def _shown(command: Command, case: Case) -> str:
+    words = [os.fsdecode(word).replace(str(case.place), ".") for word in command.argv]
+    cut = [word if len(word) <= 160 else f"{word[:150]}…({len(word)} characters)" for word in words]
+    return printable(" ".join(shlex.quote(word) for word in cut))[:600]
+
+
+def _line(text: str) -> str:
+    return printable(text)[:200]
+
+
+@contextlib.contextmanager
+def _quiet(folder: Path) -> Iterator[None]:
+    """Work in a folder, with what is printed kept back."""
+    here, out, err = os.getcwd(), sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
+    os.chdir(folder)
+    try:
+        yield
+    except BaseException:
+        out.write(sys.stdout.getvalue() + sys.stderr.getvalue())
+        raise
+    finally:
+        os.chdir(here)
+        sys.stdout, sys.stderr = out, err
+
+
+def write_rows(rows: Sequence[Row], path: Path) -> None:
+    """Rows as CSV, in the order of their index."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
+        writer.writeheader()
+        for row in sorted(rows, key=lambda one: one.index):
+            writer.writerow(asdict(row))
+
+
+def described(row: Row) -> str:
+    """A row for people, on two lines."""
+    kind, took = " (honest)" if row.honest else "", f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
+    return (
+        f"{row.verdict:<13} {row.index:>5} {row.family}/{row.generator}{kind}: vehest {row.command}\n"
+        f"{'':13} exit {row.exit_code}, {took}, {row.peak_mb:.0f} MB: {row.error or '-'} {row.detail}"
+    )
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """A line a family: how many inputs, how many honest ones, and how they ended."""
+    verdicts = [verdict for verdict, _ in Counter(row.verdict for row in rows).most_common()]
+    lines = [["family", "inputs", "honest", "done", *verdicts]]
+    for family in [*sorted({row.family for row in rows}), ""]:
+        own = [row for row in rows if not family or row.family == family]
+        counted = [sum(row.verdict == verdict for row in own) for verdict in verdicts]
+        lines.append(
+            [family or "all", *map(str, (len(own), sum(row.honest for row in own), sum(row.exit_code == 0 for row in own), *counted))]
+        )
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)

@@ -1,0 +1,99 @@
+"""Two hundred malformed inputs end well, and a harness that would notice if they did not."""
+
+from __future__ import annotations
+
+import csv
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fuzz.case import Case, Command
+from fuzz.families.planted import MISDEEDS
+from fuzz.runner import Fuzzer
+from fuzz.verdicts import VERDICTS, Outcome, differences, judge, snapshot
+
+TESTS = Path(__file__).parents[1]
+
+
+def rows_of(folder: Path, *options: str) -> list[dict[str, str]]:
+    """Rows of a run of the harness, in a process of its own."""
+    out = folder / "fuzz.csv"
+    paths = [str(TESTS), str(TESTS / "sources"), str(TESTS.parent / "src"), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    command = [sys.executable, "-m", "fuzz", "--out", str(out), *options]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert out.is_file(), ended.stdout + ended.stderr
+    with open(out, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_two_hundred_malformed_inputs_end_with_a_result_or_one_line(tmp_path):
+    rows = rows_of(tmp_path, "--inputs", "200", "--jobs", "2")
+    assert len(rows) == 200
+    honest = [row for row in rows if row["honest"] == "True"]
+    assert len(honest) >= 15
+    assert len({row["family"] for row in rows}) >= 9
+    bad = [f"{row['verdict']}: {row['family']}/{row['generator']} {row['index']}: vehest {row['command']}: {row['detail']}" for row in rows]
+    assert [line for line, row in zip(bad, rows, strict=True) if row["verdict"] != "ok"] == []
+
+
+def test_each_misdeed_gets_its_verdict(tmp_path):
+    rows = rows_of(tmp_path, "--family", "planted", "--inputs", str(len(MISDEEDS)), "--seconds", "6")
+    found = {row["command"].removeprefix("PLANTED:"): row["verdict"] for row in rows}
+    assert found == {name: verdict for name, (verdict, _) in MISDEEDS.items()}
+    assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}
+
+
+def case_in(folder: Path, *, honest: bool) -> Case:
+    return Case(folder, folder / "templates", random.Random(0), honest, 0)
+
+
+def outcome(exit_code: int, stderr: str, changed: tuple[str, ...] = ()) -> Outcome:
+    return Outcome(exit_code, 0.1, 0.1, 1.0, "", stderr, (), changed, "")
+
+
+@pytest.mark.parametrize(
+    ("honest", "ended", "verdict"),
+    [
+        (True, outcome(3, "error: no\n"), "refused"),
+        (False, outcome(3, "error: no\n"), "ok"),
+        (True, outcome(0, "warning something\n"), "ok"),
+        (False, outcome(3, "done    ingest     mine\nwarning something\nerror: no\n"), "ok"),
+        (False, outcome(3, "/a/b.py:3: RuntimeWarning: overflow\nerror: no\n"), "several lines"),
+        (False, outcome(7, "error: no\n"), "exit1"),
+        (False, outcome(0, "", ("up/up/up/place/outputs/a",)), "ok"),
+        (False, outcome(0, "", ("up/up/up/place/out.csv",)), "ok"),
+        (False, outcome(0, "", ("up/up/up/place/raw/one.csv",)), "outside"),
+        (False, outcome(0, "", ("up/up/up/place/outputs.csv",)), "outside"),
+        (False, outcome(3, "error: no\n", ("tmp/vehest-a",)), "leftovers"),
+    ],
+)
+def test_an_outcome_is_judged_by_exit_code_lines_and_files(tmp_path, honest, ended, verdict):
+    assert judge(case_in(tmp_path, honest=honest), Command(("ingest",), targets=("out.csv",)), ended)[0] == verdict
+
+
+def test_what_is_written_is_seen_in_the_folders(tmp_path):
+    for name in ("same", "longer", "gone"):
+        (tmp_path / name).write_text("a")
+    before = snapshot(tmp_path)
+    (tmp_path / "longer").write_text("ab")
+    (tmp_path / "gone").unlink()
+    (tmp_path / "new").symlink_to("same")
+    assert differences(before, snapshot(tmp_path)) == ("gone", "longer", "new")
+
+
+def test_the_same_seed_and_index_make_the_same_input(tmp_path):
+    def files(folder: Path, seed: int, index: int) -> tuple[Command, dict[str, bytes]]:
+        fuzzer = Fuzzer(folder, seed, ["tables"], ["bytes_of_a_table", "cells", "magnitudes"])
+        one, visit, honest = fuzzer.generator_of(index)
+        case = fuzzer.case_of(index, visit, honest)
+        command = one.build(case)
+        return command, {path.name: path.read_bytes() for path in case.place.iterdir()}
+
+    for index in range(10):
+        assert files(tmp_path / "a", 3, index) == files(tmp_path / "b", 3, index)
+    assert files(tmp_path / "a", 3, 1) != files(tmp_path / "a", 4, 1)

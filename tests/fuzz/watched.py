@@ -1,0 +1,272 @@
+"""The forked child: limits, an audit hook, and the command line run as the terminal would run it."""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import os
+import resource
+import sys
+import tempfile
+import traceback
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import vehest
+from fuzz.case import Case, Command
+
+ADDRESS_SPACE = 4 * 2**30
+FILE_SIZE = 2**30
+
+# What runs, and what asks for code to be run. Each is noted; a program that would start is stopped.
+PROGRAMS = frozenset(
+    {"os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile", "os.fork", "os.forkpty", "pty.spawn", "subprocess.Popen"}
+)
+CODE = frozenset({"exec", "compile", "import", "ctypes.dlopen", "pickle.find_class", "marshal.loads"})
+# Position of the path that each of these writes to.
+WRITES = {
+    "os.mkdir": (0,),
+    "os.rename": (0, 1),
+    "os.remove": (0,),
+    "os.rmdir": (0,),
+    "os.link": (1,),
+    "os.symlink": (1,),
+    "os.truncate": (0,),
+    "os.chmod": (0,),
+    "os.chown": (0,),
+    "os.utime": (0,),
+    "os.mkfifo": (0,),
+    "shutil.rmtree": (0,),
+}
+DEVICES = ("/dev/null", "/dev/full", "/dev/zero", "/dev/tty", "/dev/shm/")
+NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made, though a user may ask for it
+
+# Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels, syntax trees of vehest's own modules for
+# keys; annotations of the commands' own functions, which inspect and typing evaluate for Typer; and rosbags, which makes dataclasses
+# and readers of message layouts whose names its grammar has let through. Whatever a payload would do is noticed as well: the file that
+# it makes, or the program.
+MAKERS = (
+    "dataclasses",
+    "collections",
+    "inspect",
+    "typing",
+    "numba.",
+    "llvmlite.",
+    "rosbags.typesys.store",
+    "rosbags.serde.",
+    "vehest.stages.code_version",
+    "ast",
+)
+PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
+IMPORTERS = ("importlib._bootstrap", "importlib._bootstrap_external", "_frozen_importlib", "_frozen_importlib_external")
+
+
+class Watch:
+    """Notes what a command does that no input should make it do.
+
+    Args:
+        inside: the case's folder, the only one that may be written to.
+        report: file descriptor that each event is written to, a line of JSON.
+    """
+
+    def __init__(self, inside: Path, report: int) -> None:
+        self._inside, self._report = os.path.realpath(inside), report
+        self._armed, self._noted = False, 0
+
+    def arm(self) -> None:
+        """Begin; there is no end but that of the process."""
+        sys.addaudithook(self._hook)
+        self._armed = True
+
+    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if not self._armed:
+            return
+        if event == "open":
+            self._opened(*arguments)
+        elif event in CODE:
+            self._code(event, arguments)
+        elif event in WRITES:
+            for position in WRITES[event]:
+                self._written(event, arguments[position])
+        elif event in PROGRAMS:
+            self._program(event, arguments)
+        elif event in ("socket.connect", "socket.sendto"):
+            self._armed = False
+            family = getattr(arguments[0], "family", None)
+            self._armed = True
+            if family is not None and int(family) != 1:
+                raise OSError(101, "the network is out of reach here")
+
+    def _code(self, event: str, arguments: tuple[Any, ...]) -> None:
+        caller = sys._getframe(2)
+        module = str(caller.f_globals.get("__name__", "?"))
+        if event == "import":
+            self._imported(str(arguments[0]))
+            return
+        if event in ("exec", "marshal.loads", "compile") and (module in IMPORTERS or module.startswith(MAKERS)):
+            return
+        if event == "pickle.find_class" and _called_from(caller, ("multiprocessing.", "concurrent.futures.")):
+            return
+        what = arguments[1] if event == "compile" else arguments[0]
+        code = getattr(what, "co_filename", None) or what
+        if module == "jinja2.environment" and str(code).startswith(PAGES):
+            return
+        self._note("executed", f"{event} of {str(code)[:80]!r} by {module}:{caller.f_lineno}")
+
+    def _imported(self, name: str) -> None:
+        if name not in sys.modules and not name.startswith(HARMLESS_IMPORTS):
+            self._note("executed", f"import of {name[:80]!r}")
+
+    def _program(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event == "os.fork" or _called_from(sys._getframe(2), ("multiprocessing.",)):
+            return
+        self._note("executed", f"{event} {str(arguments)[:120]}")
+        raise PermissionError(1, "no program is started here")
+
+    def _opened(self, path: Any, mode: Any, flags: Any) -> None:
+        writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
+        if writes or (isinstance(mode, str) and set(mode) & set("wax+")):
+            self._written("open", path)
+
+    def _written(self, event: str, path: Any) -> None:
+        if not isinstance(path, str | bytes):
+            return
+        self._armed = False
+        try:
+            real = os.path.realpath(os.fsdecode(path))
+        except (OSError, ValueError):
+            return
+        finally:
+            self._armed = True
+        kernels = real.endswith((".nbi", ".nbc")) or "__pycache__" in real
+        device = (event == "open" and real.startswith(DEVICES)) or f"{real}/".startswith(NO_PLACES)
+        if not (real == self._inside or real.startswith(self._inside + os.sep) or device or kernels):
+            self._note("outside", f"{event} {real[:160]}")
+            raise PermissionError(1, "this is outside of the sandbox", real)
+
+    def _note(self, verdict: str, what: str) -> None:
+        if self._noted < 20:
+            self._noted += 1
+            os.write(self._report, (json.dumps([verdict, what]) + "\n").encode())
+
+
+HARMLESS_IMPORTS = ("pyspark",)
+"""Starts of names of modules that honest commands look for anew each time, since they are not installed."""
+
+
+def _called_from(frame: Any, modules: tuple[str, ...]) -> bool:
+    """Whether any caller, up to the command itself, belongs to these modules."""
+    while frame is not None and frame.f_globals.get("__name__") != __name__:
+        if str(frame.f_globals.get("__name__", "")).startswith(modules):
+            return True
+        frame = frame.f_back
+    return False
+
+
+def become(case: Case, command: Command) -> None:
+    """Turn this forked process into the command; does not return."""
+    code = 1
+    try:
+        os.setsid()
+        report = _prepare(case, command)
+        main = _main_of(sys.argv[1:])
+        watch = Watch(case.folder, report)
+        watch.arm()
+        code = _run(main)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _main_of(words: list[str]) -> Callable[[], None]:
+    """The command line; or a planted misdeed, which shows that it is noticed."""
+    if words and words[0].startswith("PLANTED:"):
+        from fuzz.families.planted import MISDEEDS
+
+        return MISDEEDS[words[0].removeprefix("PLANTED:")][1]
+    from vehest.cli import main
+
+    return main
+
+
+def _run(main: Callable[[], None]) -> int:
+    """Exit code of a main function, as the interpreter would make it."""
+    code = 0
+    try:
+        main()
+    except SystemExit as leave:
+        if isinstance(leave.code, str):
+            sys.stderr.write(leave.code + "\n")
+            code = 1
+        else:
+            code = int(leave.code or 0)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError) as error:
+        os.write(2, f"Exception ignored in stdout: {error}\n".encode())
+        code = code or 120
+    sys.stderr.flush()
+    return code & 0xFF
+
+
+def _prepare(case: Case, command: Command) -> int:
+    """Streams, folders, environment, limits; returns the descriptor of the report."""
+    logs = case.folder / "log"
+    report = os.open(logs / "events", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    stack = open(logs / "stack", "w")  # noqa: SIM115 - open as long as the process lives, like the streams below
+    faulthandler.dump_traceback_later(case.seconds, file=stack)
+    _redirect(0, "/dev/null", os.O_RDONLY)
+    _redirect(1, command.stdout or logs / "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    _redirect(2, logs / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115
+    sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False, buffering=1)  # noqa: SIM115
+    os.chdir(case.place)
+    _environment(case, command.environment)
+    tempfile.tempdir = str(case.folder / "tmp")
+    sys.modules["__main__"] = types.ModuleType("__main__")  # the name of the program follows from it: vehest, not python -m fuzz
+    sys.argv = ["vehest", *(os.fsdecode(word) for word in command.argv)]
+    sys.path[:] = [entry for entry in sys.path if entry not in ("", ".")]
+    if command.unprivileged and os.getuid() == 0:
+        os.setgroups([])
+        os.setgid(65534)
+        os.setuid(65534)
+    os.write(report, (json.dumps(["rss", _status("VmRSS")]) + "\n").encode())
+    size = _status("VmSize") * 1024 + ADDRESS_SPACE
+    for limit, value in (
+        (resource.RLIMIT_AS, size),
+        (resource.RLIMIT_CPU, 90),
+        (resource.RLIMIT_FSIZE, FILE_SIZE),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(limit, (value, value))
+    return report
+
+
+def _environment(case: Case, changes: Mapping[str, str | None]) -> None:
+    for name in [name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))]:
+        del os.environ[name]
+    os.environ |= {"VEHEST_DATA": str(case.place / "raw"), "HOME": str(case.folder / "home"), "TMPDIR": str(case.folder / "tmp")}
+    for name, value in changes.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+
+
+def _redirect(descriptor: int, path: Any, flags: int) -> None:
+    opened = os.open(path, flags, 0o666)
+    os.dup2(opened, descriptor)
+    os.close(opened)
+
+
+def _status(field: str) -> int:
+    """A figure of /proc/self/status [kB]."""
+    with open("/proc/self/status") as stream:
+        return next(int(line.split()[1]) for line in stream if line.startswith(f"{field}:"))

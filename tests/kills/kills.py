@@ -1,0 +1,416 @@
+"""Kill a study again and again, at moments drawn from a seed, and see that every run after it ends in the same numbers: `make kills`.
+
+A round is one output root. The study is started in it and killed in its ingest, started again and killed in its downsampling, and so on
+through training, evaluation and report; the last run is left to end. So the kills of a round pile up, which is harder than one kill a
+root, and what is checked at the end of a round is said of each of its kills. Signals are SIGKILL, SIGTERM and SIGINT in turn. A moment
+is an event that can be seen from outside (an artefact is locked, begun or made, a checkpoint is there, a run of MLflow is begun or
+marked) and a delay of up to 60 ms from there; how far a run has come by then is the machine's own, and is not the same twice. A run that
+ends before its moment comes is no kill: another round makes up for it.
+
+This process imports everything once, and every run is a fork of it that calls the command line, so that a hundred runs do not spend
+their time on imports. In every fourth round jobs run side by side, in processes that a run starts itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import ctypes
+import fcntl
+import gc
+import importlib
+import json
+import os
+import random
+import shutil
+import signal
+import sqlite3
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+STAGES = ("ingest", "downsample", "train", "evaluate", "report")
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+STUDY = ("run", "quickstart", "training.max_epochs=3", "training.checkpoint_seconds=0")
+MOMENTS = {
+    "ingest": ("begun", "part", "made"),
+    "downsample": ("begun", "made"),
+    "train": ("locked", "checkpoint", "made", "store", "tracking", "tracked"),
+    "evaluate": ("locked", "begun", "made", "tracking", "tracked"),
+    "report": ("begun", "file", "made"),
+}
+PR_SET_PDEATHSIG = 1  # of Linux's prctl: a run ends with this process
+MAX_DELAY = 0.06  # s
+COUNTS = 3  # a moment is one of the first so many of its kind
+RUN_SECONDS = 1800.0  # after which a run hangs
+LOOK_SECONDS = 0.002
+HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
+HEADER += ("leftovers", "outcome")
+HEAVY = (
+    "mlflow",
+    "matplotlib.pyplot",
+    "vehest.stages.pipeline",
+    "vehest.studies.drive",
+    "vehest.report.document",
+    "vehest.report.run_figures",
+)
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One kill: when, by what, and how the run ended."""
+
+    stage: str
+    number: signal.Signals
+    moment: str
+    exit_code: int
+    jobs: int
+    at_once: tuple[str, ...] = ()
+
+
+@dataclass
+class Round:
+    """One output root with the kills in it and what was found at its end."""
+
+    position: int
+    kills: list[Kill] = field(default_factory=list)
+    metrics: list[str] = field(default_factory=list)
+    tracking: list[str] = field(default_factory=list)
+    leftovers: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+
+
+# --- runs -----------------------------------------------------------------------------------------------------------
+
+
+def started(output: Path, jobs: int, log: Path) -> int:
+    """Fork a run of the study into ``output``; returns its process, which leads a session of its own."""
+    sys.stdout.flush()
+    process = os.fork()
+    if process:
+        return process
+    code = 1
+    try:
+        os.setsid()
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        for stream in (1, 2):
+            os.dup2(out, stream)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.argv = ["vehest", *STUDY, f"output={output}", "--jobs", str(jobs)]
+        from vehest.cli import main
+
+        main()
+        code = 0
+    except SystemExit as leave:
+        code = int(leave.code or 0)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def ended(process: int, *, at_once: bool = False) -> int | None:
+    """Exit code of a run, negative where a signal ended it; none if it goes on and is not waited for."""
+    end = time.monotonic() + RUN_SECONDS
+    while True:
+        found, status = os.waitpid(process, os.WNOHANG)
+        if found:
+            return os.waitstatus_to_exitcode(status)
+        if at_once:
+            return None
+        if time.monotonic() > end:
+            os.killpg(process, signal.SIGKILL)
+            raise SystemExit(f"a run hangs: process {process}")
+        time.sleep(LOOK_SECONDS)
+
+
+def session(leader: int) -> list[int]:
+    """Living processes that a run started, itself included."""
+    alive = []
+    for entry in os.scandir("/proc"):
+        if entry.name.isdigit():
+            try:
+                fields = Path(entry.path, "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[3]) == leader and fields[0] not in "ZX":
+                alive.append(int(entry.name))
+    return alive
+
+
+def strays(leader: int, patience: float = 20.0) -> list[str]:
+    """Processes of a run that outlive it for more than ``patience`` seconds; they are ended here."""
+    end = time.monotonic() + patience
+    while session(leader) and time.monotonic() < end:
+        time.sleep(LOOK_SECONDS)
+    found = session(leader)
+    for process in found:
+        os.kill(process, signal.SIGKILL)
+    return [f"process {process}" for process in found]
+
+
+# --- moments --------------------------------------------------------------------------------------------------------
+
+
+def names(folder: Path, wanted: Callable[[str], bool]) -> set[str]:
+    """Names in a folder, none where it is not there."""
+    try:
+        return {entry.name for entry in os.scandir(folder) if wanted(entry.name)}
+    except OSError:
+        return set()
+
+
+def seen(output: Path, stage: str, moment: str) -> set[str]:
+    """What there is of a kind of event; one more of them is the event."""
+    if moment == "begun":
+        return names(output / stage, lambda name: name.startswith(".writing-"))
+    if moment == "made":
+        return names(output / stage, lambda name: not name.startswith("."))
+    if moment == "part":
+        parts = names(output / stage, lambda name: name.startswith(".parts-"))
+        return {file for folder in parts for file in names(output / stage / folder, lambda name: not name.startswith("."))}
+    if moment == "file":
+        asides = names(output / stage, lambda name: name.startswith(".writing-"))
+        return {file for folder in asides for file in names(output / stage / folder, lambda name: True)}
+    if moment == "locked":
+        return names(output / "locks", lambda name: name.startswith(f"{stage}-"))
+    if moment == "checkpoint":
+        return {
+            name for name in names(output / "checkpoints", lambda name: True) if names(output / "checkpoints" / name, lambda file: True)
+        }
+    if moment == "store":
+        return names(output, lambda name: name.endswith("mlflow.db"))
+    if moment == "tracking":
+        return names(output / "mlartifacts", lambda name: True)
+    return {name for folder in names(output / "tracked", lambda name: True) for name in names(output / "tracked" / folder, _of(stage))}
+
+
+def _of(stage: str) -> Callable[[str], bool]:
+    return lambda name: name.startswith(f"{stage}-")
+
+
+def killed(output: Path, stage: str, number: signal.Signals, jobs: int, draw: random.Random, log: Path) -> Kill | None:
+    """Start a run, kill it at a moment of a stage; none if it ended before."""
+    moment, count, delay = draw.choice(MOMENTS[stage]), draw.randint(1, COUNTS), draw.uniform(0.0, MAX_DELAY)
+    count = 1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
+    count = min(count, 2) if stage == "downsample" else count
+    before, met = seen(output, stage, moment), set[str]()
+    process = started(output, jobs, log)
+    while len(met) < count:
+        met |= seen(output, stage, moment) - before
+        code = ended(process, at_once=True)
+        if code is not None:
+            strays(process)
+            if code != 0:
+                raise SystemExit(f"a run failed by itself with exit code {code}, see '{log}'")
+            return None
+        time.sleep(LOOK_SECONDS)
+    time.sleep(delay)
+    os.kill(process, number)
+    code = ended(process)
+    assert code is not None
+    left = strays(process)
+    if code == 0:
+        return None
+    left += [f"lock {name}" for name in locks_held(output)] + broken(output)
+    expected = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}[number]
+    left += [f"exit code {code} instead of {expected}"] if code != expected else []
+    said = f"{moment} {count} + {delay * 1e3:.0f} ms"
+    return Kill(stage, number, said, code, jobs, tuple(left))
+
+
+# --- checks ---------------------------------------------------------------------------------------------------------
+
+
+def artefacts(output: Path) -> Iterator[Path]:
+    """Folders of all stages."""
+    for stage in STAGES:
+        yield from (output / stage / name for name in sorted(names(output / stage, lambda name: not name.startswith("."))))
+
+
+def broken(output: Path) -> list[str]:
+    """Folders that are not whole."""
+    from vehest.data.errors import VehestError
+    from vehest.stages.artefacts import read_artefact
+
+    found = []
+    for folder in artefacts(output):
+        try:
+            read_artefact(folder)
+        except VehestError:
+            found.append(f"half of {folder.name}")
+    return found
+
+
+def locks_held(output: Path) -> list[str]:
+    """Locks that somebody holds."""
+    held = []
+    for name in names(output / "locks", lambda name: name.endswith(".lock")):
+        with open(output / "locks" / name, "rb") as stream:
+            try:
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                held.append(name)
+    return held
+
+
+def content(output: Path) -> dict[str, str]:
+    """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that it publishes."""
+    from vehest.stages.artefacts import read_artefact
+    from vehest.stages.evaluate import TIMES
+
+    found = {}
+    for folder in artefacts(output):
+        artefact = read_artefact(folder)
+        own = f"{artefact.stage}/{folder.name} {artefact.status}"
+        if artefact.stage == "report":
+            with open(folder / "metrics.csv", newline="", encoding="utf-8") as stream:
+                found[own] = json.dumps([row for row in csv.DictReader(stream) if row["metric"] not in TIMES])
+        else:
+            found[own] = artefact.digest
+    return found
+
+
+def differences(found: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
+    """What one has and the other has not, or has otherwise."""
+    return [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
+
+
+def tracked(output: Path) -> dict[str, str]:
+    """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
+    with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
+        runs = store.execute("select run_uuid, name, status from runs where lifecycle_stage = 'active'").fetchall()
+        found: dict[str, str] = {}
+        for run, name, status in runs:
+            if status == "KILLED":  # of an interrupted training, by which it is told from the finished one
+                continue
+            keys = store.execute("select value from tags where run_uuid = ? and key = 'vehest.key'", [run]).fetchall()
+            points = store.execute("select key, step, value from metrics where run_uuid = ? order by key, step, value", [run]).fetchall()
+            parameters = store.execute("select key, value from params where run_uuid = ? order by key", [run]).fetchall()
+            files = sorted(str(file.relative_to(output / "mlartifacts" / run)) for file in (output / "mlartifacts" / run).rglob("*.*"))
+            logged = [[point for point in points if "_seconds" not in point[0]], parameters, files]
+            own = f"{name} {status} {keys[0][0] if keys else ''}"
+            found[own + (f" again {run}" if own in found else "")] = json.dumps(logged)
+    return found
+
+
+def leftovers(output: Path) -> list[str]:
+    """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
+    found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
+    found += [f"checkpoints/{name}" for name in names(output / "checkpoints", lambda name: True)]
+    return found + [f"lock {name}" for name in locks_held(output)]
+
+
+# --- rounds ---------------------------------------------------------------------------------------------------------
+
+
+def one_round(position: int, wanted: Sequence[tuple[str, signal.Signals]], output: Path, reference: Path, draw: random.Random) -> Round:
+    """Kill runs in one output root, let the last one end, and look at what there is."""
+    own, jobs = Round(position), 2 if position % 4 == 3 else 1
+    log = output.with_suffix(".log")
+    for stage, number in wanted:
+        kill = killed(output, stage, number, jobs, draw, log)
+        if kill is not None:
+            own.kills.append(kill)
+    last = started(output, jobs, log)
+    code = ended(last)
+    own.leftovers = strays(last)
+    if code != 0:
+        own.failed = [f"the last run left with {code}, see '{log}'"]
+        return own
+    own.metrics = differences(content(output), content(reference))
+    own.tracking = differences(tracked(output), tracked(reference))
+    own.leftovers += leftovers(output)
+    return own
+
+
+def rows_of(own: Round, first: int) -> Iterator[list[object]]:
+    """A row a kill."""
+    for position, kill in enumerate(own.kills):
+        faults = [*own.failed, *own.metrics, *own.tracking, *own.leftovers, *kill.at_once]
+        equal, complete = ("yes" if not (own.failed or found) else "no" for found in (own.metrics, own.tracking))
+        left = "; ".join([*own.leftovers, *kill.at_once]) or "none"
+        outcome = "good" if not faults else "bad: " + "; ".join([*own.failed, *own.metrics, *own.tracking] or [left])
+        resumed = len(own.kills) - position
+        head = [first + position, own.position, kill.jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code, resumed]
+        yield [*head, equal, complete, left, outcome]
+
+
+def still_wanted(missing: Counter[tuple[str, signal.Signals]]) -> list[tuple[str, signal.Signals]]:
+    """For the next round: of each stage a kill that is missing most."""
+    chosen = []
+    for stage in STAGES:
+        number = max(SIGNALS, key=lambda number: (missing[stage, number], -SIGNALS.index(number)))
+        if missing[stage, number] > 0:
+            chosen.append((stage, number))
+    return chosen
+
+
+def main() -> None:
+    """Run rounds until every kill was made; exit code 1 if any row is bad."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=100, help="how many, spread evenly over five stages and three signals")
+    parser.add_argument("--seed", type=int, default=0, help="of signals, moments and delays")
+    parser.add_argument("--out", type=Path, default=Path("results/reliability/kills.csv"), help="table, a row a kill")
+    given = parser.parse_args()
+    os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
+    os.environ.pop("MLFLOW_TRACKING_URI", None)
+    for module in HEAVY:
+        importlib.import_module(module)
+    gc.freeze()
+    draw = random.Random(given.seed)
+    out = given.out.resolve()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    missing = Counter((STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)]) for k in range(given.kills))
+    with tempfile.TemporaryDirectory(prefix="kills-") as scratch:
+        bad = _rounds(missing, draw, Path(scratch), out)
+    print(f"{given.kills} kills, {bad} of them bad: {out}")
+    sys.exit(1 if bad else 0)
+
+
+def _rounds(missing: Counter[tuple[str, signal.Signals]], draw: random.Random, scratch: Path, out: Path) -> int:
+    os.chdir(scratch)  # runs find the configuration that came with the package
+    begun = time.monotonic()
+    reference = scratch / "reference"
+    for output in (
+        scratch / "compiling",
+        reference,
+    ):  # compiled in its own run, code has other last digits
+        code = ended(started(output, 1, output.with_suffix(".log")))
+        if code != 0:
+            raise SystemExit(f"the study does not run by itself:\n{output.with_suffix('.log').read_text()}")
+    print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
+    position, bad, limit = 0, 0, 3 * missing.total()
+    with open(out, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(HEADER)
+        number = 1
+        while missing.total() > 0:
+            if position > limit:
+                raise SystemExit("moments are missed again and again")
+            own = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
+            missing -= Counter((kill.stage, kill.number) for kill in own.kills)
+            rows = list(rows_of(own, number))
+            writer.writerows(rows)
+            stream.flush()
+            bad += sum(row[-1] != "good" for row in rows)
+            number += len(rows)
+            print(f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s", flush=True)
+            if all(row[-1] == "good" for row in rows):
+                shutil.rmtree(scratch / f"round{position}")
+            position += 1
+    return bad
+
+
+if __name__ == "__main__":
+    main()

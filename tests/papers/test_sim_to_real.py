@@ -1,0 +1,201 @@
+"""From simulated cars to a real one: what is learnt on, what is chosen by, and what the report says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from conftest import planar_drive
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.splits import Span, Split
+from vehest.data.store import write_estimate, write_recording
+from vehest.estimators.model_files import save_model
+from vehest.estimators.registry import estimator_class
+from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.report.document import Document, Table, write_document
+from vehest.simulation.fleet import variations_from_config, varied
+from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
+from vehest.sources.base import kind_of, open_source
+from vehest.stages.config import compose_config
+from vehest.stages.config_files import choices
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest_papers.sim_to_real import build_parts
+
+PROTOCOL = Protocol(rate_hz=20.0)
+SPLITS = [name for name in choices("split") if name.startswith("sim_to_real_")]
+LEARNT = ("sim_fleet_wide", "sim_fleet_fast", "sim_fleet_rough", "sim_fleet_more", "sim_fleet_level")
+HELD_OUT = "sim_fleet_held_out"
+
+
+def dataset(name: str) -> Mapping[str, Any]:
+    return compose_config("ingest", [f"dataset={name}"])["dataset"]
+
+
+def courses(name: str) -> set[str]:
+    return {drive.manoeuvre["course"] for drive in open_source(dataset(name)).drives.values() if "course" in drive.manoeuvre}  # type: ignore[attr-defined]
+
+
+# What is learnt on, and what is chosen by
+
+
+@pytest.mark.parametrize("name", SPLITS)
+def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
+    split = compose_config("train", [f"split={name}"])["split"]
+    for entry in (*split["train"], *split["validation"]):
+        assert kind_of(dataset(entry["dataset"])) == "simulated"
+    assert [entry["dataset"] for entry in split["validation"]] == [HELD_OUT]
+    assert split["tests"]["ferrari"] == [{"dataset": "ferrari_250lm", "recording": "20140222_01_01_03_250lm"}]
+    assert split["tests"]["race_cars"] == [{"dataset": "sim_two_cars", "recordings": "*"}]
+    learns_on_it = "tum" in {entry["dataset"] for entry in split["train"]}
+    assert ("other_simulator" in split["tests"]) != learns_on_it
+
+
+@pytest.mark.parametrize("name", LEARNT)
+def test_validation_cars_are_other_cars_on_other_courses(name):
+    assert not courses(name) & courses(HELD_OUT)
+    seeds = [{drive.seed for drive in open_source(dataset(of)).drives.values()} for of in (name, HELD_OUT)]  # type: ignore[attr-defined]
+    assert not seeds[0] & seeds[1]
+
+
+@pytest.mark.parametrize("name", [*LEARNT, HELD_OUT])
+def test_fleets_take_nothing_that_was_read_off_the_real_recording(name):
+    described = dataset(name)
+    preset = described["sensors"]["preset"] if isinstance(described["sensors"], Mapping) else described["sensors"]
+    assert preset == "default"
+    assert "palm_beach_like" not in courses(name)
+    assert {vehicle["name"] for vehicle in described["vehicles"].values()} == {"bmw_545i", "corvette_grand_sport"}
+
+
+def test_cars_of_the_fleets_differ_as_widely_as_stated():
+    described = dataset("sim_fleet_wide")
+    vary = variations_from_config(described["vary"])
+    for vehicle in described["vehicles"].values():
+        nominal = compiled_parameters(vehicle_from_configuration(vehicle))
+        cars = [compiled_parameters(varied(vehicle_from_configuration(vehicle), vary, seed)) for seed in range(60)]
+        stiffness = np.array([car.tire.p_ky1 for car in cars]) / nominal.tire.p_ky1
+        assert stiffness.max() / stiffness.min() > 2.5
+        assert max(car.m for car in cars) / min(car.m for car in cars) > 1.6
+        assert max(car.a + car.b for car in cars) / min(car.a + car.b for car in cars) > 1.2
+
+
+# The study
+
+ERRORS = {  # part -> (on validation, on race cars, on another simulation's car, on the real car) of every seed
+    "one": [(0.30, 0.20, 0.0, 0.10), (0.31, 0.21, 0.0, 0.11)],
+    "rough": [(0.20, 0.30, 0.40, 0.40), (0.10, 0.32, 0.41, 0.60), (0.16, 0.31, 0.42, 0.50)],
+    "level": [(0.05, 0.25, 0.31, 0.05), (0.05, 0.26, 0.30, 0.06)],
+}
+
+
+def part(folder: Path, name: str) -> StudyArtefacts:
+    """A part whose seeds err by given sizes on a drive of 60 s, which stands for validation and tests."""
+    recording = planar_drive(60.0, 20.0, seed=3)
+    file = folder / "lap.parquet"
+    write_recording(recording, file)
+    spans = {
+        "validation": Span("sim", recording.id, 0.0, 30.0),
+        "race_cars": Span("sim", recording.id, 30.0, 45.0),
+        "other_simulator": Span("sim", recording.id, 45.0, 60.0),
+        "ferrari": Span("ferrari", recording.id),
+    }
+    models, rows = [], []
+    for seed, sizes in enumerate(ERRORS[name]):
+        home = folder / name / str(seed)
+        model = EvaluatedModel("ksnn", "nonlinear_no_bias_p2_q2", "KS-NN", seed, home / "model", home)
+        models.append(model)
+        model.model_folder.mkdir(parents=True)
+        fitted = estimator_class("ksnn").from_config({"name": "ksnn"})
+        weights = {key: np.full_like(value, 0.1 * seed) for key, value in fitted.weights().items()}
+        fitted.load_weights(weights)
+        save_model(fitted, model.model_folder)
+        for (where, span), size in zip(spans.items(), sizes, strict=True):
+            vy = recording["vy_ref"] + size * np.sin(3.0 * recording.time)
+            estimate = Estimate(recording.id, "ksnn", 20.0, recording.start_time, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
+            write_estimate(estimate, home / where / "0.parquet")
+            found = accuracy([score(estimate, recording, span, PROTOCOL)])
+            head = ("toy", "ksnn", model.variant, "sim", span.dataset, "", where, "all", "nominal", 20.0, "causal", seed)
+            rows += [(*head, metric, value, "", None, None) for metric, value in found.items()]
+    return StudyArtefacts(
+        study="toy",
+        title="Toy",
+        about="",
+        command="vehest run toy",
+        split=Split(
+            name,
+            (Span("sim", f"{name}_lap"),),
+            (spans["validation"],),
+            {test: (span,) for test, span in spans.items() if test != "validation" and (name, test) != ("one", "other_simulator")},
+        ),
+        protocol=PROTOCOL,
+        kinds={"sim": "simulated", "ferrari": "real"},
+        data_titles={},
+        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
+        models=models,
+        references={("sim", recording.id): file, ("ferrari", recording.id): file},
+        facts=["the same for all"],
+    )
+
+
+@pytest.fixture(scope="module")
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> PartsArtefacts:
+    folder = tmp_path_factory.mktemp("toy")
+    parts = {name: part(folder, name) for name in ERRORS}
+    return PartsArtefacts("toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, [])
+
+
+def overview(document: Document) -> pd.DataFrame:
+    (table,) = (block.frame for block in document.blocks if isinstance(block, Table))
+    return table.set_index("part")
+
+
+def test_validation_cars_choose_first_even_where_the_real_car_says_otherwise(artefacts):
+    table = overview(build_parts(artefacts))
+    assert table.loc["rough", "chosen"] == "first", (
+        "the lowest error on validation cars of those laid down beforehand, the highest on the real"
+    )
+    assert table.loc["level", "validation_rmse_vy"] < table.loc["rough", "validation_rmse_vy"]
+    assert table.loc["level", "added"], "added later, and so not for the first choice"
+    assert table.loc["rough", "fvu_median"] > table.loc["one", "fvu_median"]
+
+
+def test_race_cars_choose_second_and_another_simulation_third_among_those_that_have_not_learnt_on_it(artefacts):
+    table = overview(build_parts(artefacts))
+    assert table.loc["one", "chosen"] == "second"
+    assert table.loc["level", "chosen"] == "third"
+    assert np.isnan(table.loc["one", "other_simulator_rmse_vy"]), "the lowest error there, but not asked"
+
+
+def test_shipped_seed_is_that_of_the_third_choice(artefacts):
+    table = overview(build_parts(artefacts))
+    assert table.loc["level", "model_seed"] == 1, "the best on the other simulation's car, not on the real one"
+    assert table.loc["level", "model_fvu"] == table.loc["level", "fvu_max"]
+    assert table["model_fvu"].notna().sum() == 1
+
+
+def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path):
+    document = build_parts(artefacts)
+    write_document(document, tmp_path)
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    values = [overview(document).loc[name, "fvu_median"] for name in ("rough", "one", "level")]
+    assert all(f"**FVU {value:.3f}**" in text for value in values)
+    assert text.count("**That misses what was asked for.**") == sum(value > 0.10 for value in values) > 0
+    assert "Only the first figure is a clean test." in text
+    assert text.count("the same for all") == 1, "what holds for every part is said once"
+    assert {"spread.png", "traces.png"} <= {file.name for file in (tmp_path / "figures").iterdir()}
+
+
+def test_study_refuses_a_part_that_learns_on_the_real_car_or_stops_on_other_ranges(artefacts):
+    one = artefacts.parts["one"]
+    real = replace(one, split=replace(one.split, train=(Span("ferrari", "other"),)))
+    with pytest.raises(DataError, match="part 'one' learns or chooses on 'ferrari', which is not simulated"):
+        build_parts(replace(artefacts, parts={**artefacts.parts, "one": real}))
+    other = replace(one, split=replace(one.split, validation=(Span("sim", "elsewhere"),)))
+    with pytest.raises(DataError, match="stop or choose on different ranges"):
+        build_parts(replace(artefacts, parts={**artefacts.parts, "one": other}))

@@ -1,0 +1,99 @@
+"""Pieces of the study of heavy-vehicle laps, on a short drive of a filter whose curves and levels are given."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import numpy as np
+import pytest
+
+from vehest.data.recording import Recording
+from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalSettings, TrackNoise
+from vehest.report.document import Table
+from vehest.studies.artefacts import EvaluatedModel
+from vehest.vehicle.parameters import SingleTrackParameters
+from vehest_papers.heavy_ekf import tables, tyres, watching
+from vehest_papers.heavy_ekf.document import WHEELS
+from vehest_papers.heavy_ekf.subjects import Filter
+
+RATE = 20.0
+TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
+
+
+def short_drive(seconds: float = 60.0) -> Recording:
+    """A truck that weaves, by steady-state gains, with wheels that roll."""
+    time = np.arange(round(seconds * RATE)) / RATE
+    generator = np.random.default_rng(0)
+    u, steer = np.full(len(time), 10.0), 0.05 * np.sin(0.4 * time)
+    yaw_rate = u * steer / 3.5
+    clean = {"vx": u, "steer": steer, "yaw_rate": yaw_rate, "ay": u * yaw_rate, "ax": np.zeros(len(time))}
+    levels = {"vx": 0.01, "steer": 0.0005, "yaw_rate": 0.002, "ay": 0.05, "ax": 0.05}
+    channels = {name: samples + levels[name] * generator.standard_normal(len(time)) for name, samples in clean.items()}
+    sides = {"fl": 1.04, "fr": -1.04, "rl": 1.04, "rr": -1.04}
+    channels |= {f"wheel_speed_{wheel}": (u - yaw_rate * side) / WHEELS.wheel_radius for wheel, side in sides.items()}
+    references = {"vx_ref": u, "vy_ref": 0.1 * yaw_rate, "yaw_rate_ref": yaw_rate, "sideslip_ref": 0.01 * yaw_rate}
+    return Recording("short", "truck", RATE, 0.0, channels | references, "simulated")
+
+
+@pytest.fixture(scope="module")
+def ratte() -> RationalFilter:
+    curves = AxleCurves(0.013, 487e3, 0.0077, 622e3)
+    return RationalFilter(RationalSettings(car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003)))
+
+
+def test_every_fault_leaves_the_filter_finite(ratte: RationalFilter) -> None:
+    drive = short_drive()
+    for name, apply in watching.faults(WHEELS).items():
+        estimate = ratte.estimate([apply(drive).without_references()])[0]
+        assert all(np.isfinite(values).all() for values in estimate.channels.values()), name
+
+
+def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte: RationalFilter) -> None:
+    drive = short_drive()
+    wrong = watching.faults(WHEELS)["yaw rate of the other sign"](drive)
+    sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
+    limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))
+    assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
+
+
+def test_table_of_bad_input_names_the_drive_backwards(ratte: RationalFilter) -> None:
+    drive = short_drive()
+    filters = {"RATTE": Filter("RATTE", cast("EvaluatedModel", None), ratte)}
+    table, *words = watching.bad_input_table(filters, drive, [drive], WHEELS, 2.0, "SIMULATED")
+    assert isinstance(table, Table)
+    said = table.frame.set_index("fault")["check"]
+    assert said["nothing"] == "–"
+    assert said["the drive backwards"] == "reverse: vx"
+    assert not any("the drive backwards" in str(block) for block in words)
+
+
+def test_monitor_is_the_mean_over_measured_numbers_in_windows() -> None:
+    nis, dof = np.repeat([2.0, 6.0, 0.0], 200), np.repeat([2.0, 1.0, 0.0], 200)
+    np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
+
+
+def test_parameters_show_where_the_truck_turns(ratte: RationalFilter) -> None:
+    seen = watching.observability_of(ratte, short_drive(), 2.0).smallest
+    turning = np.abs(np.sin(0.4 * (np.arange(len(seen)) + 10) / RATE))
+    assert np.median(seen[turning > 0.9]) > np.median(seen[turning < 0.1])
+    assert np.isfinite(seen).all()
+
+
+def test_convergence_counts_from_the_last_time_outside() -> None:
+    time = np.arange(6.0) + 100.0
+    assert tyres.convergence_time(time, np.array([2.0, 1.0, 1.5, 1.05, 1.0, 0.95]), 1.0) == 3.0
+    assert tyres.convergence_time(time, np.full(6, 1.05), 1.0) == 0.0
+    assert tyres.convergence_time(time, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.2]), 1.0) == math.inf
+
+
+def test_gains_are_those_of_the_figures() -> None:
+    rmse = {
+        (name, f"{kind}_{drive}"): value
+        for name, value in (("LINT", 1.0), ("RATT", 0.5), ("RATTE", 0.25))
+        for kind in tables.TYRES
+        for drive in tables.DRIVES
+    }
+    frame = tables.gains_table(rmse).frame
+    assert frame["nominal_laps"].tolist() == ["50 %", "50 %", "75 %"]
+    assert frame["paper"].tolist() == ["37 %", "44 %", "65 %"]

@@ -1,0 +1,227 @@
+"""Tables and the scatter of the KS-NN study, from metrics made by the test."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vehest.data.errors import DataError
+from vehest.data.splits import Span, Split
+from vehest.evaluation.metrics import Protocol
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.sweep import interval
+from vehest_papers.ksnn import paper, scatter, tables
+from vehest_papers.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
+from vehest_papers.ksnn.tilted import tilted
+
+SPLIT = Split(
+    "scheme",
+    (Span("cars", "c1", -math.inf, math.inf),),
+    (Span("cars", "f1", -math.inf, math.inf),),
+    {"c2": (Span("cars", "c2", -math.inf, math.inf),), "f2": (Span("cars", "f2", -math.inf, math.inf),)},
+)
+
+# (estimator, variant, seed) -> RMSE of v on validation, FVU on c2, FVU on f2
+FIGURES = {
+    ("luenberger", "luenberger", 0): (0.30, 0.20, 0.21),
+    ("gru", "states_2", 0): (0.20, 0.15, 0.30),
+    ("gru", "states_3", 0): (0.19, 0.14, 0.29),
+    ("gru", "states_3", 1): (0.25, 0.01, 0.01),
+    ("ksnn", "linear_no_bias_p2", 0): (0.12, 0.10, 0.12),
+    ("ksnn", "linear_no_bias_p2", 1): (0.11, 0.11, 0.13),
+    ("ksnn", "linear_no_bias_p3", 0): (0.15, 0.02, 0.02),
+    ("ksnn", "nonlinear_bias_p2_q3", 0): (0.14, 0.05, 0.40),
+}
+
+
+def part(figures=FIGURES, drop: str = "") -> StudyArtefacts:
+    rows, models = [], []
+    for (estimator, variant, seed), (validation, *fvus) in figures.items():
+        values = {("validation", "rmse_vy"): validation, ("validation", "fvu"): validation**2}
+        for test, fvu in zip(("c2", "f2"), fvus, strict=True):
+            values |= {(test, "fvu"): fvu, (test, "rmse_vy"): 0.5 * math.sqrt(fvu)}
+            values |= {(test, "n_parameters"): 2 + seed * 0, (test, "epochs"): 10 * (seed + 1) * (estimator != "luenberger")}
+        for test in ("validation", "c2", "f2"):
+            values |= {(test, "r2"): 1 - values[test, "fvu"], (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"]}
+        for (test, metric), value in values.items():
+            if metric != drop:
+                own = ("ksnn", estimator, variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", seed, metric, value)
+                rows.append((*own, "1", None, None))
+        models.append(EvaluatedModel(estimator, variant, f"{estimator} {variant}", seed, Path("m"), Path("e")))
+    return StudyArtefacts(
+        study="ksnn",
+        title="t",
+        about="a",
+        command="c",
+        split=SPLIT,
+        protocol=Protocol(),
+        kinds={"cars": "simulated"},
+        data_titles={"cars": "Cars"},
+        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
+        models=models,
+        references={},
+        facts=[],
+    )
+
+
+def test_runs_have_a_row_a_model_with_all_metrics():
+    runs = runs_of(part())
+    assert len(runs) == len(FIGURES)
+    row = runs[(runs["variant"] == "states_3") & (runs["seed"] == 1)].iloc[0]
+    assert (row["category"], row["structure"], row["epochs"]) == (paper.GRU, "3 states", 20)
+    assert (row["rmse_vy.validation"], row["fvu.c2"], row["r2.f2"]) == (0.25, 0.01, 0.99)
+
+
+def test_a_metric_that_is_missing_is_said():
+    with pytest.raises(DataError, match=r"luenberger-luenberger-seed0 has no r2\.validation; evaluate it again"):
+        runs_of(part(drop="r2"))
+
+
+@pytest.mark.parametrize(
+    ("estimator", "variant", "category", "structure"),
+    [
+        ("luenberger", "luenberger", paper.LUENBERGER, "–"),
+        ("lstm", "states_6", paper.LSTM, "6 states"),
+        ("ksnn", "linear_no_bias_p4", paper.LINEAR, "P = 4"),
+        ("ksnn", "linear_bias_p4", paper.LINEAR_BIAS, "P = 4"),
+        ("ksnn", "nonlinear_no_bias_p2_q1", paper.NONLINEAR, "P = 2, Q = 1"),
+        ("ksnn", "nonlinear_bias_p12_q3", paper.NONLINEAR_BIAS, "P = 12, Q = 3"),
+        ("kalman", "kalman_own_noise", paper.KALMAN, "–"),
+        ("factor_graph", "factor_graph_batch", paper.FACTOR_GRAPH, "–"),
+        ("factor_graph", "factor_graph_lag_0.05s", "Factor graph (FG), fixed lag of 0.05 s", "–"),
+        ("somebodys", "own_p2", "somebodys", "P = 2"),
+    ],
+)
+def test_candidates_fall_into_the_papers_categories(estimator, variant, category, structure):
+    assert (category_of(estimator, variant), structure_of(variant)) == (category, structure)
+
+
+def test_validation_chooses_and_tests_do_not():
+    picked = chosen_by_category(runs_of(part()))
+    assert list(picked) == [paper.LUENBERGER, paper.GRU, paper.NONLINEAR_BIAS, paper.LINEAR]
+    assert (picked[paper.GRU]["variant"], picked[paper.GRU]["seed"]) == ("states_3", 0), "seed 1 is far better on both tests"
+    assert (picked[paper.LINEAR]["variant"], picked[paper.LINEAR]["seed"]) == ("linear_no_bias_p2", 1)
+
+
+def test_a_run_that_diverged_is_not_chosen():
+    figures = {("gru", "states_2", 0): (math.nan, 0.1, 0.1), ("gru", "states_2", 1): (0.3, 0.2, 0.2)}
+    assert chosen(runs_of(part(figures)))["seed"] == 1
+
+
+def test_most_general_models_stand_beside_the_papers():
+    runs = runs_of(part())
+    table = tables.most_general(runs, paper.TABLE_IV, "table_4", "caption")
+    row = table.frame.set_index("model").loc[paper.LINEAR]
+    assert (row["paper_fvu_f2"], row["fvu_f2"], row["fvu_c2"]) == (0.152, 0.13, 0.11)
+    mean, half = interval(np.array([0.12, 0.13]))
+    assert row["fvu_seeds_f2"] == f"{mean:.3f} ± {half:.3f}"
+    assert math.isnan(table.frame.set_index("model").loc[paper.LUENBERGER, "epochs"])
+    assert list(table.columns)[:4] == ["model", "structure", "paper_structure", "n_parameters"]
+    without = tables.most_general(runs, {}, "table_x", "caption")
+    assert not any("paper" in name for name in without.columns)
+
+
+def test_order_says_which_pairs_are_the_other_way_round():
+    words = tables.order_in_words(runs_of(part()), paper.TABLE_IV, "f2")
+    assert isinstance(words, str)
+    assert "Paper: KS-NN linear no bias (0.152), KS-NN nonlinear + bias (0.216), Luenberger (0.253), GRU (0.279)." in words
+    assert "Ours: KS-NN linear no bias (0.130), Luenberger (0.210), GRU (0.290), KS-NN nonlinear + bias (0.400)." in words
+    assert "2 of 6 pairs are the other way round here, 1 of them by more than chance" in words
+    assert words.endswith("Luenberger before KS-NN nonlinear + bias (0.210 against 0.400).")
+    assert "GRU before" not in words, "its two seeds lie between 0.01 and 0.29"
+    agreeing = {name: values for name, values in FIGURES.items() if name[0] != "ksnn" or "no_bias" in name[1]}
+    assert "in all 3 pairs" in str(tables.order_in_words(runs_of(part(agreeing)), paper.TABLE_IV, "f2"))
+
+
+def test_specialisation_is_the_ratio_of_the_two_cars():
+    words = tables.specialisation_in_words(runs_of(part()), paper.TABLE_IV, "c2", "f2")
+    assert "FVU on F-2 over C-2" in words
+    assert "KS-NN nonlinear + bias 2.8 in the paper, 8.0 here" in words
+
+
+@pytest.mark.parametrize(
+    ("fvus", "expected"),
+    [
+        ({"ksnn": 0.4, "luenberger": 0.5, "gru": 0.6}, "the order of families that the paper has in its scheme 1"),
+        ({"ksnn": 0.4, "luenberger": 0.7, "gru": 0.6}, "Every KS-NN comes before GRU and LSTM, as in the paper."),
+        ({"ksnn": 0.7, "luenberger": 0.5, "gru": 0.6}, "KS-NN linear no bias (0.700)."),
+        ({"ksnn": 1.7, "luenberger": 1.5, "gru": 1.6}, "none knows that car"),
+    ],
+)
+def test_families_are_ordered_as_they_come_out(fvus, expected):
+    variants = {"ksnn": "linear_no_bias_p2", "luenberger": "luenberger", "gru": "states_2"}
+    runs = runs_of(part({(name, variants[name], 0): (0.1, 0.1, fvu) for name, fvu in fvus.items()}))
+    words = tables.families_in_words(runs, "f2", "other")
+    assert expected in words
+    assert ("scheme 1" in words) == ("scheme 1" in expected)
+
+
+@pytest.mark.parametrize(("fvu", "expected"), [(0.105, "are **not** why the order differs"), (0.2, "The largest factor is 2.00.")])
+def test_tilted_sensors_are_named_as_a_reason_only_where_they_change_something(fvu, expected):
+    before, after = (runs_of(part({("ksnn", "linear_no_bias_p2", 0): (0.1, 0.05, value)})) for value in (0.1, fvu))
+    titles = PartsArtefacts("s", "t", "a", "c", {"scheme_1": "Scheme 1"}, {}, [])
+    blocks = tilted(titles, {"scheme_1": before, "tilted_1": after}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")})
+    assert expected in str(blocks[-1])
+    assert tilted(titles, {"scheme_1": before}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")}) == []
+
+
+def test_sideslip_table_has_a_column_a_kind_of_data():
+    runs = runs_of(part())
+    drive = runs.rename(columns={"rmse_sideslip.f2": "rmse_sideslip.test"})
+    table = tables.sideslip(runs, drive, None, "simulated").frame.set_index("model")
+    assert table.loc[paper.LUENBERGER, "scheme_2"] == pytest.approx(math.sqrt(0.21))
+    assert table.loc[paper.LUENBERGER, "real_drive"] == table.loc[paper.LUENBERGER, "scheme_2"]
+    assert math.isnan(table.loc[paper.FACTOR_GRAPH, "scheme_2"])
+    assert table["real_whole"].isna().all()
+    assert dict(table["paper"]) == paper.TABLE_VI
+    assert tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header == "ours: REAL F-2, scheme 2 [deg]"
+
+
+def test_regularisation_compares_the_same_structure():
+    figures = {("lstm", "states_2", 0): (0.2, 0.4, 0.1), ("lstm", "states_5", 0): (0.1, 0.3, 0.1)}
+    without = {("lstm", "states_2", 0): (0.2, 0.8, 0.05)}
+    table = tables.regularisation(runs_of(part(figures)), runs_of(part(without))).frame
+    assert table["model"].tolist() == ["LSTM, 2 states"] * 2
+    assert table["fvu_c2"].tolist() == [0.4, 0.8]
+    assert table["paper_fvu_c2"].tolist() == [0.483, 0.840]
+
+
+def test_stopping_counts_fits_that_train():
+    table = tables.stopping({"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}).frame.set_index("model")
+    assert paper.LUENBERGER not in table.index
+    assert table.loc[paper.GRU, ["fits", "least", "median", "most"]].tolist() == [3, 10, 10, 20]
+
+
+def test_every_candidate_is_in_the_file_of_its_scheme():
+    table = tables.candidates(runs_of(part()), ["c2", "f2"])
+    assert len(table) == 6
+    row = table[table["variant"] == "linear_no_bias_p2"].iloc[0]
+    assert (row["n_seeds"], row["seed"], row["fvu_f2"], row["epochs_max"]) == (2, 1, 0.13, 20)
+
+
+def test_the_scatter_shows_ours_filled_and_the_papers_hollow():
+    runs = runs_of(part())
+    schemes = [scatter.Scheme("One", runs, paper.TABLE_IV, "c2", "f2"), scatter.Scheme("Two", runs, paper.TABLE_V, "f2", "c2")]
+    figure = scatter.two_tests(schemes, "caption").static
+    assert len(figure.axes) == 4
+    upper_left = figure.axes[0]
+    points = np.concatenate([own.get_offsets() for own in upper_left.collections])
+    for expected in ((1 - 0.13, 1 - 0.11), (1 - 0.152, 1 - 0.133)):
+        assert np.isclose(points, expected).all(axis=1).any(), f"{expected} is not drawn"
+    lower_right = figure.axes[3]
+    points = np.concatenate([own.get_offsets() for own in lower_right.collections])
+    assert np.isclose(points, (0.210, 0.170)).all(axis=1).any(), "the paper's linear network without bias, C-2 against F-2"
+
+
+def test_published_figures_agree_with_each_other():
+    """R² and RMSE of the same rows imply one variance of v a test set, as they must."""
+    for table in (paper.TABLE_IV, paper.TABLE_V):
+        for test in ("c2", "f2"):
+            deviations = [row.rmse(test) / math.sqrt(row.fvu(test)) for row in table.values()]
+            assert max(deviations) / min(deviations) < 1.06, (test, deviations)
+    assert paper.TABLE_VII[paper.LSTM, True] == paper.TABLE_V[paper.LSTM]
+    assert sum(row.variants for row in paper.TABLE_III.values()) == 39

@@ -1,0 +1,335 @@
+"""The study of the learned UKF, from small models and recordings made by the test."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.splits import Span, Split
+from vehest.data.store import read_estimate, write_estimate, write_recording
+from vehest.estimators.learned_ukf import LearnedUkf, LearnedUkfSettings
+from vehest.estimators.model_files import save_model
+from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
+from vehest.report.document import Figure, Table, write_document
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.kit.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
+from vehest.studies.kit.reading import median_and_range
+from vehest.training.through_filter import Drive
+from vehest_papers.learned_ukf import build_parts, paper, tables
+from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of
+from vehest_papers.learned_ukf.departures import departures, settings_table
+from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, swapped
+from vehest_papers.learned_ukf.lengths import lengths
+from vehest_papers.learned_ukf.slips import rear_slip
+from vehest_papers.learned_ukf.traces import hardest
+
+PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
+SPANS = {name: Span("car", name) for name in ("learnt", "judged", "a", "d")}
+SPLIT = Split("tyres", (SPANS["learnt"],), (SPANS["judged"],), {"tyre_a": (SPANS["a"],), "tyre_d": (SPANS["d"],)})
+PHASE = {"learning_rate": 5e-4, "max_epochs": 1000, "schedule": "constant"}
+AS_THE_PAPER = {
+    **dict.fromkeys(("one_step", "through", "noise"), PHASE),
+    **{
+        "batch_size": 256,
+        "placing": "fixed",
+        "start_spread": 0.0,
+        "mirrored": 0.0,
+        "start_noise": "given",
+        "drop_steps": 200,
+        "steps": 500,
+    },
+}
+CANDIDATES = {
+    "NNT": {"dynamics": "tyre_network", "noise": "constant", "through_filter": False},
+    "NNTF": {"noise": "constant", "through_filter": False},
+    "NNTF_U": {"noise": "constant"},
+    "NNTF_UH": {},
+    "NNTF_UH*": {"start_friction": 0.4},
+}
+
+
+def recording(name: str, seconds: float = 3.2, seed: int = 0) -> Recording:
+    """A drive of smooth motion that no model explains."""
+    time = np.arange(round(100 * seconds)) / 100.0
+    vx, vy, yaw_rate = 2.5 + 0.4 * np.sin(1.3 * time + seed), 0.3 * np.sin(2.0 * time + seed), 1.2 * np.cos(1.1 * time + seed)
+    noise = np.random.default_rng(seed).normal(0.0, 0.05, (4, len(time)))
+    measured = {"vx": vx, "motor_speed": 20.0 * vx + noise[0], "yaw_rate": yaw_rate + noise[1]}
+    measured |= {"ax": noise[2], "ay": vx * yaw_rate + noise[3], "steer": 0.2 * yaw_rate, "motor_current": 10.0 + 5.0 * np.sin(time)}
+    return Recording(name, "car", 100.0, 0.0, {**measured, "vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate}, "simulated")
+
+
+def filter_of(seed: int = 0, **settings: object) -> LearnedUkf:
+    """A filter with networks of random weights, not trained."""
+    estimator = LearnedUkf(LearnedUkfSettings(**{"width": 4, "scaled": False, **settings}))
+    estimator.filter.reset(torch.Generator().manual_seed(seed))
+    return estimator
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
+    """Five filters and a network, two seeds each, on two sets of three sequences."""
+    folder = tmp_path_factory.mktemp("study")
+    recordings = {name: recording(name, seed=number) for number, name in enumerate(SPANS)}
+    references = {}
+    for name, own in recordings.items():
+        references["car", name] = folder / f"{name}.parquet"
+        write_recording(own, references["car", name])
+    models, rows = [], []
+    for candidate in (*CANDIDATES, "GRU"):
+        for seed in (0, 1):
+            home = folder / f"{candidate.strip('*')}{candidate.count('*')}-{seed}"
+            home.mkdir()
+            estimator = filter_of(seed, **CANDIDATES[candidate]) if candidate in CANDIDATES else None
+            name, variant = (estimator.name, estimator.variant) if estimator else ("velocity_gru", "states_64")
+            figures: dict[tuple[str, str], float] = {}
+            for test, span in {"validation": SPANS["judged"], "tyre_a": SPANS["a"], "tyre_d": SPANS["d"]}.items():
+                pieces = sequences([span], lambda span: recordings[span.recording], PROTOCOL)
+                cut = [recordings[span.recording].cut(piece.start, piece.stop) for piece in pieces]
+                states = [reference_state(recordings[span.recording], piece) for piece in pieces]
+                own = estimator.estimate([one.without_references() for one in cut], states) if estimator else [constant(one) for one in cut]
+                for position, estimate in enumerate(own):
+                    write_estimate(estimate, home / test / f"{position}.parquet")
+                scored = score_all(own.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL)
+                figures |= {(test, metric): value for metric, value in accuracy(scored).items()}
+                figures |= {(test, "n_parameters"): 100, (test, "epochs"): 4, (test, "n_sequences"): 3}
+            if estimator:
+                save_model(estimator, home)
+                pd.DataFrame({"metric": ["skipped_steps", "best_epoch"], "value": [1.0, 2.0]}).to_csv(home / "fit.csv", index=False)
+                history = pd.DataFrame({"phase": [0.0, 1.0, 1.0], "epoch": [1, 1, 2], "train_loss": 1.0, "validation_loss": 1.0})
+                history.to_csv(home / "history.csv", index=False)
+            models.append(EvaluatedModel(name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}))
+            head = ("learned_ukf", name, variant, "car", "car", "simulated")
+            tail = ("all", "nominal", 100.0, "causal", seed)
+            rows += [(*head, test, *tail, metric, value, "1", None, None) for (test, metric), value in figures.items()]
+    return StudyArtefacts(
+        study="learned_ukf",
+        title="t",
+        about="a",
+        command="c",
+        split=SPLIT,
+        protocol=PROTOCOL,
+        kinds={"car": "simulated"},
+        data_titles={"car": "A car"},
+        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
+        models=models,
+        references=references,
+        facts=["Recordings are made", "learned_ukf: through_filter"],
+    )
+
+
+def constant(own: Recording) -> Estimate:
+    """An estimate without covariance that stays at the start."""
+    channels = {name: np.full(len(own), own[f"{name}_ref"][0]) for name in ("vx", "vy", "yaw_rate")}
+    return Estimate(own.id, "velocity_gru", 100.0, own.start_time, {**channels, "sideslip": channels["vy"] / channels["vx"]})
+
+
+def model(part: StudyArtefacts, candidate: str, seed: int = 0) -> EvaluatedModel:
+    return models_by_candidate(part)[candidate][seed]
+
+
+@pytest.mark.parametrize(
+    ("settings", "candidate"),
+    [({"dynamics": "pacejka", "noise": "constant", "through_filter": False}, "PC")]
+    + [({"dynamics": "residual", "noise": "constant", "through_filter": False}, "PCR")]
+    + [({"dynamics": "neural", "noise": "constant"}, "NN_U")]
+    + [(own, candidate) for candidate, own in CANDIDATES.items()],
+)
+def test_candidates_have_the_papers_names(settings, candidate):
+    estimator = LearnedUkf(LearnedUkfSettings(width=4, **settings))
+    assert candidate_of(EvaluatedModel("learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path())) == candidate
+
+
+def test_two_variants_under_one_name_are_refused(part):
+    twice = StudyArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
+    with pytest.raises(DataError, match="NNT was trained twice with one seed"):
+        models_by_candidate(twice)
+
+
+def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path):
+    titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "length_500": "Sequences of 500"}
+    length = StudyArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
+    artefacts = PartsArtefacts("learned_ukf", "t", "a", "c", titles, {"simulated": part, "length_500": length}, ["real"])
+    document = build_parts(artefacts)
+    write_document(document, tmp_path, page=False)
+    text = (tmp_path / "report.md").read_text()
+    figures = {block.name for block in document.blocks if isinstance(block, Figure)}
+    assert figures == {*(f"figure_{number}_simulated" for number in (3, 4, 5, 6)), "figure_7"}
+    names = {block.name for block in document.blocks if isinstance(block, Table)}
+    assert names >= {
+        "overview",
+        *(f"{name}_simulated" for name in ("table_1", "table_2", "by_state", "consistency", "definiteness", "budget")),
+    }
+    assert set(document.data) >= {f"{name}_simulated" for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")}
+    assert "Simulated tyre sets: SIMULATED data" in text
+    assert "Not in this report, since the recordings were not at hand: Real tyre sets" in text
+    assert "authors' public code on these files" not in text
+    assert "learned_ukf: through_filter" not in text
+    assert "Recordings are made" in text
+
+
+def test_study_without_its_parts_or_test_sets_is_refused(part):
+    with pytest.raises(DataError, match="needs one of the parts: real, simulated"):
+        build_parts(PartsArtefacts("s", "t", "a", "c", {}, {}, []))
+    other = StudyArtefacts(**{**vars(part), "split": Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})})
+    with pytest.raises(DataError, match="must be called tyre_a and tyre_d"):
+        build_parts(PartsArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
+
+
+@pytest.mark.parametrize("candidate", ["NNT", "NNTF_U", "NNTF_UH", "NNTF_UH*"])
+def test_filters_put_to_work_again_give_what_was_evaluated(part, candidate):
+    estimator = loaded(model(part, candidate))
+    means = filtered(estimator, drives_of(part, estimator, "tyre_d")).steps.filtered.mean
+    stored = read_estimate(model(part, candidate).evaluation_folder / "tyre_d" / "1.parquet")
+    assert means.shape == (3, 100, 5)
+    np.testing.assert_allclose(means[1, :, 1], stored["vy"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(means[1, :, 4], stored["friction"], rtol=0, atol=1e-6)
+
+
+def test_swapping_a_model_for_itself_changes_nothing_and_for_another_both_halves(part):
+    first, second = (loaded(model(part, "NNTF", seed)) for seed in (0, 1))
+    drives = drives_of(part, first, "tyre_a")
+
+    def means(result):
+        return result.steps.filtered.mean
+
+    own = means(filtered(first, drives))
+    assert torch.equal(means(swapped(first, first, drives)), own)
+    assert not torch.allclose(means(swapped(first, second, drives)), own)
+    assert not torch.allclose(means(swapped(second, first, drives)), means(filtered(second, drives)))
+
+
+def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
+    estimator = loaded(model(part, "NNTF"))
+    drives = drives_of(part, estimator, "tyre_a")
+    assert definiteness(estimator, drives).lost == 0
+    estimator.filter.initial_covariance = lambda: -torch.eye(5)
+    counted = definiteness(estimator, drives)
+    assert (counted.sequences, counted.lost, counted.steps) == (3, 3, 300)
+    assert counted.lost_steps >= 3
+    assert estimator.filter.repair
+
+
+def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
+    estimator = loaded(model(part, "NNTF_U"))
+    inputs = torch.tensor([[0.1, 10.0]]).expand(6, 2)
+    states = [torch.tensor([2.5, 0.1, 0.5, 2.6, 0.6])]
+    with torch.no_grad():
+        for k in range(5):
+            states.append(estimator.filter.moved(states[-1][None], inputs[k : k + 1])[0])
+    drives = Drive(torch.stack(states)[None], inputs[None], torch.zeros(1, 6, 4))
+    assert one_step_squares(estimator, drives).max() == 0.0
+    drives.states[0, -1, 1] += 0.5
+    np.testing.assert_allclose(one_step_squares(estimator, drives), [0.0, 0.05, 0.0, 0.0], rtol=1e-5)
+
+
+def test_protocol_without_sequences_is_refused(part):
+    whole = StudyArtefacts(**{**vars(part), "protocol": Protocol(100.0, 0.0, 0.2)})
+    with pytest.raises(ConfigurationError, match=r"needs evaluation\.sequence_seconds"):
+        drives_of(whole, loaded(model(part, "NNTF")), "tyre_a")
+
+
+def test_validation_chooses_the_seed_and_tests_do_not(part):
+    runs = runs_of(part)
+    column = runs["candidate"] == "NNTF"
+    runs.loc[column, "mse_weighted.validation"] = [2.0, 1.0]
+    runs.loc[column, "mse_weighted.tyre_d"] = [0.1, 9.0]
+    assert chosen(part, runs, "NNTF").seed == 1
+
+
+def test_a_metric_that_is_missing_is_said(part):
+    metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
+    with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
+        runs_of(StudyArtefacts(**{**vars(part), "metrics": metrics}))
+
+
+def test_tables_show_median_and_range_beside_the_paper():
+    assert median_and_range(np.array([0.3, 0.1, 0.2]), 2) == "0.20 [0.10, 0.30]"
+    assert median_and_range(np.array([0.3, math.nan]), 2) == "0.30"
+    runs = pd.DataFrame({"candidate": ["NNTF_UH"] * 3, **{f"{m}_weighted.tyre_a": [0.3, 0.1, 0.2] for m in ("mse", "mae", "ae99")}})
+    row = tables.accuracy(runs, "tyre_a", "t", "c", authors_code=True).frame.iloc[0]
+    assert (row["paper_mse"], row["median_mse"], row["code_mse"], row["n_seeds"]) == (0.0063, 0.2, 0.0158, 3)
+    assert math.isnan(tables.accuracy(runs, "tyre_a", "t", "c", authors_code=False).frame.iloc[0]["code_mse"])
+
+
+def test_differences_that_are_planted_are_told_from_those_that_are_not():
+    generator = np.random.default_rng(0)
+    sequence = np.repeat(np.arange(12), 50)
+    hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
+
+    def losses(level):
+        return np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)])
+
+    published = {"A": 0.1, "B": 0.2, "C": 0.3, "D": 0.4}
+    pairs = differences(
+        {"A": losses(1.0), "B": losses(2.0), "C": losses(1.5), "D": losses(1.5), "X": losses(9.0)}, sequence, published, 100.0
+    )
+    verdicts = {(row["first"], row["second"]): row["verdict"] for row in pairs.to_dict("records")}
+    assert verdicts["A", "B"] == verdicts["A", "C"] == AS_IN_THE_PAPER
+    assert verdicts["B", "C"] == TURNED
+    assert verdicts["C", "D"] == UNDECIDED
+    assert [tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()] == [("A", "B"), ("B", "C"), ("C", "D")]
+    words = order_in_words(pairs, {"A": 1.0, "B": 2.0, "C": 1.5, "D": 1.5}, "on tyre A")
+    assert "3 in its order, 2 the other way round, and includes zero for 1" in words
+    assert "The other way round: C before B; D before B." in words
+    assert "do not tell apart: C and D." in words
+
+
+def test_pairs_that_are_level_in_the_paper_have_a_verdict_of_their_own_and_share_their_neighbours():
+    generator = np.random.default_rng(0)
+    table = {name: level * generator.uniform(0.9, 1.1, (3, 600)) for name, level in (("A", 1.0), ("B", 2.0), ("C", 2.0), ("D", 3.0))}
+    pairs = differences(table, np.repeat(np.arange(12), 50), {"A": 0.1, "B": 0.1, "C": 0.1, "D": 0.2}, 100.0)
+    verdicts = {(row["first"], row["second"]): row["verdict"] for row in pairs.to_dict("records")}
+    assert (verdicts["A", "B"], verdicts["B", "C"], verdicts["C", "D"]) == (APART, LEVEL, AS_IN_THE_PAPER)
+    assert {tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()} == {("A", "D"), ("B", "D"), ("C", "D")}
+    assert "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C." in order_in_words(pairs, {}, "x")
+
+
+def test_slip_angle_of_the_rear_axle_is_that_of_a_hand_calculation():
+    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
+    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
+    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
+
+
+def test_hardest_sequence_is_that_of_all_models_together():
+    assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
+
+
+def test_only_what_departs_from_the_paper_is_said(part):
+    assert [line.split(":")[0] for line in departures({"real": part})] == [
+        "Data",
+        "Hidden layers of some candidates are 4 wide (paper",
+        "Not part of this run",
+        "GRU and LSTM",
+    ]
+    training = {**AS_THE_PAPER, "batch_size": 6, "through": {**PHASE, "max_epochs": 300, "schedule": "cosine"}, "mirrored": 0.5}
+    changed = [EvaluatedModel(**{**vars(own), "training": training}) for own in part.models if own.estimator == "learned_ukf"]
+    text = "\n".join(departures({"real": StudyArtefacts(**{**vars(part), "models": changed})}))
+    assert "Batches of 6 sequences" in text
+    assert "300 epochs (paper: 1000, of one batch each); a step size of 0.0005 that falls to zero along a cosine" in text
+    assert "mirror" in text
+    table = settings_table({"real": StudyArtefacts(**{**vars(part), "models": changed})})
+    assert table[(table["candidate"] == "NNT") & (table["setting"] == "through.max_epochs")]["value"].tolist() == [300]
+
+
+def test_lengths_are_those_of_trainings_through_the_filter(part):
+    own = StudyArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
+    row = lengths({"length_500": own}).iloc[0]
+    assert (row["steps"], row["epochs"]) == (500, 1000)
+    with pytest.raises(DataError, match="was not trained through the filter"):
+        lengths({"length_500": StudyArtefacts(**{**vars(part), "models": [model(part, "GRU")]})})
+
+
+def test_published_figures_agree_with_the_text_of_the_paper():
+    first, second = paper.TABLE_I, paper.TABLE_II
+    for name, gain in (("mse", 17), ("mae", 6), ("ae99", 33)):
+        assert round(100 * (1 - getattr(first["NNTF_UH"], name) / getattr(first["GRU"], name))) == gain
+    order = sorted(second, key=lambda name: -second[name].mse)
+    assert order == ["PC", "LSTM", "GRU", "NN_U", "NN", "PCR", "NNTF", "NNTF_U", "NNTF_UH", "NNTF_UH*"]

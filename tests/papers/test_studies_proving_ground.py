@@ -1,0 +1,368 @@
+"""The study of the simulated cars: its statistics against plain ones, its pages, and pipelines of data sets alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from test_cli import _statuses
+
+from conftest import planar_drive
+from place import DATASET
+from vehest.data.files import ASIDE_PREFIX
+from vehest.data.recording import Recording
+from vehest.data.store import write_recording
+from vehest.report.document import Document, write_document
+from vehest.report.recording_figures import Distribution, beyond
+from vehest.simulation.plant.parameters import Vehicle
+from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
+from vehest_papers.proving_ground import documents
+from vehest_papers.proving_ground.handling import HandlingPoints, characteristic, single_track_gradient
+from vehest_papers.proving_ground.noise import spectra
+from vehest_papers.proving_ground.papers import PROFILES, page_of
+from vehest_papers.proving_ground.tally import FINE, Grid, Tally
+from vehest_papers.proving_ground.vehicles import CHANNELS, busiest_stretch, set_of, survey
+
+FERRARI = yaml.safe_load((Path(__file__).parents[2] / "conf" / "vehicle" / "ferrari_250_lm.yaml").read_text(encoding="utf-8"))
+CALM = {"spun": False, "left_road": False, "stood": False, "completed": True, "gave_up_at": None, "largest_sideslip": 0.05}
+REAL = AbsentDataset("ferrari_250lm", "The real car", "somebody's licence", "somebody's paper")
+
+
+def _drive(name: str = "f1_001", seed: int = 0, seconds: float = 60.0, rate_hz: float = 20.0, *, steered: float = 0.0) -> Recording:
+    """A drive with a steering angle: that of the curvature, and ``steered`` rad more in left turns, less in right ones."""
+    plain = planar_drive(seconds, rate_hz, seed=seed, name=name)
+    steer = np.arctan(2.4 * plain["yaw_rate"] / plain["vx"]) + steered * np.sign(plain["yaw_rate"])
+    return replace(plain, vehicle="ferrari_250_lm", channels={**plain.channels, "steer": steer})
+
+
+def _simulated(recording: Recording, manoeuvre: str = "laps", **flags: object) -> Recording:
+    """The same as if vehest's plant had made it."""
+    about = {
+        "parameter_set": FERRARI["parameter_set"],
+        "overrides": FERRARI["overrides"],
+        "manoeuvre": {"name": manoeuvre},
+        "surface": {"name": "dry", "friction": 1.0},
+        "stability_control": False,
+        "flags": {**CALM, **flags},
+    }
+    return replace(recording, kind="simulated", provenance=about)
+
+
+def _stored(folder: Path, name: str, kind: str, recordings: list[Recording]) -> StoredDataset:
+    files = {}
+    for recording in recordings:
+        files[recording.id] = folder / f"{name}-{recording.id}.parquet"
+        write_recording(recording, files[recording.id])
+    return StoredDataset(name, f"Title of {name}", kind, {"seed": 7} if kind == "simulated" else {}, files)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory) -> SurveyArtefacts:
+    """Three simulated drives, of which one spun, and a real one."""
+    folder = tmp_path_factory.mktemp("store")
+    spin = {"spun": True, "gave_up_at": 12.5, "largest_sideslip": 2.0, "stood": True}
+    simulated = [
+        _simulated(_drive("f1_001", 1, 90.0, 100.0)),
+        _simulated(_drive("f1_002", 2, 60.0, 100.0), **spin),
+        _simulated(_drive("f2_001", 3, 60.0, 100.0), left_road=True),
+    ]
+    real = replace(_drive("day", 4, 80.0, 100.0), kind="real", vehicle="the real one")
+    datasets = [_stored(folder, "sim_two_cars", "simulated", simulated), _stored(folder, "ferrari_250lm", "real", [real])]
+    return SurveyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run pipelines/x.yaml", datasets, [])
+
+
+@pytest.fixture(scope="module")
+def made(study) -> dict[str, Document]:
+    return documents(study)
+
+
+# Statistics
+
+
+def test_statistics_of_many_recordings_are_those_of_all_samples_together():
+    drives = [_drive(f"d{seed}", seed, 20.0 + seed) for seed in range(5)]
+    tally = Tally()
+    for drive in drives:
+        tally.add(drive)
+    together = {name: np.concatenate([drive[name] for drive in drives]) for name in CHANNELS}
+    values = {name: value for name, (value, _) in tally.values().items()}
+    half_bin = FINE["ay"].width / 2 + 1e-9
+    tight = {"rtol": 0, "atol": 2 * half_bin}  # half a bin, and as much again for another rule of interpolating between two samples
+    assert values["drives"] == 5
+    assert values["duration"] == pytest.approx(sum(drive.duration for drive in drives))
+    assert values["distance"] == pytest.approx(np.hypot(together["vx"], together["vy_ref"]).sum() / 20.0)
+    assert (values["yaw_rate_min"], values["yaw_rate_max"]) == (together["yaw_rate"].min(), together["yaw_rate"].max())
+    np.testing.assert_allclose(values["ay_abs_q99"], np.quantile(np.abs(together["ay"]), 0.99), **tight)
+    np.testing.assert_allclose(values["vy_q01"], np.quantile(together["vy_ref"], 0.01), **tight)
+    np.testing.assert_allclose(values["sideslip_abs_q50"], np.degrees(np.quantile(np.abs(together["sideslip_ref"]), 0.5)), **tight)
+
+
+def test_two_tallies_merged_are_one_tally_of_both():
+    first, second, both = Tally(), Tally(), Tally()
+    one, two = _simulated(_drive("a", 1), spun=True), _drive("b", 2)
+    first.add(one)
+    second.add(two)
+    both.add(one)
+    both.add(two)
+    first.merge(second)
+    assert first.values() == both.values()
+    assert first.flags["spun"] == 1
+
+
+def test_histogram_has_the_bins_of_the_paper_and_loses_no_sample():
+    drive = _drive(seconds=30.0)
+    tally = Tally()
+    tally.add(drive)
+    edges, counts = tally.histogram("ay", 1.0)
+    expected, _ = np.histogram(drive["ay"], edges)
+    assert 0.0 in edges
+    assert np.array_equal(counts, expected)
+    assert counts.sum() == len(drive)
+    assert np.array_equal(Grid(2.0, 1.0).count(np.array([-9.0, -1.0, 0.0, 0.5, 9.0])), [1, 1, 2, 1]), "beyond the limit: outermost bins"
+    with pytest.raises(ValueError, match="do not fit"):
+        tally.histogram("ay", 0.03)
+
+
+def test_slow_samples_count_in_the_duration_and_not_in_distributions():
+    drive = _drive(seconds=10.0)
+    stopped = {**drive.channels, "vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive)), "sideslip_ref": np.full(len(drive), 3.0)}
+    tally = Tally()
+    tally.add(drive)
+    tally.add(replace(drive, channels=stopped))
+    assert tally.seconds == 20.0
+    assert tally.counts["sideslip"].sum() == len(drive)
+
+
+def test_memory_does_not_grow_with_the_number_of_recordings():
+    tally, points = Tally(), HandlingPoints(2.4)
+    sizes = []
+    for seed in range(3):
+        tally.add(_drive(seed=seed))
+        points.add(_drive(seed=seed))
+        sizes.append(sum(counts.nbytes for counts in tally.counts.values()) + points.everything.nbytes + points.steady.nbytes)
+    assert len(set(sizes)) == 1
+
+
+# Handling
+
+
+def test_medians_find_the_steering_that_was_added_to_the_curvature():
+    points = HandlingPoints(2.4)
+    points.add(_drive(seconds=600.0, steered=np.radians(1.03)))
+    ay, angle = points.medians()
+    turning = np.abs(ay) > 1.0
+    assert turning.sum() >= 4
+    np.testing.assert_allclose(angle[turning], 1.03 * np.sign(ay[turning]), atol=0.06)  # half a bin of 0.1°, and its edge
+
+
+def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
+    vehicle = Vehicle("ferrari_250_lm", FERRARI["parameter_set"], FERRARI["overrides"])
+    own = characteristic(vehicle, 1.0, "dry")
+    # m (b/Cf - a/Cr)/L with the axle stiffnesses that the published study of the same car gives
+    expected = np.degrees(982.0 / 2.4 * (1.07 / 0.7e5 - 1.33 / 1.2e5))
+    assert single_track_gradient(vehicle) == pytest.approx(expected, rel=0.01)  # p_ky1 is rounded to three digits
+    for low, high in ((0.5, 2.5), (-2.5, -0.5)):
+        inside = (own.ay > low) & (own.ay < high)
+        slope = np.polyfit(own.ay[inside], own.angle[inside], 1)[0]
+        assert slope == pytest.approx(own.gradient, rel=0.15)  # roll and load transfer are in the plant, not in the single track
+    assert own.ay.max() == pytest.approx(11.3, abs=0.5)
+    assert own.angle[-1] > 3 * own.gradient * own.ay[-1], "understeer rises towards the limit"
+    wet = characteristic(vehicle, 0.7, "wet")
+    assert wet.ay.max() == pytest.approx(0.7 * own.ay.max(), rel=0.05)
+
+
+# What is shown
+
+
+def test_spectrum_of_white_noise_is_flat_at_its_density():
+    noise = np.random.default_rng(0).standard_normal(60_000)
+    drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
+    own = spectra({"simulated": drive})["ay [m/s²/√Hz]"][0]
+    np.testing.assert_allclose(np.median(own.density), 0.3 * np.sqrt(2 / 100.0), rtol=0.03)  # 100 bands of 59 windows each
+    np.testing.assert_allclose(own.density, 0.3 * np.sqrt(2 / 100.0), rtol=0.4)  # one band of 59 windows
+    assert own.frequency[-1] > 40.0
+
+
+def test_busiest_stretch_is_the_one_with_the_most_lateral_acceleration():
+    drive = _drive(seconds=60.0)
+    ay = np.zeros(len(drive))
+    ay[400:500] = 5.0
+    stretch = busiest_stretch(replace(drive, channels={**drive.channels, "ay": ay}), 5.0)
+    assert (stretch.time[0], len(stretch.time)) == (20.0, 100)
+
+
+def test_variants_share_a_page_and_counters_a_set():
+    assert page_of("heavy_truck_worn") == page_of("heavy_truck") == "heavy_truck"
+    assert page_of("bmw_320i_low") == "bmw_320i_low"
+    assert set_of("train_j_turn_off_012") == "train_j_turn_off"
+    assert set_of("nominal_fast") == "nominal_fast"
+
+
+def test_table_i_is_what_the_paper_prints():
+    rows = [own.values for profile in PROFILES.values() for own in profile.sets if "ay_abs_q99" in own.values]
+    assert [row["ay_abs_q99"] for row in rows] == [11.33, 11.60, 10.55, 10.78]
+    assert sum(row["duration"] for row in rows) / 60.0 == pytest.approx(19.0 + 12.6 + 25.7 + 18.1)
+    assert sum(row["distance"] for row in rows) / 1000.0 == pytest.approx(35.4 + 24.1 + 45.8 + 33.6)
+
+
+def test_accidents_are_kept_flagged_and_counted(study, made):
+    pages = survey(study.datasets)
+    page = pages["ferrari_250_lm"]
+    assert list(pages) == ["ferrari_250_lm"], "the real recording stands on the page of its car"
+    assert page.merged("simulated").drives == 3
+    assert page.merged("simulated").flags == {"spun": 1, "left_road": 1, "stood": 1}
+    assert [drive.recording for drive in page.flagged] == ["f1_002", "f2_001"]
+    assert {name: stretch.recording for name, stretch in page.stretches.items()} == {"laps": "f1_001"}, (
+        "traces show a drive that went as planned"
+    )
+    index = "\n".join(block for block in made["report"].blocks if isinstance(block, str))
+    assert "Of 3 simulated drives 2 went wrong by accident: 1 spun, 1 left the road" in index
+    statistics = made["report"].data["statistics"]
+    assert list(statistics.columns) == ["dataset", "kind", "vehicle", "set", "quantity", "value", "unit"]
+    spun = statistics[(statistics["quantity"] == "spun") & (statistics["set"] == "f1")]
+    assert spun["value"].tolist() == [1]
+    assert not ((statistics["kind"] == "real") & (statistics["quantity"] == "spun")).any(), "nobody knows that of a real drive"
+
+
+def test_pages_say_what_is_simulated_and_what_is_real(made):
+    assert list(made) == ["report", "ferrari_250_lm"]
+    for document in made.values():
+        assert str(document.blocks[0]).startswith("**SIMULATED:**")
+    index = "\n".join(str(block) for block in made["report"].blocks)
+    assert "seed 7" in index
+    assert "vehest run pipelines/x.yaml" in index
+    tables = {block.name: block for block in made["ferrari_250_lm"].blocks if hasattr(block, "frame")}
+    assert set(tables["ferrari_250_lm_beside_paper"].frame["set"]) == {"F-1", "F-2"}
+    assert {"real", "simulated"} <= set(tables["ferrari_250_lm_beside_real"].frame.columns)
+    for block in made["ferrari_250_lm"].blocks:
+        if hasattr(block, "static"):
+            assert "imulated" in block.caption
+
+
+def test_without_the_real_recording_the_page_says_how_to_get_it(study):
+    made = documents(replace(study, datasets=study.datasets[:1], absent=[REAL]))
+    text = "\n".join(block for block in made["ferrari_250_lm"].blocks if isinstance(block, str))
+    assert "absent from this report" in text
+    assert "somebody's licence" in text
+    assert "vehest data check ferrari_250lm" in text
+    assert not any(getattr(block, "name", "").endswith("_spectra") for block in made["ferrari_250_lm"].blocks)
+
+
+# Pipelines of data sets alone
+
+
+@pytest.fixture
+def survey_place(place, monkeypatch):
+    """A pipeline of three recordings that say they are simulated, and of a data set whose files may be missing."""
+    monkeypatch.delenv("VEHEST_DATA")
+    conf = place.folder / "conf" / "dataset"
+    (conf / "mine.yaml").write_text(yaml.safe_dump({**DATASET, "path": str(place.folder / "raw")}, allow_unicode=True))
+    other = {**DATASET, "name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
+    (conf / "other.yaml").write_text(yaml.safe_dump(other, allow_unicode=True))
+    pipeline = {"study": "ground", "report": "proving_ground", "datasets": ["mine"], "optional_datasets": ["other"], "publish": True}
+    (place.folder / "pipelines" / "ground.yaml").write_text(yaml.safe_dump(pipeline))
+    return place
+
+
+def test_pipeline_of_data_sets_runs_publishes_and_is_skipped_then(survey_place):
+    place, results = survey_place, survey_place.folder / "results" / "ground"
+    code, out, err = place("run", "ground", "--jobs", "1")
+    assert code == 0, err
+    assert "the study goes on without it" in err
+    assert "my_car" in out
+    assert {"report.md", "my_car.md", "provenance.json", "figures", "tables"} == {file.name for file in results.iterdir()}
+    assert json.loads((results / "provenance.json").read_text())["absent"] == ["other"]
+    for page in results.glob("*.md"):
+        for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+            assert (results / target).is_file(), f"{page.name} links to {target}"
+        assert str(place.folder) not in page.read_text(encoding="utf-8")
+    html = next((place.folder / "outputs" / "report").glob("ground-*/report.html")).read_text(encoding="utf-8")
+    assert 'href="my_car.html"' in html
+    assert 'href="my_car.md"' not in html
+
+    made = place.files()
+    code, again, err = place("run", "ground", "--jobs", "1")
+    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert (again, place.files()) == (out, made)
+    assert place("report", "ground")[0] == 0
+
+    here = ("root=raw", "--jobs", "1")  # the real recording is there now
+    _, out, err = place("run", "ground", *here, "--json")
+    assert [line.split()[1] for line in err.splitlines() if line.startswith("done")] == ["ingest", "report", "publish"]
+    assert [row["kind"] for row in json.loads(out)["overview"]] == ["simulated", "real"]
+    assert json.loads((results / "provenance.json").read_text())["kinds"] == {"mine": "simulated", "other": "real"}
+    _, out, err = place("run", "ground", "--json")
+    assert "not published: 'results/ground' shows data set 'other'" in err.replace("\n", "")
+    assert json.loads(out)["published"] is None
+    assert (results / "tables" / "overview.csv").read_text().count("real") == 1
+    assert pd.read_csv(results / "tables" / "statistics.csv")["set"].isin(["manoeuvre:drive"]).any()
+
+
+def test_overrides_reach_the_data_sets_that_have_their_key(survey_place):
+    place = survey_place
+    code, _, err = place("run", "ground", "dataset.files=t*.csv", "--dry-run", "tracking=none")
+    assert code == 0, err
+    assert ("would", "ingest") in _statuses(err)
+    assert ("would", "report") in _statuses(err)
+    assert place.files() == set()
+    assert "suits no data set" in place.refused("run", "ground", "training.patience=1")[1]
+    assert "belong to the study" in place.refused("run", "ground", "dataset=mine")[1]
+    assert "run 'vehest run" in place.refused("report", "ground")[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"split": "mine"}, "one of: split and sweeps; parts"),
+        ({"datasets": []}, "must name some"),
+        ({"datasets": "mine"}, "datasets must be a list of names, not 'mine'"),
+        ({"datasets": ["other"]}, "none of them twice"),
+        ({"datasets": ["nothing"]}, "dataset=nothing is not there"),
+        ({"report": "drive"}, "'drive' draws its report from split and sweeps"),
+    ],
+)
+def test_pipelines_of_data_sets_that_make_no_sense_are_refused(survey_place, change, message):
+    file = survey_place.folder / "pipelines" / "ground.yaml"
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **change}))
+    code, line = survey_place.refused("run", "ground")
+    assert code == 2
+    assert message in line
+
+
+def test_needed_recordings_that_are_missing_are_one_clear_line(survey_place):
+    file = survey_place.folder / "pipelines" / "ground.yaml"
+    file.write_text(yaml.safe_dump({"study": "ground", "report": "proving_ground", "datasets": ["other"]}))
+    code, line = survey_place.refused("run", "ground")
+    assert code == 4
+    assert "no data root is set" in line
+
+
+def test_a_signal_while_pages_are_drawn_leaves_nothing_and_the_next_run_goes_on(survey_place, monkeypatch):
+    place, reports = survey_place, survey_place.folder / "outputs" / "report"
+
+    def interrupted(made, folder):
+        write_document(made["report"], folder)
+        assert any(reports.glob(f"{ASIDE_PREFIX}*/report.md"))
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr("vehest.report.document.write_documents", interrupted)
+    code, _, err = place("run", "ground", "--jobs", "1")
+    assert code == 143, err
+    assert not list(reports.iterdir())
+    assert not (place.folder / "results").exists()
+    code, _, err = place("run", "ground", "--dry-run")
+    assert _statuses(err) == [("skipped", "ingest"), ("would", "report")]
+
+
+def test_samples_beyond_the_drawn_range_are_counted():
+    edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
+    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
+    assert beyond(distributions, 20.0) == pytest.approx(2.5)

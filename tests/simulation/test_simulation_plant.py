@@ -1,0 +1,526 @@
+"""The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
+
+from __future__ import annotations
+
+import fcntl
+import importlib.util
+import inspect
+import math
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.integrate import solve_ivp
+from vehiclemodels import vehicle_dynamics_mb as library
+from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
+
+from vehest.constants import GRAVITY
+from vehest.data.errors import ConfigurationError, MissingError
+from vehest.simulation.errors import SimulationError
+from vehest.simulation.plant import compiled
+from vehest.simulation.plant.handling import ramp_steer
+from vehest.simulation.plant.motion import Motion
+from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState, road_gravity
+from vehest.simulation.plant.parameters import (
+    PUBLISHED_SETS,
+    Vehicle,
+    compiled_parameters,
+    library_parameters,
+    rear_tyre,
+    vehicle_from_configuration,
+)
+from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, STEER, VX, VY, YAW_RATE, Regime
+from vehest.simulation.plant.rewriting import CONTACT_FORCES, SMALLEST_WHEEL_VELOCITY, rewritten_source
+
+CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
+
+
+def shipped(name: str) -> Vehicle:
+    return vehicle_from_configuration(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
+
+
+AS_PUBLISHED = Vehicle("bmw_320i", parameter_set=2)
+LOWERED = shipped("bmw_320i_low")
+FERRARI, CORVETTE, TRUCK = shipped("ferrari_250_lm"), shipped("corvette_grand_sport"), shipped("heavy_truck")
+
+# CommonRoad's own test of the multi-body equations (vehiclemodels/unit_tests/test_derivatives.py): BMW 320i, state, derivatives.
+PUBLISHED_INPUTS = (0.15, 0.63 * GRAVITY)
+PUBLISHED_STATE = [
+    *(10.8808433066274794, 0.5371850187869442, 0.0980442671005920, 18.0711398687457745, 0.1649995631003776, 0.6158755000936103),
+    *(-0.1198403612262477, -0.2762672756169581, 0.0131909920269115, -0.0718483683742141, -0.3428324595054725, 0.0103233373083297),
+    *(-0.0399590564140291, -0.0246468320579360, -0.0551575051990853, 0.5798277643297529, 0.0172059354801703, 0.0067890113155477),
+    *(-0.0184269459410162, -0.0408207136116175, -1.0064484829203018, 0.0166808347900582, -0.0049188492004049, 53.6551710641082451),
+    *(50.7045242506744316, 56.7917911784219598, 200.7079633169796296, -0.0939969123691911, -0.0881514621614376),
+]
+PUBLISHED_DERIVATIVES = [
+    *(17.8820162482414098, 2.6300428035858809, 0.1500000000000000, 2.7009396644636450, 0.6158755000936103, 1.3132879472301846),
+    *(-0.2762672756169581, -0.1360581472638375, -0.0718483683742141, 0.4909514227532223, -2.6454134031927374, -0.0399590564140291),
+    *(0.0486778649724968, -0.0551575051990853, 0.0354501802049087, -1.1130397141873534, 0.0067890113155477, -0.0886810139593130),
+    *(-0.0408207136116175, 0.0427680029698811, -4.3436374104751501, -0.0049188492004049, 0.1142109377736169, 10.0527321757776047),
+    *(0.0436512393438736, -154.12795711273924, 422.12780928288305, -0.2105876149500405, -0.2126005780977984),
+]
+
+
+class TwoTyres:
+    """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one for two, and so on."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.values, self.asked = library_parameters(vehicle), 0
+        self.tyres = (self.values.tire, rear_tyre(vehicle))
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "tire":
+            self.asked += 1
+            return self.tyres[(self.asked - 1) % 4 // 2]
+        return getattr(self.values, name)
+
+
+def passes_forces_on(contact: object, x: object, u: object, p: object, *forces: float) -> tuple[float, ...]:
+    return forces[:8]
+
+
+@cache
+def rewritten_function() -> Any:
+    names = {**vars(library), CONTACT_FORCES: passes_forces_on}
+    exec(rewritten_source(vehicle_dynamics_mb, "library"), names)
+    return names["vehicle_dynamics_mb"]
+
+
+def rewritten_in_python(x: list[float], inputs: list[float], vehicle: Vehicle) -> list[float]:
+    derivatives, _ = rewritten_function()(list(x), inputs, compiled_parameters(vehicle), None)
+    return derivatives
+
+
+def disturbed(plant: MultiBodyPlant, generator: np.random.Generator, speed: float = 25.0) -> np.ndarray:
+    values = plant.initial_state(1.0, 2.0, 0.3, speed).values
+    return values + 0.02 * generator.standard_normal(29) * np.maximum(np.abs(values), 0.1)
+
+
+def inputs_of(steering: float = 0.0, acceleration: float = 0.0, moment: float = 0.0, along: float = 0.0, across: float = 0.0) -> np.ndarray:
+    return np.array([steering, acceleration, moment, along, across])
+
+
+def drive(
+    plant: MultiBodyPlant, state: PlantState, command: Any, seconds: float, rate_hz: float = 100.0, friction: float = 1.0
+) -> tuple[Motion, list[PlantState]]:
+    """What follows from inputs command(time, state), held between samples."""
+    states, inputs, n_steps = [], [], round(1.0 / (rate_hz * plant.step))
+    for k in range(round(seconds * rate_hz)):
+        now = np.asarray(command(k / rate_hz, state), dtype=float)
+        states.append(state)
+        inputs.append(now)
+        state = plant.advance(state, now, n_steps, friction)
+    return plant.motion(states, np.array(inputs), rate_hz, friction=friction), states
+
+
+def lane_change(time: float, state: PlantState) -> np.ndarray:
+    target = 0.06 * math.sin(2.0 * math.pi * 0.5 * time) if time < 2.0 else 0.0
+    return inputs_of(20.0 * (target - state.steer), 1.0 if time < 2.0 else -6.0)
+
+
+def spins(time: float, state: PlantState) -> np.ndarray:
+    """A sine with dwell in the steering, too large for the speed, then the brakes."""
+    phase = min(time, max(time - 0.5, 0.75 / 0.7)) * 0.7
+    target = 0.2 * math.sin(2.0 * math.pi * phase) if phase < 1.0 else 0.0
+    return inputs_of(50.0 * (target - state.steer), -4.0 if time > 2.0 else 0.0)
+
+
+@pytest.fixture(scope="module")
+def spin() -> tuple[Motion, list[PlantState]]:
+    plant = MultiBodyPlant(CORVETTE)
+    return drive(plant, plant.initial_state(0.0, 0.0, 0.0, 40.0), spins, 12.0)
+
+
+# --- the library's equations
+
+
+def test_published_derivatives_are_reproduced() -> None:
+    computed = rewritten_in_python(PUBLISHED_STATE, list(PUBLISHED_INPUTS), AS_PUBLISHED)
+    np.testing.assert_allclose(computed, PUBLISHED_DERIVATIVES, rtol=0.0, atol=5e-8)  # as the library's own test: seven places
+    inputs = inputs_of(*PUBLISHED_INPUTS)
+    state = PlantState(np.array(PUBLISHED_STATE), Regime.ROLLING)
+    derivatives, _ = MultiBodyPlant(AS_PUBLISHED).evaluate([state], inputs[None])
+    same = np.setdiff1d(np.arange(29), [25, 26])  # one driven wheel spins at 200 rad/s: the plant's engine has no such power
+    np.testing.assert_allclose(derivatives[0, same], np.array(PUBLISHED_DERIVATIVES)[same], rtol=0.0, atol=5e-8)
+
+
+@pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
+def test_rewritten_equations_are_the_librarys_bit_by_bit(vehicle: Vehicle) -> None:
+    plant, generator, parameters = MultiBodyPlant(vehicle), np.random.default_rng(0), TwoTyres(vehicle)
+    for _ in range(20):
+        state, inputs = disturbed(plant, generator), generator.uniform([-0.3, -8.0], [0.3, 0.5])
+        expected = vehicle_dynamics_mb(state.tolist(), inputs.tolist(), parameters)
+        assert rewritten_in_python(state.tolist(), inputs.tolist(), vehicle) == expected
+        derivatives, _ = plant.evaluate([PlantState(state, Regime.ROLLING)], inputs_of(*inputs)[None])
+        np.testing.assert_allclose(derivatives[0], expected, rtol=1e-9, atol=1e-9)  # compiled: other sines
+
+
+def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_below() -> None:
+    plant = MultiBodyPlant(LOWERED)
+    for speed in (1.02 * SMALLEST_WHEEL_VELOCITY, 2.0 * SMALLEST_WHEEL_VELOCITY):
+        state = plant.initial_state(0.0, 0.0, 0.0, speed).values
+        state[FIRST_WHEEL] *= 0.98
+        expected = vehicle_dynamics_mb(state.tolist(), [0.0, 0.0], library_parameters(LOWERED))
+        assert rewritten_in_python(state.tolist(), [0.0, 0.0], LOWERED) == expected
+    at_limit = []
+    for speed in (0.999999 * SMALLEST_WHEEL_VELOCITY, 1.000001 * SMALLEST_WHEEL_VELOCITY):
+        state = plant.initial_state(0.0, 0.0, 0.0, speed).values
+        state[[FIRST_WHEEL, VY, YAW_RATE]] += 0.01, 0.02, 0.02
+        at_limit.append(rewritten_in_python(state.tolist(), [0.0, 0.0], LOWERED))
+    np.testing.assert_allclose(at_limit[0], at_limit[1], rtol=1e-3, atol=1e-3)  # no step at the limit
+    creeping = plant.initial_state(0.0, 0.0, 0.0, 1e-6).values
+    assert np.isfinite(rewritten_in_python(creeping.tolist(), [0.0, 0.0], LOWERED)).all()
+
+
+def test_library_that_reads_differently_is_an_error(tmp_path: Path) -> None:
+    source = inspect.getsource(library).replace("abs(x[3]) < 0.1", "abs(x[3]) < 0.2").replace("s_lf = 1 -", "s_lf = 1.0 -")
+    assert "0.2" in source
+    (tmp_path / "other.py").write_text(source, encoding="utf-8")
+    spec = importlib.util.spec_from_file_location("other", tmp_path / "other.py")
+    assert spec is not None
+    assert spec.loader is not None
+    other = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(other)
+    with pytest.raises(MissingError, match=r"commonroad 9: .*switch abs\(x\[3\]\) < 0.1: 0 instead of 4.*install"):
+        rewritten_source(other.vehicle_dynamics_mb, "commonroad 9")
+
+
+def test_fixed_step_agrees_with_solve_ivp() -> None:
+    plant, inputs = MultiBodyPlant(LOWERED), inputs_of(0.04, -2.0)
+    parameters, start = library_parameters(LOWERED), plant.initial_state(0.0, 0.0, 0.0, 30.0)
+
+    def right_hand_side(_: float, state: np.ndarray) -> list[float]:
+        return vehicle_dynamics_mb(state.tolist(), inputs[:2].tolist(), parameters)
+
+    reference = solve_ivp(right_hand_side, (0.0, 1.0), start.values, method="DOP853", rtol=1e-8, atol=1e-9).y[:, -1]
+    state = plant.advance(start, inputs, 1000)
+    np.testing.assert_allclose(state.values, reference, rtol=1e-4, atol=1e-4)
+    assert abs(state.yaw_rate * state.vx) > 6.0  # the manoeuvre is not a harmless one
+
+
+def test_halving_the_step_changes_nothing_that_matters() -> None:
+    # A lane change at 8 m/s², braking at 6 m/s² to standstill: all of a drive but the spin.
+    whole, half = (
+        drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lane_change, 8.0)[0]
+        for plant in (MultiBodyPlant(FERRARI, 1e-3), MultiBodyPlant(FERRARI, 5e-4))
+    )
+    assert np.abs(whole.ay).max() > 8.0
+    assert whole.vx[-1] == 0.0
+    for name, largest in (("vx", 2e-5), ("vy", 1e-7), ("yaw_rate", 2e-7), ("roll", 1e-8), ("x", 1e-5), ("y", 1e-6)):
+        assert np.abs(getattr(whole, name) - getattr(half, name)).max() < largest, name
+    standing = np.flatnonzero(half.vx == 0.0)[0]  # where a step decides when ax ends
+    moving = slice(0, standing - 2)
+    for name in ("ax", "ay"):
+        assert np.abs(getattr(whole, name)[moving] - getattr(half, name)[moving]).max() < 0.01, name
+
+
+# --- signs and references
+
+
+def turn_left(speed: float, steer: float, seconds: float, vehicle: Vehicle = LOWERED) -> Motion:
+    plant = MultiBodyPlant(vehicle)
+
+    def hold(time: float, state: PlantState) -> np.ndarray:
+        return inputs_of(np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * (speed - state.vx) + 0.8)
+
+    return drive(plant, plant.initial_state(0.0, 0.0, 0.0, speed), hold, seconds)[0]
+
+
+def test_steady_cornering_at_45_m_per_s_reaches_the_known_figure() -> None:
+    turn = turn_left(speed=45.0, steer=0.0275, seconds=15.0)
+    assert turn.ay[-1] == pytest.approx(9.3, abs=0.1)
+    assert math.degrees(turn.sideslip[-1]) == pytest.approx(-3.4, abs=0.15)
+
+
+def test_left_turn_has_the_signs_of_iso_8855() -> None:
+    turn = turn_left(speed=20.0, steer=0.04, seconds=5.0)
+    for name in ("steer", "yaw_rate", "ay", "yaw", "y"):
+        assert getattr(turn, name)[-1] > 0, name
+    assert turn.roll[-1] > 0.01  # leans outwards, the left side up
+    front_left, front_right, rear_left, rear_right = turn.wheel_speed[-1]
+    assert front_right > front_left + 1.0  # the outer wheels run further
+    assert rear_right > rear_left + 0.5
+    assert (turn.tyre_fz[-1, [1, 3]] > turn.tyre_fz[-1, [0, 2]] + 500.0).all()  # and carry more
+    assert (turn.tyre_fy[-1] > 0).all()
+
+
+def test_braking_lowers_the_nose() -> None:
+    plant = MultiBodyPlant(LOWERED)
+    motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lambda time, state: inputs_of(acceleration=-5.0), 1.0)
+    assert motion.pitch[-1] > 0.005
+    assert motion.ax[-1] == pytest.approx(-5.0, abs=0.5)
+    assert motion.pitch[0] == 0.0
+    assert (motion.tyre_fx[-1] < -500.0).all()
+    np.testing.assert_allclose(np.gradient(motion.pitch, 0.01)[5:-1], motion.pitch_rate[5:-1], atol=2e-3)
+
+
+def test_right_is_the_mirror_image_of_left() -> None:
+    plant = MultiBodyPlant(FERRARI)
+    start = plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    left, _ = drive(plant, start, lambda time, state: inputs_of(0.05 if time < 1.0 else -0.05, -2.0), 2.0)
+    right, _ = drive(plant, start, lambda time, state: inputs_of(-0.05 if time < 1.0 else 0.05, -2.0), 2.0)
+    for name in ("vx", "ax", "pitch"):
+        np.testing.assert_allclose(getattr(right, name), getattr(left, name), atol=1e-9)
+    for name in ("vy", "ay", "yaw_rate", "roll", "steer", "yaw"):
+        np.testing.assert_allclose(getattr(right, name), -getattr(left, name), atol=1e-9)
+    np.testing.assert_allclose(right.tyre_fz[:, [1, 0, 3, 2]], left.tyre_fz, rtol=1e-9)
+    np.testing.assert_allclose(right.tyre_fy[:, [1, 0, 3, 2]], -left.tyre_fy, atol=1e-6)
+
+
+# --- balances
+
+
+def test_accelerations_are_consistent_with_velocities_in_every_regime(spin: tuple[Motion, list[PlantState]]) -> None:
+    plant = MultiBodyPlant(FERRARI)
+    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0)
+    assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
+    assert motion.vx[-1] == 0.0
+    for velocity, rate in ((motion.vy, motion.ay - motion.vx * motion.yaw_rate), (motion.vx, motion.ax + motion.vy * motion.yaw_rate)):
+        error = np.abs((velocity[2:] - velocity[:-2]) / 2e-3 - rate[1:-1])
+        assert np.median(error) < 1e-5
+        # Inputs that jump (brakes at 2 s) and the stop itself leave a few samples with half a jump.
+        assert np.sum(error > 0.05) <= 8
+        assert np.sort(error)[-20] < 0.01
+    motion, states = spin
+    sliding = np.array([state.regime == Regime.SLIDING for state in states])
+    inside = np.flatnonzero(sliding[:-2] & sliding[2:])
+    for velocity, rate in ((motion.vy, motion.ay - motion.vx * motion.yaw_rate), (motion.vx, motion.ax + motion.vy * motion.yaw_rate)):
+        error = np.abs((velocity[inside + 2] - velocity[inside]) / 0.02 - rate[inside + 1])
+        assert np.median(error) < 0.02  # the sampling is ten times coarser here
+
+
+@pytest.mark.parametrize("moment", [0.0, 900.0, -900.0])
+def test_tyre_forces_account_for_all_accelerations(moment: float) -> None:
+    # Masses times accelerations by differences of velocities of the body and of both axles, against the sum of forces.
+    plant, slope = MultiBodyPlant(FERRARI), road_gravity(bank=0.05, grade=0.03)
+    p, rate_hz = plant.parameters, 1000.0
+
+    def command(time: float, state: PlantState) -> np.ndarray:
+        return inputs_of(20.0 * (0.05 * math.sin(3.0 * time) - state.steer), -1.0, moment, *slope)
+
+    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), command, 2.0, rate_hz)
+    values = np.array([state.values for state in states])
+    change = ((values[2:] - values[:-2]) / (2.0 / rate_hz))[100:]  # brakes and moment come on within the first 100 ms
+    vx, vy, yaw_rate = (values[101:-1, place] for place in (VX, VY, YAW_RATE))
+    forces = [force[101:-1] for force in (motion.tyre_fx, motion.tyre_fy)]
+    ax = change[:, VX] - vy * yaw_rate - slope[0]
+    np.testing.assert_allclose(forces[0].sum(axis=1), p.m * ax, atol=0.5)  # of 2,000 N: what differences over 2 ms leave
+    lateral = sum(mass * (change[:, place] + vx * yaw_rate - slope[1]) for mass, place in ((p.m_s, VY), (p.m_uf, 15), (p.m_ur, 20)))
+    joint = 8.0  # N, of 10,000: joints lean with the body, by the cosine of the roll angle and its second order
+    np.testing.assert_allclose(forces[1].sum(axis=1), lateral, atol=joint)
+    arm_x, arm_y = np.array([p.a, p.a, -p.b, -p.b]), 0.5 * np.array([p.T_f, -p.T_f, p.T_r, -p.T_r])
+    turning = (forces[1] * arm_x).sum(axis=1) - (forces[0] * arm_y).sum(axis=1)
+    np.testing.assert_allclose(turning, p.I_z * change[:, YAW_RATE], atol=1.0)
+    assert np.abs(motion.ay).max() > 8.0
+
+
+def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can() -> None:
+    plant = MultiBodyPlant(FERRARI)
+    p, state = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 30.0)
+    inputs = np.array([inputs_of(moment=moment) for moment in (0.0, 900.0, 1e6)])
+    without, with_moment, too_much = plant.motion([state] * 3, inputs, 100.0).ax
+    arm = 0.25 * (p.T_f + p.T_r)
+    assert with_moment - without == pytest.approx(-900.0 / arm / p.m, rel=1e-9)
+    assert too_much == pytest.approx(-0.5 * GRAVITY * 1.27, rel=0.03)  # half of the weight times the friction of 1.24 and 1.30
+    after = plant.advance(state, inputs_of(moment=900.0), 10)
+    assert after.yaw_rate == pytest.approx(900.0 / p.I_z * 0.01, rel=0.05)  # the tyres already resist
+
+
+def test_gravity_on_a_bank_pulls_body_and_axles_alike() -> None:
+    # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
+    plant, across = MultiBodyPlant(FERRARI), road_gravity(bank=0.1, grade=0.0)[1]
+    assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
+    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(across=across), 1.0, friction=1e-3)
+    assert motion.vy[-1] == pytest.approx(across * 0.99, rel=0.02)
+    assert np.abs([state.values[27:29] for state in states]).max() < 1e-4  # 1e-2 with the body pulled alone
+
+
+def test_friction_halved_halves_the_reachable_lateral_acceleration() -> None:
+    plant = MultiBodyPlant(CORVETTE)
+    dry, wet = (ramp_steer(plant, 25.0, friction=friction).ay.max() for friction in (1.0, 0.5))
+    assert wet / dry == pytest.approx(0.5, rel=0.08)  # above: smaller slip angles cost less drag
+
+
+# --- standstill, spin, rollover
+
+
+def test_car_in_equilibrium_stays_there() -> None:
+    for vehicle in (FERRARI, TRUCK, LOWERED):
+        plant = MultiBodyPlant(vehicle)
+        for speed in (0.0, 0.5, 30.0):
+            start = plant.initial_state(3.0, 4.0, 0.0, speed)
+            after = plant.advance(start, inputs_of(), 2000)
+            moved = after.values - start.values
+            assert moved[0] == pytest.approx(2.0 * speed, abs=2e-3)
+            if vehicle is not LOWERED or speed == 0.0:  # whose published tyres pull to one side when they roll
+                assert np.abs(moved[1:]).max() < 1e-9
+
+
+def test_truck_stops_from_45_km_per_h_in_five_seconds_stands_and_drives_off() -> None:
+    plant = MultiBodyPlant(TRUCK)
+    motion, states = drive(
+        plant, plant.initial_state(0.0, 0.0, 0.0, 12.5), lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5), 12.0
+    )
+    stands = np.array([state.stands for state in states])
+    assert np.flatnonzero(stands)[0] == pytest.approx(500, abs=15)
+    assert stands[520:700].all()
+    assert not motion.ax[520:700].any()
+    assert not motion.wheel_speed[600:700].any()
+    assert np.abs(motion.pitch[600:700]).max() < 1e-3  # the last nod is over
+    assert motion.vx[-1] == pytest.approx(1.5 * 5.0, rel=0.06)  # wheels take part of the force to turn faster
+    assert not states[-1].spun
+
+
+def test_regimes_join_without_jumps_that_matter() -> None:
+    plant = MultiBodyPlant(CORVETTE)
+
+    def stop_and_go(time: float, state: PlantState) -> np.ndarray:
+        return inputs_of(10.0 * (0.15 * math.sin(time) - state.steer), -2.5 if time < 3.0 else 2.0)
+
+    motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 5.0), stop_and_go, 6.0, rate_hz=1000.0)
+    regimes = np.array([state.regime for state in states])
+    joins = np.flatnonzero(np.diff(regimes)) + 1
+    assert regimes[joins].tolist() == [Regime.SLOW, Regime.ROLLING]
+    for k in joins:
+        assert abs(motion.ax[k] - motion.ax[k - 1]) < 0.1
+        assert abs(motion.ay[k] - motion.ay[k - 1]) < 0.02
+        for name, largest in (("vx", 3e-3), ("vy", 5e-4), ("yaw_rate", 5e-4), ("roll", 1e-4), ("pitch", 1e-4)):  # a step's change
+            assert abs(getattr(motion, name)[k] - getattr(motion, name)[k - 1]) < largest, name
+        assert np.abs(motion.tyre_fz[k] - motion.tyre_fz[k - 1]).max() < 10.0
+    slow = np.flatnonzero((regimes == Regime.SLOW) & (motion.vx > 0.3))
+    path = motion.yaw_rate[slow] - motion.vx[slow] * np.tan(motion.steer[slow]) / plant.wheelbase
+    assert np.abs(path).max() < 0.01  # follows its front wheels
+
+
+def test_brakes_hold_the_car_on_a_slope() -> None:
+    plant = MultiBodyPlant(FERRARI)
+    along = road_gravity(bank=0.0, grade=0.1)[0]
+    assert along > 0.0  # downhill
+    state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    held = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
+    assert held.stands
+    rolls = plant.advance(state, inputs_of(along=along), 1000)
+    assert rolls.vx == pytest.approx(along, rel=0.1)
+    motion = plant.motion([held], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1)
+    assert motion.tyre_fx[0].sum() == pytest.approx(-plant.parameters.m * along)
+    assert motion.grade[0] == 0.1
+
+
+def test_spin_is_survived_and_ends_at_standstill(spin: tuple[Motion, list[PlantState]]) -> None:
+    motion, states = spin
+    assert states[-1].spun
+    assert not states[0].spun
+    assert states[-1].stands
+    assert math.degrees(np.abs(motion.sideslip[motion.vx**2 + motion.vy**2 > 1.0]).max()) > 60.0
+    for name in (field.name for field in fields(Motion) if field.name != "rate_hz" and not field.name.startswith("motor_")):
+        assert np.isfinite(getattr(motion, name)).all(), name
+    p = MultiBodyPlant(CORVETTE).parameters
+    energy = 0.5 * p.m * (motion.vx**2 + motion.vy**2) + 0.5 * p.I_z * motion.yaw_rate**2
+    sliding = np.flatnonzero([state.regime == Regime.SLIDING for state in states])
+    assert len(sliding) > 50
+    assert (np.diff(energy[sliding]) < 0.0).all()
+    slowing = np.hypot(motion.ax, motion.ay)[sliding[10:-10]]
+    assert slowing.max() < 1.1 * 1.42 * GRAVITY  # the rear tyres' friction; loads vary
+    assert slowing.mean() > 0.6 * GRAVITY
+    end = states[-1]
+    away = MultiBodyPlant(CORVETTE).advance(end, inputs_of(acceleration=2.0), 3000)
+    assert away.vx > 4.0
+    assert away.spun  # it has been in a spin, whatever it does now
+
+
+def test_published_bmw_rolls_over_where_the_lowered_one_corners() -> None:
+    with pytest.raises(SimulationError, match="rolled over") as raised:
+        turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
+    assert raised.value.exit_code == 3
+
+
+def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine() -> None:
+    plant = MultiBodyPlant(CORVETTE)
+    p = plant.parameters
+    motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(0.3 if t < 0.3 else 0.0, 7.0), 3.0)
+    assert motion.tyre_fz.min() >= 1.0
+    driven = motion.wheel_speed[:, 2:].mean(axis=1) * p.R_w
+    assert driven.max() > 1.2 * motion.vx.max()  # they do spin
+    assert driven.max() < 1.2 * p.longitudinal.v_max
+
+
+MULTI_BODY = [
+    path.stem for path in sorted(CONFIGURATIONS.glob("*.yaml")) if "plant" not in yaml.safe_load(path.read_text(encoding="utf-8"))
+]
+ALL_VEHICLES = [*(shipped(name) for name in MULTI_BODY), *(Vehicle(f"set {n}", n) for n in PUBLISHED_SETS)]
+
+
+@pytest.mark.parametrize("vehicle", ALL_VEHICLES, ids=lambda vehicle: vehicle.name)
+def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle: Vehicle) -> None:
+    plant = MultiBodyPlant(vehicle)
+    for speed in (0.0, 0.05, 0.9, 1.0, 1.1, 1.3, 2.0, 5.0, 15.0, 40.0, 70.0):
+        for acceleration in (-20.0, 0.0, 5.0):
+            for steering, friction in ((0.0, 1.0), (0.3, 0.3)):
+                state = plant.initial_state(0.0, 0.0, 0.0, speed)
+                state = plant.advance(state, inputs_of(steering, acceleration, 500.0), 600, friction)
+                assert np.isfinite(state.values).all()
+                assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
+
+
+def test_state_that_is_not_finite_is_an_error() -> None:
+    plant = MultiBodyPlant(LOWERED)
+    state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    state.values[VY] = np.nan
+    with pytest.raises(SimulationError):
+        plant.advance(state, inputs_of(), 1)
+
+
+def test_start_that_makes_no_sense_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="step"):
+        MultiBodyPlant(LOWERED, step=0.0)
+    with pytest.raises(ConfigurationError, match="-1"):
+        MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0)
+
+
+# --- repeatability
+
+
+def test_same_inputs_give_the_same_states_bit_by_bit() -> None:
+    plant = MultiBodyPlant(FERRARI)
+    first, again = (drive(plant, plant.initial_state(0.0, 0.0, 0.0, 25.0), lane_change, 3.0)[1][-1] for _ in range(2))
+    assert first.values.tobytes() == again.values.tobytes()
+
+
+def test_first_call_waits_for_another_process_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    function, called = compiled._Kept(compiled._advance), Event()
+    assert function.lock is not None
+    monkeypatch.setattr(function, "dispatcher", called.set)
+    first = Thread(target=function)
+    with function.lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        first.start()
+        assert not called.wait(0.3)
+    assert called.wait(10.0)
+    first.join()
+    with function.lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        function()  # later calls do not
+
+
+def test_no_kind_of_array_is_compiled_for_twice() -> None:
+    plant, state = MultiBodyPlant(FERRARI), MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
+    read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
+    for inputs in (read_only, columns, columns.tolist()):
+        for friction in (1.0, [1, 1, 1], np.broadcast_to(1.0, 3)):
+            plant.motion([state] * 3, inputs, 100.0, friction=friction)
+        plant.advance(state, inputs[0], 1)
+    assert [len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]
+
+
+def test_state_shows_what_a_driver_sees() -> None:
+    plant = MultiBodyPlant(FERRARI)
+    state = plant.advance(plant.initial_state(1.0, 2.0, 0.1, 20.0), inputs_of(0.1), 300)
+    assert (state.x, state.y, state.yaw) == (state.values[0], state.values[1], state.values[4])
+    assert (state.vx, state.vy, state.yaw_rate, state.steer) == tuple(state.values[[VX, VY, YAW_RATE, STEER]])
+    assert state.regime is Regime.ROLLING
+    assert not state.stands

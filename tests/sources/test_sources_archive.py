@@ -1,0 +1,245 @@
+"""Archives from strangers: what is harmless comes out as it went in, all else is refused in one line and leaves nothing behind."""
+
+from __future__ import annotations
+
+import io
+import os
+import random
+import stat
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.limits import Limits, use_limits
+from vehest.sources.archive import unpacked
+
+CONTENT = {"bag/metadata.yaml": b"a: 1\n", "bag/data.db3": bytes(range(256)) * 40, "bag/deep/er/x": b""}
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A temporary folder of our own, which every test must leave empty."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    yield folder
+    assert list(folder.iterdir()) == []
+
+
+def packed(folder: Path, content: dict[str, bytes], name: str = "bag.zip") -> Path:
+    file = folder / name
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path, data in content.items():
+            archive.writestr(path, data)
+    return file
+
+
+def refusal(file: Path, kind: type[VehestError] = DataError, **limits: int) -> str:
+    before = sorted(file.parent.rglob("*"))
+    with pytest.raises(kind) as error, unpacked(file, **limits):
+        pytest.fail("it was unpacked")
+    assert type(error.value) is kind
+    message = str(error.value)
+    assert str(file) in message
+    assert message.isprintable()  # no line breaks, no control characters of an entry's name
+    assert sorted(file.parent.rglob("*")) == before
+    return message
+
+
+def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> None:
+    file = packed(tmp_path, CONTENT)
+    with unpacked(file) as folder:
+        found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        assert found == CONTENT
+    assert not folder.exists()
+
+
+def test_the_folder_goes_even_if_what_was_done_with_it_fails(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), unpacked(packed(tmp_path, CONTENT)) as folder:
+        _ = 1 / 0
+    assert not folder.exists()
+
+
+def test_names_with_backslashes_or_dots_in_the_middle_are_paths_inside(tmp_path: Path) -> None:
+    with unpacked(packed(tmp_path, {"bag\\a..b": b"1", "./bag/./c": b"2"})) as folder:
+        assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == ["bag/a..b", "bag/c"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil",
+        "bag/../../evil",
+        "/etc/evil",
+        "\\evil",
+        "..\\evil",
+        "C:\\evil",
+        "C:evil",
+        "bag/..",
+        "//server/share/evil",
+        "a\nb",
+        ".",
+        "a/\x1b[2J",
+    ],
+)
+def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> None:
+    message = refusal(packed(tmp_path, {"bag/metadata.yaml": b"", name: b"evil"}))
+    assert "outside of the folder" in message
+    assert not (tmp_path.parent / "evil").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [(stat.S_IFLNK, "is a symbolic link"), (stat.S_IFIFO, "neither a file nor"), (stat.S_IFCHR, "neither"), (stat.S_IFSOCK, "neither")],
+)
+def test_links_and_special_files_are_refused(tmp_path: Path, kind: int, said: str) -> None:
+    file = tmp_path / "bag.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        entry = zipfile.ZipInfo("bag/data.db3")
+        entry.external_attr = (kind | 0o777) << 16
+        archive.writestr(entry, "/etc/passwd")
+    assert said in refusal(file)
+
+
+def test_a_link_does_not_become_a_way_for_a_later_entry(tmp_path: Path) -> None:
+    file = tmp_path / "bag.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        entry = zipfile.ZipInfo("bag")
+        entry.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(entry, str(tmp_path))
+        archive.writestr("bag/evil", "evil")
+    assert "'bag' is a symbolic link" in refusal(file)
+
+
+def test_more_bytes_than_the_limit_are_refused_before_any_is_written(tmp_path: Path) -> None:
+    file = packed(tmp_path, {"zeros": bytes(10**6), "more": bytes(10**6)})
+    assert file.stat().st_size < 10**4
+    assert "would unpack to 0.002 GB, more than the limit of 0.0015 GB" in refusal(file, most_bytes=1_500_000)
+    with unpacked(file, most_bytes=2_000_000) as folder:
+        assert (folder / "more").stat().st_size == 10**6
+
+
+def test_an_archive_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
+    file = packed(tmp_path, {"data.db3": b"small"})
+    raw = bytearray(file.read_bytes())
+    directory = raw.index(b"PK\x01\x02")
+    raw[directory + 24 : directory + 28] = (2**32 - 2).to_bytes(4, "little")
+    file.write_bytes(raw)
+    assert "would unpack to 4.29 GB, more than the limit of 1 GB" in refusal(file, most_bytes=10**9)
+
+
+def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None:
+    file = packed(tmp_path, {"data.db3": bytes(10**6)})
+    raw = bytearray(file.read_bytes())
+    for at in (raw.index(b"PK\x03\x04") + 22, raw.index(b"PK\x01\x02") + 24):
+        raw[at : at + 4] = (10).to_bytes(4, "little")
+    file.write_bytes(raw)
+    assert "not a sound zip archive" in refusal(file)
+
+
+def test_more_entries_than_the_limit_are_refused(tmp_path: Path) -> None:
+    assert "holds 11 entries, more than the limit of 10" in refusal(packed(tmp_path, {str(k): b"" for k in range(11)}), most_files=10)
+
+
+def test_entries_that_overwrite_each_other_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "bag.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("bag/a", "1")
+        archive.writestr("bag/./a", "2")
+    assert "two entries called" in refusal(file)
+    assert "is a file, too" in refusal(packed(tmp_path, {"bag": b"1", "bag/a": b"2"}))
+
+
+def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
+    file = packed(tmp_path, {"data.db3": b"secret"})
+    raw = bytearray(file.read_bytes())
+    for at in (raw.index(b"PK\x03\x04") + 6, raw.index(b"PK\x01\x02") + 8):
+        raw[at] |= 1
+    file.write_bytes(raw)
+    assert "is encrypted" in refusal(file)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda raw: raw[: len(raw) // 2],
+        lambda raw: raw[:-10],
+        lambda raw: b"",
+        lambda raw: b"SQLite format 3\x00" + bytes(1000),
+        lambda raw: raw[:60] + bytes(40) + raw[100:],
+    ],
+    ids=["half", "tail", "empty", "other format", "zeros inside"],
+)
+def test_a_truncated_or_corrupt_archive_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
+    content = {"data.db3": random.Random(0).randbytes(5000)}
+    file = packed(tmp_path, content)
+    file.write_bytes(damage(file.read_bytes()))
+    assert "not a sound zip archive" in refusal(file)
+
+
+def test_whatever_is_flipped_in_an_archive_is_refused_or_harmless(tmp_path: Path) -> None:
+    """Three hundred archives with three random bytes each: no other exception, and no other content under a known name."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in CONTENT.items():
+            archive.writestr(name, data)
+    good = buffer.getvalue()
+    generator = random.Random(1)
+    file = tmp_path / "bag.zip"
+    refusals = []
+    for _ in range(300):
+        raw = bytearray(good)
+        for _ in range(3):
+            raw[generator.randrange(len(raw))] = generator.randrange(256)
+        file.write_bytes(raw)
+        try:
+            with unpacked(file, most_bytes=10**7) as folder:
+                for path in folder.rglob("*"):
+                    name = path.relative_to(folder).as_posix()
+                    assert path.is_dir() or name not in CONTENT or path.read_bytes() == CONTENT[name]
+        except (DataError, MissingError) as error:
+            refusals.append(str(error))
+    assert len(refusals) > 150
+    assert not any("\n" in refused for refused in refusals)
+
+
+def test_a_missing_archive_is_named(tmp_path: Path) -> None:
+    assert "there is no file" in refusal(tmp_path / "nowhere.zip", MissingError)
+
+
+def test_a_missing_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    assert "set TMPDIR" in refusal(packed(tmp_path, CONTENT), MissingError)
+
+
+def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path: Path) -> None:
+    file = packed(tmp_path, {"zeros": bytes(80 * 2**20)})
+    assert "times its size, more than the limit of 250; if that is meant, raise it: limits.expansion=NUMBER" in refusal(file)
+    with use_limits(Limits(expansion=10_000)), unpacked(file) as folder:
+        assert (folder / "zeros").stat().st_size == 80 * 2**20
+
+
+def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path: Path) -> None:
+    file = packed(tmp_path, {f"{k:0100d}": b"" for k in range(200)})
+    with use_limits(Limits(text_bytes=10_000)):
+        assert "holds a list of entries of" in refusal(file)
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "a/" * 100 + "b"])
+def test_names_that_no_disk_takes_and_folders_without_end_are_refused(tmp_path: Path, name: str) -> None:
+    assert "has too long a name, or lies in too many folders" in refusal(packed(tmp_path, {name: b"1"}))
+
+
+def test_an_archive_inside_an_archive_stays_one(tmp_path: Path) -> None:
+    inner = packed(tmp_path, CONTENT, "inner.zip").read_bytes()
+    with unpacked(packed(tmp_path, {"bag/inner.zip": inner})) as folder:
+        assert [path.name for path in folder.rglob("*") if path.is_file()] == ["inner.zip"]
+
+
+def test_a_pipe_is_no_archive(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "bag.zip")
+    assert "is a pipe, not a file" in refusal(tmp_path / "bag.zip")

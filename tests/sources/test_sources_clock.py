@@ -1,0 +1,217 @@
+"""From time stamps to a uniform clock, and from a file's columns to channels."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import Recording
+from vehest.data.transforms import Resample
+from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config, uniform_clock
+
+RATES = [10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
+PROPERTY = settings(max_examples=120, deadline=None, derandomize=True, database=None)
+
+
+@PROPERTY
+@given(st.sampled_from(RATES), st.integers(2, 2000), st.sampled_from([0.0, 149.99, -12.5, 1_700_000_123.456]))
+def test_the_rate_that_was_meant_comes_back_at_any_start(rate: float, length: int, start: float) -> None:
+    clock = uniform_clock(start + np.arange(length) / rate, "'file'")
+    assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
+    assert (clock.start_time, clock.n_samples, clock.stamps) == (start, length, None)
+
+
+@pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0 / 3.0, 400.0])
+@pytest.mark.parametrize("digits", [3, 4, 6])
+def test_rounded_unix_time_stamps_can_be_resampled_to_20_hz(rate: float, digits: int) -> None:
+    stamps = np.round(1_700_000_000.0 + np.arange(500) / rate, digits)
+    policy = "strict" if np.abs(np.diff(stamps) * rate - 1).max() < 0.01 else "interpolate"
+    clock = uniform_clock(stamps, "'file'", policy)  # type: ignore[arg-type]
+    recording = Recording("lap", "car", clock.rate_hz, clock.start_time, {"ay": np.zeros(clock.n_samples)})
+    assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
+    assert Resample(20.0)(recording).rate_hz == 20.0
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.24])  # from a quarter on, a long step cannot be told from a lost sample
+@pytest.mark.parametrize("rate", [20.0, 100.0, 125.0])
+def test_the_rate_survives_strong_jitter_and_gaps(rate: float, share: float) -> None:
+    generator = np.random.default_rng(5)
+    stamps = (np.arange(1000) + share * generator.uniform(-1, 1, 1000)) / rate
+    kept = np.delete(stamps, [*range(300, 350), 500, 777])
+    clock = uniform_clock(kept, "'file'", "interpolate")
+    assert clock.rate_hz == rate
+    assert clock.n_samples == pytest.approx(1000, abs=1)
+
+
+def test_a_clock_that_truly_runs_fast_keeps_its_rate() -> None:
+    stamps = np.arange(50_000) / 100.003
+    assert uniform_clock(stamps, "'file'").rate_hz == pytest.approx(100.003, rel=1e-9)
+
+
+@pytest.mark.parametrize(("amplitude", "strict_takes_it"), [(4e-5, True), (2e-3, False)])
+def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation(amplitude: float, strict_takes_it: bool) -> None:
+    stamps = np.arange(1000) / 100.0 + amplitude * np.random.default_rng(0).uniform(-1, 1, 1000)
+    if strict_takes_it:
+        assert uniform_clock(stamps, "'file'").rate_hz == 100.0
+    else:
+        with pytest.raises(DataError, match="set clock: interpolate"):
+            uniform_clock(stamps, "'file'")
+    assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
+
+
+def test_a_drifting_clock_needs_interpolation() -> None:
+    stamps = np.concatenate([[0.0], np.cumsum(np.linspace(0.00995, 0.01005, 5000))])
+    with pytest.raises(DataError, match=r"'file': the clock drifts.*set clock: interpolate"):
+        uniform_clock(stamps, "'file'")
+    assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
+
+
+@pytest.mark.parametrize("start", [0.0, 1_700_000_000.0])
+def test_interpolation_puts_a_line_onto_the_uniform_clock(start: float) -> None:
+    elapsed = np.sort(np.concatenate([[0.0, 10.0], np.random.default_rng(1).uniform(0, 10, 400), np.arange(1, 1000) / 100.0]))
+    clock = uniform_clock(start + elapsed, "'file'", "interpolate")
+    aligned = clock.align(3.0 - 2.0 * elapsed)
+    np.testing.assert_allclose(aligned, 3.0 - 2.0 * np.arange(clock.n_samples) / clock.rate_hz, atol=2e-6)
+    assert clock.n_samples == pytest.approx(10.0 * clock.rate_hz + 1, abs=1)
+
+
+def test_interpolation_bridges_a_gap_linearly() -> None:
+    stamps = np.delete(np.arange(300) / 100.0, np.s_[100:200])
+    with pytest.raises(DataError, match="cut the range out or set clock: interpolate"):
+        uniform_clock(stamps, "'file'")
+    clock = uniform_clock(stamps, "'file'", "interpolate")
+    assert (clock.rate_hz, clock.n_samples) == (100.0, 300)
+    np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * np.arange(300) / 100.0, atol=1e-12)
+
+
+def test_interpolation_keeps_every_measured_sample_of_a_slow_channel() -> None:
+    stamps = np.arange(200) / 100.0 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, 200)
+    slow = np.where(np.arange(200) % 5 == 0, np.arange(200.0), np.nan)
+    aligned = uniform_clock(stamps, "'file'", "interpolate").align(slow, gappy=True)
+    measured = ~np.isnan(aligned)
+    assert aligned[measured].tolist() == slow[::5].tolist()
+    assert np.abs(np.flatnonzero(measured) - aligned[measured]).max() <= 1
+
+
+@pytest.mark.parametrize("policy", ["strict", "interpolate"])
+@pytest.mark.parametrize(
+    ("stamps", "what"),
+    [
+        ([0.0, 0.01, 0.01, 0.02], "repeats 1 times, first at sample 2"),
+        ([0.0, 0.02, 0.01, 0.03], "goes backwards 1 times, first at sample 2"),
+        ([0.0, np.nan, 0.02], "sample 1 is not a number"),
+        ([0.0], "fewer than two"),
+        ([], "fewer than two"),
+    ],
+)
+def test_disordered_time_stamps_are_refused_whatever_the_policy(policy: str, stamps: list[float], what: str) -> None:
+    with pytest.raises(DataError) as error:
+        uniform_clock(np.array(stamps), "'lap.csv'", policy)  # type: ignore[arg-type]
+    assert what in str(error.value)
+    assert str(error.value).startswith("'lap.csv': ")
+    assert "repair, remove or sort the rows" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_units_and_signs_are_applied() -> None:
+    values = np.array([1.0, -2.0, 0.5])
+    np.testing.assert_allclose(Column("a", "g", -1).to_si(values, "m/s²"), -9.80665 * values)
+    np.testing.assert_allclose(Column("a", "deg/s").to_si(values, "rad/s"), np.deg2rad(values))
+    np.testing.assert_array_equal(Column("a", "m/s").to_si(values, "m/s"), values)
+
+
+def test_columns_named_like_channels_need_no_map() -> None:
+    assert identity_columns(["time", "ay", "steer", "spam"]) == {"ay": Column("ay", "m/s²"), "steer": Column("steer", "rad")}
+
+
+@pytest.mark.parametrize(
+    ("entries", "what"),
+    [
+        ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
+        ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
+        ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
+        ({"vx": {"column": "a"}}, "channel 'vx': unit is missing"),
+        ({"vx": "a"}, "must say column, unit"),
+        ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "unknown key 'scale'; there are: column, unit, sign, factor"),
+        ({"vx": {"column": "a", "unit": "m/s", "sign": 2}}, "sign must be 1 or -1, not 2"),
+        (["vx"], "must map a channel to its column"),
+    ],
+)
+def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: object, what: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        columns_from_config(entries, "mine")  # type: ignore[arg-type]
+    assert what in str(error.value)
+    assert "data set 'mine'" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_time_column_has_a_unit_of_time() -> None:
+    assert time_column_from_config({"column": "t", "unit": "ms"}, "mine") == Column("t", "ms")
+    with pytest.raises(ConfigurationError, match="data set 'mine': time: unit 'km/h' cannot be converted to 's'"):
+        time_column_from_config({"column": "t", "unit": "km/h"}, "mine")
+    with pytest.raises(ConfigurationError, match="data set 'mine': time must say column"):
+        time_column_from_config("t", "mine")
+    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here") == Column("3", "s", -1), "YAML reads it as a number"
+    for name in (3.5, True, None, ["3"]):
+        with pytest.raises(ConfigurationError, match=f"here: column must be text, not {re.escape(repr(name))}"):
+            column_from_config({"column": name, "unit": "s"}, "here")
+
+
+EVEN = np.arange(1000) / 100.0
+
+
+@pytest.mark.parametrize(
+    ("stamps", "n_samples", "said"),
+    [
+        (
+            np.append(EVEN, 1e9),
+            100_000_000_001,
+            "the gap of 1e+09 s between data rows 1000 (9.99 s) and 1001 (1000000000 s): remove the row",
+        ),
+        (np.where(EVEN < 5, EVEN, EVEN + 3e6), 300_000_999, "between data rows 500 (4.99 s) and 501 (3000005 s)"),
+        (np.append(-3e5, EVEN), 30_001_000, "between data rows 1 (-300000 s) and 2 (0 s)"),
+    ],
+)
+def test_a_stray_time_stamp_is_named_before_anything_is_allocated(stamps: np.ndarray, n_samples: int, said: str) -> None:
+    with pytest.raises(DataError) as error:
+        uniform_clock(stamps, "'lap.csv'", "interpolate")
+    assert f"'lap.csv': an even clock of 100 Hz over {len(stamps)} time stamps would hold {n_samples} samples" in str(error.value)
+    assert said in str(error.value)
+    assert "more than the limit of 20000000; if that is meant, raise it: limits.samples=NUMBER" in str(error.value)
+
+
+def test_an_even_clock_is_bounded_by_values_and_by_the_rows_that_there_are() -> None:
+    stamps = np.append(EVEN, 9e4)
+    with pytest.raises(DataError, match=r"8991 times as many as there are rows, more than the limit of 250; .*limits\.expansion="):
+        uniform_clock(stamps, "'lap.csv'", "interpolate")
+    with use_limits(Limits(expansion=10_000)):
+        assert uniform_clock(stamps, "'lap.csv'", "interpolate", n_channels=55).n_samples == 9_000_001
+        with pytest.raises(DataError, match=r"one side\) of 56 channels, more than the limit of 500000000; .*limits\.values="):
+            uniform_clock(stamps, "'lap.csv'", "interpolate", n_channels=56)
+
+
+@pytest.mark.parametrize("policy", ["strict", "interpolate"])
+@pytest.mark.parametrize(
+    ("stamps", "said"),
+    [
+        (EVEN * 1e-298, "the time stamps lie 1e-300 s apart"),
+        (np.arange(100) * 5e-324, "the time stamps lie 4.94066e-324 s apart"),
+        (EVEN * 1e8, "the time stamps lie 1e+06 s apart (from 0 s to 999000000 s); correct the unit of time"),
+        (1.7e18 + EVEN * 1e9, "time stamp of sample 999 is 1.7e+18 s"),
+        (np.append(EVEN, 1e308), "time stamp of sample 1000 is 1e+308 s"),
+        (np.array([-1.7e308, 0.0, 1.7e308]), "time stamp of sample 0 is -1.7e+308 s"),
+        (np.append(EVEN, np.inf), "time stamp of sample 1000 is not a number"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_time_stamps_of_no_drive_are_refused_whatever_the_policy(policy: str, stamps: np.ndarray, said: str) -> None:
+    with pytest.raises(DataError) as error:
+        uniform_clock(stamps, "'lap.csv'", policy)  # type: ignore[arg-type]
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)

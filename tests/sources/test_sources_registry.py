@@ -1,0 +1,240 @@
+"""Opening a source by name, simulated drives, and the data sets that are shipped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from vehest.alignment.checks import checks_of_recording
+from vehest.data.errors import ConfigurationError, MissingError
+from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
+from vehest.simulation.plant.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
+from vehest.simulation.road.surface import SURFACES
+from vehest.simulation.sensors.recording import SensorLevels
+from vehest.sources.base import kind_of, open_source, source_module, source_names
+from vehest.sources.simulated import SimulatedSource
+from vehest.stages.config import compose_config, missing_keys
+
+CONF = Path(__file__).parents[2] / "conf"
+DATASETS = sorted((CONF / "dataset").glob("*.yaml"))
+VEHICLE = yaml.safe_load((CONF / "vehicle" / "bmw_320i_low.yaml").read_text(encoding="utf-8"))
+
+
+def simulated(**changes: object) -> dict[str, Any]:
+    drives = [drive("a", 3.0, seed=1), drive("b", 2.5, seed=2)]
+    return {"name": "sim", "source": "simulated", "vehicle": VEHICLE, "rate_hz": 50, "drives": drives, **changes}
+
+
+def drive(name: str, duration: float = 2.0, **more: object) -> dict[str, object]:
+    return {"id": name, "manoeuvre": {"name": "laps", "course": "handling", "duration": duration}, **more}
+
+
+@pytest.mark.parametrize("file", DATASETS, ids=lambda file: file.stem)
+def test_every_data_set_that_is_shipped_opens(file: Path) -> None:
+    config = compose_config("ingest", [f"dataset={file.stem}", "root=elsewhere"])["dataset"]
+    assert config["name"] == file.stem
+    if not missing_keys(config):
+        assert open_source(config).name == file.stem
+
+
+def test_every_source_has_a_module_that_opens() -> None:
+    assert set(source_names()) >= {"revs", "tabular", "simulated"}
+    for name in source_names():
+        with pytest.raises(ConfigurationError, match="has no option 'spam'"):
+            open_source({"name": "x", "source": name, "spam": 1})
+
+
+@pytest.mark.parametrize("name", ["revz", None, ""])
+def test_an_unknown_source_is_refused_with_those_there_are(name: str | None) -> None:
+    with pytest.raises(ConfigurationError, match="is not one of: mdf, revs, rosbag, simulated, tabular"):
+        source_module({"name": "x", "source": name})
+
+
+def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate() -> None:
+    source = open_source(simulated())
+    assert source.ids() == ["a", "b"]
+    recording = source.read("b")
+    assert (recording.id, recording.kind, recording.rate_hz, len(recording)) == ("b", "simulated", 50.0, 125)
+    assert {"vx", "yaw_rate", "ax", "ay", "vy_ref"} <= set(recording.channels)
+    assert [finding for finding in checks_of_recording(recording) if finding.level == "error"] == []
+
+
+def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed() -> None:
+    source = open_source(simulated())
+    np.testing.assert_array_equal(source.read("b")["ay"], source.read("b")["ay"])
+    other = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
+    assert not np.array_equal(other.read("b")["ay"], source.read("b")["ay"])
+
+
+def test_a_drive_without_a_seed_has_one_of_its_own_from_the_data_sets_seed_and_its_name() -> None:
+    drives = [drive("a"), drive("b")]
+    seeds = {name: entry.seed for name, entry in SimulatedSource(simulated(drives=drives, seed=1)).drives.items()}
+    assert seeds["a"] != seeds["b"]
+    assert SimulatedSource(simulated(drives=drives[1:], seed=1)).drives["b"].seed == seeds["b"], "whatever other drives there are"
+    assert SimulatedSource(simulated(drives=drives, seed=2)).drives["b"].seed != seeds["b"]
+
+
+def test_count_makes_as_many_drives_with_seeds_of_their_own() -> None:
+    source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
+    assert source.ids() == ["a_001", "a_002", "a_003"]
+    assert len({entry.seed for entry in source.drives.values()}) == 3
+
+
+def test_of_several_vehicles_each_drive_has_the_one_it_names() -> None:
+    heavier = {**VEHICLE, "name": "heavier"}
+    config = simulated(vehicles={"one": VEHICLE, "other": heavier}, drives=[drive("a", vehicle="one"), drive("b", vehicle="other")])
+    del config["vehicle"]
+    assert [open_source(config).read(name).vehicle for name in ("a", "b")] == [VEHICLE["name"], "heavier"]
+    with pytest.raises(ConfigurationError, match="drive 'a': vehicle 'None' is not one of: one, other"):
+        SimulatedSource({**config, "drives": [drive("a")]})
+
+
+def test_cars_of_a_fleet_differ_from_drive_to_drive_within_the_stated_range() -> None:
+    masses = []
+    vary = [{"parameters": ["m", "m_s"], "factor": [0.8, 1.2]}]
+    vehicle = vehicle_from_configuration(VEHICLE)
+    nominal = library_parameters(vehicle)
+    for seed in range(40):
+        parameters = library_parameters(varied(vehicle, variations_from_config(vary), seed))
+        masses.append(parameters.m / nominal.m)
+        assert parameters.m_s / nominal.m_s == pytest.approx(masses[-1]), "scaled together"
+    assert 0.8 <= min(masses) < 0.84
+    assert 1.16 < max(masses) <= 1.2
+    assert library_parameters(varied(vehicle, variations_from_config(vary), 7)).m / nominal.m == masses[7]
+    with pytest.raises(ConfigurationError, match=r"vary: 'tire\.grip' is no parameter of vehicle"):
+        varied(vehicle, variations_from_config([{"parameters": ["tire.grip"], "factor": [1, 2]}]), 0)
+
+
+def test_tyres_of_both_axles_vary_and_what_is_named_twice_is_scaled_twice() -> None:
+    vehicle = vehicle_from_configuration(compose_config("ingest", ["dataset=sim_bmw"])["dataset"]["vehicle"])
+    vary = variations_from_config(
+        [{"parameters": ["tire.p_ky1", "tire_rear.p_ky1"], "factor": [0.5, 0.5]}, {"parameters": ["tire_rear.p_ky1"], "factor": [1.1, 1.1]}]
+    )
+    nominal, changed = compiled_parameters(vehicle), compiled_parameters(varied(vehicle, vary, 0))
+    assert changed.tire.p_ky1 == pytest.approx(0.5 * nominal.tire.p_ky1)
+    assert changed.tire_rear.p_ky1 == pytest.approx(0.55 * nominal.tire_rear.p_ky1)
+    assert changed.tire_rear.p_dy1 == nominal.tire_rear.p_dy1
+
+
+def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles() -> None:
+    dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
+    vehicle, vary = vehicle_from_configuration(dataset["vehicle"]), variations_from_config(dataset["vary"])
+    cars = [compiled_parameters(varied(vehicle, vary, seed)) for seed in range(50)]
+    for car in cars:
+        assert car.m_s + car.m_uf + car.m_ur == pytest.approx(car.m, abs=1.0)
+    for axle in ("tire", "tire_rear"):
+        assert np.std([getattr(car, axle).p_ky1 for car in cars]) > 0.5
+        assert np.std([getattr(car, axle).p_dy1 for car in cars]) > 0.05
+    assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), "the front axle lets go first, or about when the rear one does"
+
+
+def test_worn_tyres_of_the_truck_are_worn_at_both_axles() -> None:
+    vehicles = compose_config("ingest", ["dataset=sim_heavy"])["dataset"]["vehicles"]
+    nominal, worn = (compiled_parameters(vehicle_from_configuration(vehicles[name])) for name in ("nominal", "worn"))
+    for axle in ("tire", "tire_rear"):
+        assert getattr(worn, axle).p_ky1 / getattr(nominal, axle).p_ky1 == pytest.approx(0.85, abs=0.001)
+
+
+@pytest.mark.parametrize("kind", ["real", "measured"])
+def test_nobody_can_call_a_simulation_real(kind: str) -> None:
+    with pytest.raises(ConfigurationError, match="simulated"):
+        SimulatedSource(simulated(kind=kind))
+    assert kind_of({"source": "simulated"}) == "simulated"
+    assert kind_of({"source": "tabular"}) == "real"
+
+
+def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
+    levels = SensorLevels()
+    variation = SensorVariation.from_config({"noise": [2.0, 3.0], "delay": [0.0, 0.0]})
+    changed = variation.applied(levels, 3)
+    assert 2.0 <= changed.yaw_rate.noise / levels.yaw_rate.noise <= 3.0
+    assert changed.yaw_rate.delay == 0.0
+    assert changed.yaw_rate.offset == levels.yaw_rate.offset
+    assert changed.reference == levels.reference
+    assert changed.yaw_rate.noise / levels.yaw_rate.noise != changed.ay.noise / levels.ay.noise
+
+
+def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
+    with pytest.raises(MissingError, match=r"no drive 'c' \(it has a, b, …\)"):
+        open_source(simulated()).read("c")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"drives": [{"id": "a", "seed": 1}]}, "dataset.drives.0.manoeuvre is missing"),
+        ({"drives": [drive("a", color=1)]}, "dataset.drives.0.color is not an option of dataset.drives.0; options: id, manoeuvre, count"),
+        ({"drives": ["a"]}, "dataset.drives.0 must be a group of options, not 'a'; options: id, manoeuvre, count, seed, vehicle, surface"),
+        (
+            {"drives": [{"id": "a", "manoeuvre": "laps"}]},
+            "dataset.drives.0.manoeuvre must be a mapping with a name, such as {name: laps}, not 'laps'",
+        ),
+        ({"drives": [drive("a", seed="one")]}, "dataset.drives.0.seed must be a whole number, zero or positive, not 'one'"),
+        ({"drives": [drive("a", seed=-1)]}, "drive 'a': seed must be a whole number, zero or positive, not -1"),
+        ({"drives": [drive("a", seed=1, count=2)]}, "drive 'a': give seed for a single drive, or count, not both"),
+        ({"drives": [drive("a", count=1.5)]}, "dataset.drives.0.count must be a whole number of drives, not 1.5"),
+        ({"drives": [drive("a", count=-1)]}, "drive 'a': count must be a whole number of drives, not -1"),
+        ({"drives": [drive("a", stability_control="on")]}, "dataset.drives.0.stability_control must be true or false, not 'on'"),
+        ({"drives": [drive("a", surface="icy")]}, "there is no surface 'icy'; there are dry, wet, patchy"),
+        ({"drives": [drive("a", 0.0)]}, "data set 'sim': manoeuvre 'laps': duration must lie between"),
+        ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
+        ({"drives": 5}, "dataset.drives must be a list of mappings, not 5"),
+        ({"rate_hz": "abc"}, "dataset.rate_hz must be a number between 1 and 1000, not 'abc'"),
+        ({"rate_hz": 1e-9}, "rate_hz must be a number between 1 and 1000, not 1e-09"),
+        ({"accept": 5}, "dataset.accept must be a list of checks, not 5"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": ["laps"]}}]}, "there is no manoeuvre '('laps',)'"),
+        ({"drives": [drive("a", (1, 2))]}, "manoeuvre 'laps': duration must be a number, not [1, 2]"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": "random_steer", "band": [0.1]}}]}, "band must be a pair of numbers, not [0.1]"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": "slalom", "cones": True}}]}, "cones must be a whole number, not True"),
+        ({"drives": [drive("a", vehicle=["b"])]}, "dataset.drives.0.vehicle must be the name of one of the vehicles, not ['b']"),
+        ({"drives": [drive("a", vehicle="b")]}, "drive 'a': vehicle 'b' is not one of"),
+        ({"drives": [drive("a", surface=5)]}, f"dataset.drives.0.surface must be one of {', '.join(SURFACES)}, or a mapping such as"),
+        ({"surface": 5}, f"dataset.surface must be one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not 5"),
+        ({"drives": [drive("a", surface={"friction": "x"})]}, "surface 'own': friction must be a number, not 'x'"),
+        ({"drives": [drive("a", surface={"patches": 0.5, "patch_length": 5})]}, "patch_length is a pair"),
+        ({"vary": [{"parameters": 5, "factor": [1, 1]}]}, "vary: an entry is {parameters"),
+        ({"vary": [{"parameters": ["R_w"], "factor": [0, 1]}]}, "vary: a factor must be positive"),
+        ({"vary": [{"parameters": ["R_w"], "factor": [1, float("inf")]}]}, "vary: a range is a pair"),
+        ({"vary": [{"parameters": ["nope"], "factor": [1, 1]}]}, "data set 'sim': vary: 'nope' is no parameter"),
+        ({"vehicle": {**VEHICLE, "overrides": {"R_w": 0}}}, "R_w must be positive"),
+        ({"vehicle": {**VEHICLE, "overrides": 5}}, "overrides"),
+        ({"vehicle": {**VEHICLE, "parameter_set": True}}, "parameter set True"),
+        ({"seed": -1}, "seed must be a whole number, zero or positive, not -1"),
+        ({"vary": {"m": 1}}, "dataset.vary must be a list of {parameters, factor}, not {'m': 1}"),
+        ({"vary": [{"parameters": ["m"], "factor": [2, 1]}]}, "vary: a range is a pair [lowest, highest] of scales, not [2, 1]"),
+        ({"vary_sensors": {"hum": [0, 1]}}, "vary_sensors is a mapping from"),
+        ({"sensors": "perfect"}, "default, race, ideal"),
+        ({"sensor": "ideal"}, "has no option 'sensor'"),
+    ],
+)
+def test_a_misspelt_simulation_is_refused_in_one_line(changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        SimulatedSource(simulated(**changes))
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_simulation_without_a_vehicle_is_refused() -> None:
+    config = simulated()
+    del config["vehicle"]
+    with pytest.raises(ConfigurationError, match="needs a vehicle from conf/vehicle"):
+        SimulatedSource(config)
+
+
+@pytest.mark.parametrize(
+    ("changes", "limit"),
+    [
+        ({"drives": [drive("a", count=10**9)]}, "jobs"),
+        ({"drives": [drive("a", count=6_000), drive("b", count=6_000)]}, "jobs"),
+        ({"rate_hz": 1000, "drives": [{"id": "a", "manoeuvre": {"name": "laps", "duration": 36_000}}]}, "samples"),
+        ({"drives": [{"id": "a", "manoeuvre": {"name": "laps", "laps": 1000}}]}, "samples"),
+    ],
+    ids=str,
+)
+def test_a_simulation_that_asks_for_too_much_is_refused_before_it_begins(changes: dict[str, Any], limit: str) -> None:
+    with pytest.raises(ConfigurationError, match=rf"if that is meant, raise it: limits\.{limit}=NUMBER"):
+        open_source(simulated(**changes))

@@ -1,0 +1,191 @@
+"""The Revs database as re-laid text: a file a channel, a number a line."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from vehest.alignment.checks import checks_of_recording
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import Recording
+from vehest.sources.base import open_source
+from vehest.sources.revs import RevsSource
+
+CONFIGURATION = Path(__file__).parents[2] / "conf" / "dataset" / "ferrari_250lm.yaml"
+N = 300
+
+
+def configuration(root: Path, **changes: object) -> dict[str, Any]:
+    channels = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ayCG", "unit": "g", "sign": -1}}
+    base = {
+        "name": "mine",
+        "source": "revs",
+        "layout": "text",
+        "path": str(root),
+        "recordings": ["lap"],
+        "vehicle": "car",
+        "citation": "me",
+    }
+    return base | {"time": {"column": "t", "unit": "s"}, "channels": channels} | changes
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A recording of three seconds."""
+    lap = tmp_path / "lap"
+    lap.mkdir()
+    np.savetxt(lap / "t.txt", 149.99 + np.arange(N) / 100.0, fmt="%.2f")
+    np.savetxt(lap / "vx.txt", np.linspace(10, 20, N))
+    np.savetxt(lap / "ayCG.txt", np.linspace(-1, 1, N))
+    return tmp_path
+
+
+def refusal(folder: Path, kind: type[VehestError] = DataError, **changes: object) -> str:
+    with pytest.raises(kind) as error:
+        RevsSource(configuration(folder, **changes)).read("lap")
+    assert type(error.value) is kind
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_a_folder_of_text_files_is_a_recording(folder: Path) -> None:
+    source = open_source(configuration(folder))
+    assert isinstance(source, RevsSource)
+    assert source.ids() == ["lap"]
+    recording = source.read("lap")
+    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == ("lap", "car", "real", 100.0)
+    assert recording.start_time == 149.99
+    np.testing.assert_array_equal(recording["vx"], [float(line) for line in (folder / "lap" / "vx.txt").read_text().split()])
+    np.testing.assert_allclose(recording["ay"], -9.80665 * np.linspace(-1, 1, N))
+    assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
+
+
+def test_inputs_are_the_files_that_are_read(folder: Path) -> None:
+    (folder / "lap" / "spam.txt").write_text("not read")
+    inputs = RevsSource(configuration(folder)).inputs()
+    assert inputs == {f"lap/{name}.txt": folder / "lap" / f"{name}.txt" for name in ("ayCG", "t", "vx")}
+
+
+@pytest.mark.parametrize("ending", ["\r\n", "\n\n", "   \n"])
+def test_line_endings_blank_lines_and_byte_order_marks_do_not_matter(folder: Path, ending: str) -> None:
+    expected = RevsSource(configuration(folder)).read("lap")["vx"]
+    lines = (folder / "lap" / "vx.txt").read_text().split()
+    (folder / "lap" / "vx.txt").write_bytes(("\ufeff" + ending.join(lines) + ending).encode())
+    np.testing.assert_array_equal(RevsSource(configuration(folder)).read("lap")["vx"], expected)
+
+
+def test_a_missing_root_folder_or_recording_is_named(folder: Path) -> None:
+    assert "VEHEST_DATA" in refusal(folder, MissingError, path="None/revs")
+    assert "nowhere" in refusal(folder / "nowhere", MissingError)
+    with pytest.raises(MissingError, match=r"no folder .*other"):
+        RevsSource(configuration(folder, recordings=["other"])).inputs()
+
+
+def test_a_missing_or_empty_channel_file_is_named(folder: Path) -> None:
+    (folder / "lap" / "vx.txt").unlink()
+    assert "vx.txt" in refusal(folder, MissingError)
+    (folder / "lap" / "vx.txt").touch()
+    assert "vx.txt' is empty" in refusal(folder, MissingError)
+    (folder / "lap" / "vx.txt").write_text("\n\n")
+    assert "vx.txt' holds no numbers" in refusal(folder)
+
+
+def test_text_among_numbers_is_found_with_its_row(folder: Path) -> None:
+    lines = (folder / "lap" / "vx.txt").read_text().splitlines()
+    lines[41] = "spam"
+    (folder / "lap" / "vx.txt").write_text("\n".join(lines))
+    message = refusal(folder)
+    assert "vx.txt" in message
+    assert "spam" in message
+    assert "row 41" in message or "row 42" in message
+
+
+def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
+    np.savetxt(folder / "lap" / "vx.txt", np.zeros(N - 3))
+    assert f"holds {N - 3} samples, the time file {N}" in refusal(folder)
+
+
+def test_several_numbers_a_line_are_refused(folder: Path) -> None:
+    np.savetxt(folder / "lap" / "vx.txt", np.zeros((N, 2)))
+    assert "2 numbers a line" in refusal(folder)
+
+
+def test_nan_and_disordered_time_are_refused(folder: Path) -> None:
+    samples = np.linspace(10, 20, N)
+    samples[7] = np.nan
+    np.savetxt(folder / "lap" / "vx.txt", samples)
+    assert "channel 'vx' holds 1 NaN between 150.06 s and 150.06 s" in refusal(folder)
+    np.savetxt(folder / "lap" / "t.txt", np.repeat(np.arange(N / 2), 2))
+    assert "t.txt': time repeats 150 times" in refusal(folder)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"layout": "xlsx"}, "layout 'xlsx' is not one of: csv, mat, text"),
+        ({"time": None}, "time must say column"),
+        ({"time": {"column": "t", "unit": "m/s"}}, "cannot be converted to 's'"),
+        ({"channels": {"vx": {"column": "vx", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
+        ({"rate": 3}, "has no option 'rate'"),
+    ],
+)
+def test_a_misspelt_data_set_is_refused(folder: Path, changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        RevsSource(configuration(folder, **changes))
+    assert said in str(error.value)
+
+
+# --- the real recording ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def ferrari(data_root: Path) -> Recording:
+    config = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
+    source = open_source(config)
+    (recording,) = source.recordings()
+    return recording
+
+
+def test_the_ferrari_was_recorded_for_550_seconds_at_100_hz(ferrari: Recording) -> None:
+    assert len(ferrari) == 55_001
+    assert ferrari.rate_hz == 100.0
+    assert ferrari.start_time == 149.99
+    assert ferrari.time[-1] == pytest.approx(699.99, abs=1e-9)
+
+
+def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari: Recording) -> None:
+    derived = (ferrari["vy_ref"][2:] - ferrari["vy_ref"][:-2]) * 50.0
+    residual = derived - (ferrari["ay"] - ferrari["yaw_rate"] * ferrari["vx"])[1:-1]
+    assert residual.mean() == pytest.approx(-0.028, abs=5e-4)  # -0.03 in Table I of Da Lio et al. 2023
+
+
+def test_the_ferraris_sideslip_is_that_of_its_velocities(ferrari: Recording) -> None:
+    np.testing.assert_allclose(ferrari["sideslip_ref"], np.arctan2(ferrari["vy_ref"], ferrari["vx_ref"]), rtol=0, atol=1e-8)
+
+
+def test_the_ferrari_passes_every_check(ferrari: Recording) -> None:
+    assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []
+
+
+def test_the_ferrari_with_vy_turned_round_is_reported(ferrari: Recording) -> None:
+    turned = Recording("t", "car", 100.0, 0.0, {**ferrari.channels, "vy_ref": -ferrari["vy_ref"]})
+    assert [(one.check, one.channel) for one in checks_of_recording(turned) if one.level != "note"] == [("sign", "vy_ref")]
+
+
+def test_a_line_without_end_and_more_lines_than_the_limit_are_not_read(folder: Path) -> None:
+    with use_limits(Limits(samples=N - 1)):
+        assert f"has {N} rows or more, more than the limit of {N - 1}" in refusal(folder)
+    (folder / "lap" / "vx.txt").write_text("1 " * 3000)
+    assert "line 1 is longer than 4096 bytes" in refusal(folder)
+
+
+def test_a_pipe_is_no_text_file(folder: Path) -> None:
+    (folder / "lap" / "vx.txt").unlink()
+    os.mkfifo(folder / "lap" / "vx.txt")
+    assert "is a pipe, not a file" in refusal(folder)

@@ -1,0 +1,537 @@
+"""The official CSV and MAT layouts of the Revs database: known values in, SI units out; whatever is malformed is one line."""
+
+from __future__ import annotations
+
+import gzip
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from numpy.typing import NDArray
+from scipy.io import loadmat, savemat
+
+from revs_files import COLUMNS, PREAMBLE, Drive, drive_of, smooth_drive, write_csv, write_mat, write_vehicle_parameters
+from vehest.alignment.checks import checks_of_recording
+from vehest.cli import main
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Recording
+from vehest.data.store import read_recording
+from vehest.sources.base import open_source
+from vehest.sources.revs import RevsSource
+from vehest.stages.config import compose_config
+
+NAME = "20140222_01_01_03_250lm"
+SECONDS, BLANK = 4.0, 37
+ONE_ROUNDING = {"rtol": 4e-16, "atol": 1e-300}  # degrees and back: two multiplications by π/180 or its inverse
+
+
+def source(root: Path, *overrides: str, dataset: str = "revs_targa_2014", **changes: Any) -> RevsSource:
+    """The source of a data set in conf/, of one recording below ``root``."""
+    config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *overrides])["dataset"]
+    found = open_source({**config, "recordings": [NAME], **changes})
+    assert isinstance(found, RevsSource)
+    return found
+
+
+def read(root: Path, *overrides: str, **changes: Any) -> Recording:
+    return source(root, *overrides, **changes).read(NAME)
+
+
+def refusal(root: Path, **changes: Any) -> str:
+    with pytest.raises(DataError) as error:
+        read(root, **changes)
+    message = str(error.value)
+    assert message.isprintable(), message
+    return message
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    (tmp_path / "revs").mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def csv(root: Path) -> Path:
+    return root / "revs" / f"{NAME}.csv"
+
+
+@pytest.fixture
+def mat(root: Path) -> Path:
+    return root / "revs" / f"{NAME}.mat"
+
+
+# --- what is read ------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay(root: Path, csv: Path) -> None:
+    drive, truth = smooth_drive(SECONDS, start_time=12.5)
+    write_csv(csv, drive, blank_rows=BLANK)
+    recording = read(root)
+    assert (recording.id, recording.vehicle, recording.kind, recording.rate_hz) == (NAME, "ferrari_250lm", "real", 1000.0)
+    assert recording.start_time == pytest.approx(12.5 + BLANK / 1000, abs=1e-12)
+    assert len(recording) == 1000 * SECONDS - BLANK
+    rows = BLANK + np.arange(len(recording))
+    assert set(recording.channels) == set(truth) - {"steer"}
+    for name in recording.channels:
+        expected = truth[name][rows] if name == "handwheel" else truth[name][rows // 10 * 10]  # the INS delivers every 10 ms
+        np.testing.assert_allclose(recording[name], expected, **ONE_ROUNDING, err_msg=name)
+
+
+def test_the_mat_file_is_read_at_the_rate_of_the_ins_and_has_the_road_wheel_angle(root: Path, mat: Path) -> None:
+    drive, truth = smooth_drive(SECONDS, start_time=12.5)
+    write_mat(mat, drive)
+    recording = read(root, layout="mat")
+    assert (recording.rate_hz, recording.start_time, len(recording)) == (100.0, 12.5, 100 * SECONDS)
+    assert set(recording.channels) == set(truth)
+    for name in recording.channels:
+        np.testing.assert_allclose(recording[name], truth[name][::10], **ONE_ROUNDING, err_msg=name)
+    assert recording.provenance["native_rates_hz"]["vxCG"] == 100.0
+    assert recording.provenance["native_rates_hz"]["handwheelAngle"] == 1000.0
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_csv_and_mat_are_the_same_recording_at_the_same_rate(root: Path, csv: Path, mat: Path, compressed: bool) -> None:
+    drive, _ = smooth_drive(SECONDS)
+    write_csv(csv, drive, blank_rows=0)
+    write_mat(mat, drive, compressed=compressed)
+    from_csv, from_mat = read(root), read(root, "dataset.layout=mat", "dataset.rate_hz=1000")
+    assert (from_mat.rate_hz, from_mat.start_time, len(from_mat)) == (from_csv.rate_hz, from_csv.start_time, len(from_csv))
+    for name in from_csv.channels:
+        np.testing.assert_array_equal(from_mat[name], from_csv[name], err_msg=name)
+
+
+def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root: Path, mat: Path) -> None:
+    fast, slow = np.arange(10_000.0), np.arange(1000.0)
+    structs = {
+        "insData": {"vxCG": {"value": slow, "time": 3.0 + np.arange(1000) / 100}},
+        "driverData": {"handwheelAngle": {"value": fast, "time": 3.0004 + np.arange(10_000) / 1000}},
+    }
+    savemat(mat, structs, oned_as="column")
+    channels = {"vx": {"column": "vxCG", "unit": "m/s"}, "handwheel": {"column": "driverData.handwheelAngle", "unit": "rad"}}
+    both = read(root, layout="mat", channels=channels, extra_channels={}, accept=["impossible"])
+    assert both.start_time == pytest.approx(3.01, abs=1e-12)  # the first tick at which both have a value
+    assert both.rate_hz == 100.0
+    np.testing.assert_array_equal(both["vx"], slow[1:])
+    np.testing.assert_array_equal(both["handwheel"], 9.0 + 10.0 * np.arange(999))  # at 3.01 s the value of 3.0094 s holds
+
+
+def test_channels_that_begin_late_shorten_the_recording(root: Path, csv: Path, mat: Path) -> None:
+    drive, truth = smooth_drive(SECONDS)
+    write_csv(csv, drive, blank_rows={"yawRate": 500, "vyCG": 120})
+    recording = read(root)
+    assert recording.provenance["rows_dropped_at_the_head"] == 500
+    assert recording.start_time == 0.5
+    np.testing.assert_allclose(recording["yaw_rate"][::10], truth["yaw_rate"][500::10], **ONE_ROUNDING)
+    write_mat(mat, drive, late={"yawRate": 50, "vyCG": 12})
+    recording = read(root, layout="mat")
+    assert (recording.start_time, len(recording)) == (0.5, 350)
+    np.testing.assert_allclose(recording["vy_ref"], truth["vy_ref"][500::10], **ONE_ROUNDING)
+
+
+def test_columns_that_are_not_declared_may_be_blank(root: Path, csv: Path) -> None:
+    write_csv(csv, smooth_drive(SECONDS)[0], blank_rows={"altitude": 4000, "HDOP": 3000})
+    assert read(root).provenance["rows_dropped_at_the_head"] == 0
+
+
+def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root: Path, csv: Path, mat: Path) -> None:
+    drive, _ = smooth_drive(SECONDS)
+    roll = np.array(drive.signals["rollAngle"])
+    roll[200:230] = np.nan
+    drive = Drive(SECONDS, {**drive.signals, "rollAngle": roll})
+    write_csv(csv, drive, blank_rows={"rollAngle": 3500})
+    recording = read(root, gappy=["roll"])
+    assert len(recording) == 4000
+    assert np.isnan(recording["roll"][:3500]).all()
+    assert np.isfinite(recording["roll"][3500:]).all()
+    write_csv(csv, drive, blank_rows=0)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, gappy=["roll"])["roll"])), np.arange(2000, 2300))
+    write_mat(mat, drive)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, layout="mat", gappy=["roll"])["roll"])), np.arange(200, 230))
+
+
+def as_mixed(content: bytes) -> bytes:
+    """Preamble in UTF-8, row of units in Latin-1."""
+    lines = content.split(b"\r\n")
+    lines[8] = lines[8].decode("latin-1").encode("utf-8")
+    return b"\r\n".join(lines)
+
+
+def as_double_encoded(content: bytes) -> bytes:
+    """UTF-8 that was taken for Latin-1 and written as UTF-8 again."""
+    lines = content.split(b"\r\n")
+    lines[11] = lines[11].decode("latin-1").encode("utf-8").decode("latin-1").encode("utf-8")
+    return b"\r\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        as_mixed,
+        as_double_encoded,
+        lambda content: b"\xef\xbb\xbf" + content.decode("latin-1").encode("utf-8"),
+        lambda content: content.replace(b"\r\n", b"\n"),
+        lambda content: content.replace("°".encode("latin-1"), b"deg").replace("²".encode("latin-1"), b"^2"),
+        lambda content: content + b"\r\n\r\n",
+        lambda content: content.rstrip(b"\r\n"),
+    ],
+    ids=["mixed encodings", "encoded twice", "UTF-8 with a byte order mark", "LF", "ASCII units", "blank lines at the end", "no line end"],
+)
+def test_encodings_and_line_ends_do_not_matter(root: Path, csv: Path, change: Callable[[bytes], bytes]) -> None:
+    write_csv(csv, smooth_drive(1.0)[0])
+    expected = read(root)
+    assert expected.provenance["preamble"][-1] == "Remark: made for tests, 25 °C"
+    csv.write_bytes(change(csv.read_bytes()))
+    recording = read(root)
+    for name in expected.channels:
+        np.testing.assert_array_equal(recording[name], expected[name])
+
+
+def test_provenance_tells_session_parameters_and_file(root: Path, csv: Path) -> None:
+    write_csv(csv, smooth_drive(1.0)[0])
+    write_vehicle_parameters(root / "revs" / "250lm.csv")
+    assert set(source(root).inputs()) == {f"{NAME}.csv", "250lm.csv"}
+    provenance = read(root).provenance
+    assert provenance["file"] == f"{NAME}.csv"
+    assert provenance["preamble"] == [line for line in PREAMBLE if line]
+    assert provenance["vehicle_parameters"]["mass"] == {"value": 982.0, "unit": "kg"}
+    assert provenance["vehicle_parameters"]["handwheelAngle"] == {"value": [-90.0, 0.0, 90.0], "unit": "°"}
+    (root / "revs" / "250lm.csv").unlink()
+    assert "vehicle_parameters" not in read(root).provenance
+
+
+# --- what is refused ---------------------------------------------------------------------------------------------------------------
+
+
+def with_cell(line: int, column: str, text: str) -> Callable[[bytes], bytes]:
+    """Put ``text`` into a cell; lines count from 1."""
+
+    def change(content: bytes) -> bytes:
+        lines = content.splitlines(keepends=True)
+        cells = lines[line - 1].rstrip(b"\r\n").split(b",")
+        cells[list(COLUMNS).index(column)] = text.encode("latin-1")
+        lines[line - 1] = b",".join(cells) + b"\r\n"
+        return b"".join(lines)
+
+    return change
+
+
+def without_lines(first: int, last: int) -> Callable[[bytes], bytes]:
+    return lambda content: b"".join(line for number, line in enumerate(content.splitlines(True), 1) if not first <= number <= last)
+
+
+def with_columns(change: Callable[[list[bytes]], list[bytes]]) -> Callable[[bytes], bytes]:
+    """Change the row of names."""
+    return lambda content: b"".join(
+        b",".join(change(line.rstrip().split(b","))) + b"\r\n" if number == 11 else line
+        for number, line in enumerate(content.splitlines(True), 1)
+    )
+
+
+def cut_in_row(content: bytes) -> bytes:
+    return content[: content.rindex(b",", 0, len(content) - 200)]
+
+
+MALFORMED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "cut in a row": (cut_in_row, r"line \d+ has \d+ cells where the header names 55 columns; the copy is truncated"),
+    "cut in the header": (lambda content: content[:300], "ends after 11 lines"),
+    "cut after the header": (lambda content: b"".join(content.splitlines(True)[:12]), "has a header and no rows"),
+    "rows of another file": (lambda content: content + b"1,2,3\r\n", r"line 1013 has 3 cells where the header names 55"),
+    "too many cells": (lambda content: content + b"1," * 60 + b"1\r\n", r"line 1013 has 61 cells"),
+    "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in line 500"),
+    "text that is not ASCII": (with_cell(500, "vyCG", "±3"), r"column 'vyCG' holds the text '.*3' in line 500"),
+    "decimal commas": (lambda content: content.replace(b".", b";"), "holds the text"),
+    "infinite": (with_cell(500, "vyCG", "Inf"), r"'vy_ref' holds 1 infinite values between 0.487 s"),
+    "blank after the head": (with_cell(500, "vyCG", ""), r"'vyCG' is blank in 1 rows after its head, first in line 500 \(0.487 s\)"),
+    "NaN after the head": (with_cell(500, "vyCG", "NaN"), r"'vyCG' is blank in 1 rows after its head, first in line 500"),
+    "no time": (with_cell(500, "time", ""), "column 'time' is blank in line 500"),
+    "time goes back": (with_cell(500, "time", "0.1"), "time goes backwards 1 times, first at sample 450"),
+    "a gap": (without_lines(400, 500), "1 gaps, the longest of 0.102 s"),
+    "no names": (without_lines(11, 11), r"line 11 should name the columns and has no 'time' \(it has s, °"),
+    "no units": (without_lines(12, 12), "line 12 should hold units and holds numbers"),
+    "a line too many": (lambda content: b"more\r\n" + content, "line 12 has it: set preamble_lines: 11"),
+    "a column missing": (with_columns(lambda names: [b"vy" if name == b"vyCG" else name for name in names]), "has no column 'vyCG'"),
+    "a column twice": (with_columns(lambda names: [b"vyCG" if name == b"vzCG" else name for name in names]), "2 columns called 'vyCG'"),
+    "too few names": (with_columns(lambda names: names[:-1]), "names 54 columns, line 12 has 55 units"),
+    "UTF-16": (lambda content: content.decode("latin-1").encode("utf-16"), "line 1 is no line of text"),
+    "compressed": (gzip.compress, "no line of text|ends after"),
+    "binary": (lambda content: bytes(range(256)) * 2000, "no line of text"),
+    "a web page": (lambda content: b"<!DOCTYPE html>\n<html>\n" + b"<p>sign in</p>\n" * 30, "should name the columns and has no 'time'"),
+}
+
+
+@pytest.fixture(scope="module")
+def one_second(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A file of 1,000 rows below 12 lines."""
+    path = tmp_path_factory.mktemp("csv") / "a.csv"
+    write_csv(path, smooth_drive(1.0)[0])
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_a_malformed_csv_is_one_line_on_any_number_of_processors(root: Path, csv: Path, one_second: bytes, case: str) -> None:
+    change, said = MALFORMED[case]
+    csv.write_bytes(change(one_second))
+    found, processors = set(), pa.cpu_count()
+    try:
+        for count in (1, 4):
+            pa.set_cpu_count(count)
+            found.add(refusal(root))
+    finally:
+        pa.set_cpu_count(processors)
+    (message,) = found
+    assert csv.name in message
+    assert re.search(said, message), message
+
+
+def test_a_wrong_cell_deep_in_a_file_is_named_by_its_line_on_any_number_of_processors(root: Path, csv: Path) -> None:
+    write_csv(csv, smooth_drive(20.0, decimals=3)[0])  # several blocks of pyarrow
+    content = with_cell(19_000, "pitchRate", "x")(csv.read_bytes())
+    csv.write_bytes(with_cell(19_500, "vxCG", "y")(content))
+    processors = pa.cpu_count()
+    try:
+        for count in (1, 4):
+            pa.set_cpu_count(count)
+            assert "column 'pitchRate' holds the text 'x' in line 19000" in refusal(root)
+    finally:
+        pa.set_cpu_count(processors)
+
+
+def test_an_empty_or_missing_file_is_named(root: Path, csv: Path) -> None:
+    with pytest.raises(MissingError, match=r"there is no file .*250lm\.csv"):
+        read(root)
+    csv.touch()
+    with pytest.raises(MissingError, match="is empty"):
+        source(root).inputs()
+    csv.unlink()
+    csv.mkdir()
+    with pytest.raises(DataError, match=r"250lm\.csv' is a folder, not a file"):
+        source(root).inputs()
+
+
+def test_a_column_that_is_blank_for_long_is_refused(root: Path, csv: Path) -> None:
+    write_csv(csv, smooth_drive(1.0)[0], blank_rows={"pitchAngle": 1000})
+    assert "column 'pitchAngle' is blank throughout" in refusal(root)
+    write_csv(csv, smooth_drive(1.0)[0], blank_rows={"pitchAngle": 600})
+    assert "column 'pitchAngle' is blank until 0.6 s, more than 50 % of the rows" in refusal(root)
+
+
+def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root: Path, csv: Path, one_second: bytes) -> None:
+    csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
+    assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refusal(root)
+    assert len(read(root, units_row="ignore")) == 1000 - BLANK
+    csv.write_bytes(with_cell(12, "yawRate", "(deg/s)")(one_second))
+    assert len(read(root)) == 1000 - BLANK
+    csv.write_bytes(with_cell(12, "yawRate", "turns")(one_second))  # says nothing that is known here
+    assert len(read(root)) == 1000 - BLANK
+
+
+def test_another_number_of_lines_above_the_names_can_be_declared(root: Path, csv: Path) -> None:
+    write_csv(csv, smooth_drive(1.0)[0], preamble=PREAMBLE[:3])
+    assert "line 4 has it: set preamble_lines: 3" in refusal(root)
+    assert read(root, preamble_lines=3).provenance["preamble"] == list(PREAMBLE[:3])
+    write_csv(csv, smooth_drive(1.0)[0], preamble=[])
+    assert len(read(root, "dataset.preamble_lines=0")) == 1000 - BLANK
+
+
+def signal(values: NDArray[Any], rate: float = 100.0, start: float = 0.0) -> dict[str, NDArray[Any]]:
+    return {"value": values, "time": start + np.arange(len(values)) / rate}
+
+
+STEADY = np.linspace(1, 2, 100)
+ODD_MAT: dict[str, tuple[Mapping[str, Any], str]] = {
+    "no structs": ({"vxCG": STEADY}, "has no channel 'vxCG' (it has no structs)"),
+    "no channel": ({"insData": {"vx": signal(STEADY)}}, "has no channel 'vxCG' (it has insData.vx)"),
+    "in two structs": ({"insData": {"vxCG": signal(STEADY)}, "other": {"vxCG": signal(STEADY)}}, "has 'vxCG' more than once"),
+    "no time": ({"insData": {"vxCG": {"value": STEADY}}}, "'insData.vxCG' has no field 'time' (it has value)"),
+    "no value": ({"insData": {"vxCG": {"time": STEADY}}}, "'insData.vxCG' has no field 'value' (it has time)"),
+    "no struct": ({"insData": {"vxCG": STEADY}}, "has no field 'value' (it has none: it is no struct)"),
+    "text": ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
+    "complex": ({"insData": {"vxCG": signal(STEADY * 1j)}}, "is no row or column of real numbers"),
+    "lengths": ({"insData": {"vxCG": {"value": STEADY[1:], "time": STEADY}}}, "holds 99 values and 100 time stamps"),
+    "empty": ({"insData": {"vxCG": signal(STEADY[:0])}}, "fewer than two time stamps"),
+    "NaN": ({"insData": {"vxCG": signal(np.where(np.arange(100) == 40, np.nan, STEADY))}}, "'insData.vxCG' holds NaN at 0.4 s"),
+    "NaN throughout": ({"insData": {"vxCG": signal(STEADY * np.nan)}}, "'insData.vxCG' holds no number"),
+    "infinite": ({"insData": {"vxCG": signal(np.where(np.arange(100) == 40, np.inf, STEADY))}}, "'vx' holds 1 infinite values"),
+    "gap": ({"insData": {"vxCG": {"value": STEADY, "time": np.r_[0:50, 90:140] / 100}}}, "'insData.vxCG': 1 gaps"),
+    "disorder": ({"insData": {"vxCG": {"value": STEADY, "time": -STEADY}}}, "'insData.vxCG': time goes backwards"),
+}
+
+
+@pytest.mark.parametrize("case", ODD_MAT)
+def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
+    content, said = ODD_MAT[case]
+    savemat(mat, dict(content), oned_as="column")
+    message = refusal(root, layout="mat", channels={"vx": {"column": "vxCG", "unit": "m/s"}}, extra_channels={})
+    assert mat.name in message
+    assert said in message
+
+
+def test_mat_channels_that_share_no_time_are_refused(root: Path, mat: Path) -> None:
+    savemat(mat, {"insData": {"vxCG": signal(STEADY), "yawRate": signal(STEADY, start=5.0)}}, oned_as="column")
+    channels = {"vx": {"column": "vxCG", "unit": "m/s"}, "yaw_rate": {"column": "yawRate", "unit": "deg/s"}}
+    message = refusal(root, layout="mat", channels=channels, extra_channels={})
+    assert "'insData.vxCG' ends at 1 s, 'insData.yawRate' begins at 5 s" in message
+
+
+def test_parameters_of_a_channels_name_in_a_mat_file_are_not_mistaken_for_it(root: Path, mat: Path) -> None:
+    write_mat(mat, smooth_drive(1.0)[0])
+    assert "handwheelAngle" in loadmat(mat, simplify_cells=True)["params"]
+    assert np.ptp(read(root, layout="mat")["handwheel"]) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("mass\nkg\n", "has 2 lines"),
+        ("mass,wheelbase\n982,2.4\n982,2.4\n", "line 2 should hold units and holds numbers"),
+        ("mass,mass\nkg,kg\n1,2\n", "names 'mass' twice"),
+        ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 has no name"),
+        ("mass\nkg\n1,2\n", "line 3 has 2 cells, line 1 names 1 columns"),
+        ("mass\nkg\n1\nabc\n", "parameter 'mass' holds the text 'abc' in line 4"),
+        ("a,b\nkg,m\n1,1\n,2\n3,3\n", "parameter 'a' is blank in line 4"),
+        ('mass\nkg\n"1\n', "cannot be read as a table"),
+        ("mass\nkg\n1\0\n", "is no table of vehicle parameters"),
+        ("x" * (1 << 20) + "\n", "is no table of vehicle parameters"),
+    ],
+)
+def test_a_malformed_table_of_vehicle_parameters_is_one_line(root: Path, csv: Path, one_second: bytes, content: str, said: str) -> None:
+    csv.write_bytes(one_second)
+    (root / "revs" / "250lm.csv").write_text(content)
+    message = refusal(root)
+    assert "250lm.csv" in message
+    assert said in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"clock": "loose"}, "clock 'loose' is not one of: strict, interpolate"),
+        ({"units_row": "maybe"}, "units_row 'maybe' is not one of: check, ignore"),
+        ({"rate_hz": 100}, "rate_hz is an option of layout mat"),
+        ({"layout": "mat", "rate_hz": 0}, "rate_hz must be a positive number, not 0"),
+        ({"preamble_lines": -1}, "preamble_lines must be a whole number up to 100, not -1"),
+        ({"gappy": ["steer"]}, "gappy names 'steer', which is not one of its channels"),
+        ({"gappy": "roll"}, "gappy must be a list"),
+        ({"recordings": NAME}, "recordings must be a list"),
+        ({"extra_channels": {"hdf": {}}}, "extra_channels must map a layout to channels"),
+        ({"channels": {}}, "channels must map a channel to its column and unit"),
+    ],
+)
+def test_a_misspelt_option_is_refused(root: Path, changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigurationError) as error:
+        source(root, **changes)
+    assert said in str(error.value)
+
+
+# --- the data sets -----------------------------------------------------------------------------------------------------------------
+
+
+def test_the_data_sets_name_the_files_of_the_papers_table_1(root: Path) -> None:
+    files = {}
+    for dataset in ("revs_targa_2013", "revs_targa_2014"):
+        config = compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"]
+        files[dataset] = open_source(config).file_names()
+    corvette = [f"2013022{name}_03_grandsport.csv" for name in ("2_01_01", "2_01_02", "2_02_01", "3_01_01", "3_01_02")]
+    ferrari = [f"201402{name}_03_250lm.csv" for name in ("21_03_02", "21_03_03", "21_04_01", "22_01_01", "22_02_01")]
+    assert files == {"revs_targa_2013": [*corvette, "grandsport.csv"], "revs_targa_2014": [*ferrari, "250lm.csv"]}
+
+
+def test_without_named_recordings_every_matching_file_is_one(root: Path) -> None:
+    for name in ("20130817_02_grandsport", "20130816_01_grandsport", "20130222_01_grandsport"):
+        write_csv(root / "revs" / f"{name}.csv", smooth_drive(0.2)[0])
+    write_vehicle_parameters(root / "revs" / "grandsport.csv")
+    monterey = source(root, dataset="revs_monterey_2013", recordings=None)
+    assert monterey.ids() == ["20130816_01_grandsport", "20130817_02_grandsport"]
+    assert set(monterey.inputs()) == {"20130816_01_grandsport.csv", "20130817_02_grandsport.csv", "grandsport.csv"}
+    assert [recording.id for recording in monterey.recordings()] == monterey.ids()
+    assert monterey.file_names() == []
+    assert len(source(root, dataset="revs_monterey_2013", recordings=None, files=None).ids()) == 3
+    with pytest.raises(MissingError, match=r"nothing in .* matches '201308\*_grandsport\.mat'"):
+        source(root, dataset="revs_monterey_2013", recordings=None, layout="mat").ids()
+
+
+def vehest(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command."""
+    monkeypatch.setattr(sys, "argv", ["vehest", *arguments])
+    code = 0
+    try:
+        main()
+    except SystemExit as leave:
+        code = int(leave.code or 0)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.mark.parametrize("layout", ["csv", "mat"])
+def test_the_whole_data_set_is_ingested_and_checked(
+    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, layout: str
+) -> None:
+    monkeypatch.chdir(root)
+    names = source(root, recordings=compose_config("ingest", ["dataset=revs_targa_2014"])["dataset"]["recordings"]).ids()
+    drive, truth = smooth_drive(25.0, decimals=6)
+    for name in names:
+        {"csv": write_csv, "mat": write_mat}[layout](root / "revs" / f"{name}.{layout}", drive)
+    write_vehicle_parameters(root / "revs" / "250lm.csv")
+    arguments = ("revs_targa_2014", f"root={root}", f"dataset.layout={layout}")
+    code, _, err = vehest(capsys, monkeypatch, "ingest", *arguments, "output=made")
+    assert code == 0, err
+    stored = {file.stem: read_recording(file) for file in (root / "made" / "ingest").rglob("*.parquet")}
+    assert set(stored) == set(names)
+    for recording in stored.values():
+        expected = truth["vy_ref"][round(recording.start_time * 1000) :: round(1000 / recording.rate_hz)]
+        assert np.abs(recording["vy_ref"] - expected)[:: 10 if layout == "csv" else 1].max() < 0.01  # held for up to 10 ms
+        assert recording.provenance["vehicle_parameters"]["wheelbase"]["value"] == 2.4
+    code, out, err = vehest(capsys, monkeypatch, "data", "check", *arguments)
+    assert code == 0, out + err
+    assert [line.split()[0] for line in out.splitlines()] == ["note"] * 5, "d(vy_ref)/dt follows ay - vx·yaw_rate, no more"
+
+
+@pytest.mark.parametrize("case", ["cut in a row", "text", "blank after the head", "no names", "UTF-16", "a gap"])
+def test_an_ingest_of_a_malformed_file_writes_nothing(
+    root: Path, csv: Path, one_second: bytes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, case: str
+) -> None:
+    monkeypatch.chdir(root)
+    csv.with_name("a_first.csv").write_bytes(one_second)
+    csv.write_bytes(MALFORMED[case][0](one_second))
+    recordings = f"dataset.recordings=[a_first,{NAME}]"
+    code, _, err = vehest(capsys, monkeypatch, "ingest", "revs_targa_2014", f"root={root}", recordings, "output=made")
+    assert code == 3
+    assert len(err.splitlines()) == 1, err
+    assert csv.name in err
+    assert not [path for path in (root / "made").rglob("*") if path.is_file() and path.parent != root / "made" / "locks"]
+
+
+# --- the real recording ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_real_ferrari_written_in_the_official_layouts_reads_back(root: Path, csv: Path, mat: Path, data_root: Path) -> None:
+    config = compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])["dataset"]
+    whole = next(iter(open_source(config).recordings()))
+    ferrari = whole.cut(300.0, 320.0)
+    write_csv(csv, drive_of(ferrari), blank_rows=0)
+    write_mat(mat, drive_of(ferrari))
+    channels = {name: entry for name, entry in config_of_official().items() if name in ferrari}
+    steer = {"mat": {"steer": {"column": "roadWheelAngle", "unit": "deg"}}}
+    from_csv = read(root, channels=channels, extra_channels=steer)
+    from_mat = read(root, layout="mat", channels=channels, extra_channels=steer)
+    assert (from_csv.rate_hz, from_mat.rate_hz) == (1000.0, 100.0)
+    assert from_csv.start_time == pytest.approx(ferrari.start_time, abs=1e-9)
+    assert from_mat.start_time == pytest.approx(ferrari.start_time, abs=1e-9)
+    assert set(from_mat.channels) == set(ferrari.channels)
+    for name in ferrari.channels:
+        np.testing.assert_allclose(from_mat[name], ferrari[name], **ONE_ROUNDING, err_msg=name)
+        if name != "steer":
+            np.testing.assert_allclose(from_csv[name], np.repeat(ferrari[name], 10), **ONE_ROUNDING, err_msg=name)
+    for recording in (from_csv, from_mat):
+        assert [finding.level for finding in checks_of_recording(recording)] == ["note"]
+
+
+def config_of_official() -> dict[str, Any]:
+    """The map of channels that both official layouts share."""
+    return dict(compose_config("ingest", ["dataset=revs_targa_2014"])["dataset"]["channels"])

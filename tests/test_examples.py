@@ -1,0 +1,234 @@
+"""The worked examples of docs/adding_an_estimator.md: found through entry points, trained, run online, saved, compared."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import vehest
+from conftest import planar_drive
+from example_package import EXAMPLES, NAMES, forget_examples, install_examples, write_laps
+from place import Place
+from single_track_drive import linear_drive, with_gaps
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import FitData
+from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
+from vehest.stages.artefacts import read_artefact
+from vehest.training.context import FitContext
+from vehest.training.nothing import NoTraining
+from vehest.training.supervised import SupervisedSettings
+
+PAGE = EXAMPLES.parent / "adding_an_estimator.md"
+SPLITS = {"sliding_mode": "mine", "window_transformer": "mine", "saturating_ekf": "steered"}
+QUICK = {
+    "sliding_mode": ["training.grid=2", "training.max_evaluations=20"],
+    "window_transformer": ["training.max_epochs=3", "training.dtype=float64"],
+    "saturating_ekf": [],
+}
+
+
+@pytest.fixture
+def examples(place: Place, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    """A place to work in where the examples are installed."""
+    install_examples(tmp_path_factory.mktemp("examples") / "site", monkeypatch)
+    place.add_steered()
+    split = {
+        "name": "steered",
+        "dataset": "steered",
+        "train": [{"recording": "first"}],
+        "validation": [{"recording": "second", "stop": 12}],
+        "tests": {"test": [{"recording": "second", "start": 14, "stop": 20}]},
+    }
+    (place.folder / "conf" / "split" / "steered.yaml").write_text(yaml.safe_dump(split))
+    yield place
+    forget_examples()
+
+
+def drive_for(name: str, seconds: float = 8.0) -> Recording:
+    kind = estimator_class(name)
+    drive = linear_drive(seconds, seed=7)[0] if "steer" in kind.channels else planar_drive(seconds, 100.0, seed=7, noise=0.02)
+    return drive.without_references()
+
+
+def test_each_example_is_a_module_and_a_configuration_of_under_a_hundred_lines_on_the_page():
+    assert len(NAMES) == 3
+    assert {file.name for file in EXAMPLES.iterdir() if file.is_file()} == {f"{name}.{end}" for name in NAMES for end in ("py", "yaml")}
+    page = PAGE.read_text(encoding="utf-8")
+    for name in NAMES:
+        lines = sum(len((EXAMPLES / f"{name}.{end}").read_text(encoding="utf-8").splitlines()) for end in ("py", "yaml"))
+        assert lines < 100
+        assert f"(examples/{name}.py)" in page
+        assert f"(examples/{name}.yaml)" in page
+
+
+def test_entry_points_of_another_package_are_found_and_only_while_it_is_there(examples):
+    for name in NAMES:
+        assert name in estimator_names()
+        assert estimator_module(name) == name
+
+
+def test_without_the_package_examples_are_unknown():
+    forget_examples()
+    with pytest.raises(ConfigurationError, match="estimator 'sliding_mode' is not one of"):
+        estimator_class("sliding_mode")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name, examples):
+    split = [f"split={SPLITS[name]}", f"estimator={name}", *QUICK[name], "tracking=none"]
+    code, _, err = examples("train", *split)
+    assert code == 0, err
+    code, _, err = examples("eval", *split)
+    assert code == 0, err
+    (evaluation,) = (examples.folder / "outputs" / "evaluate").iterdir()
+    table = pd.read_csv(evaluation / "metrics.csv")
+    scored = table[(table["test_set"] == "test") & (table["metric"] == "rmse_vy")]
+    assert np.isfinite(scored["value"]).all()
+    assert len(scored) == 1
+    (folder,) = (examples.folder / "outputs" / "train").iterdir()
+    assert read_artefact(folder).status == "complete"
+    model, again = vehest.load_model(folder), vehest.load_model(folder)
+    drive = drive_for(name)
+    (batch,) = (vehest.estimate(model, drive),)
+    assert np.array_equal(batch["vy"], vehest.estimate(again, drive)["vy"], equal_nan=True)
+    at_rate = drive if model.settings.rate_hz == drive.rate_hz else planar_drive(8.0, model.settings.rate_hz, seed=7)
+    (batch,) = model.estimate([at_rate.without_references()])
+    stepper = model.online()
+    ahead = stepper.horizon_steps
+    steps = [stepper.step({channel: at_rate[channel][k] for channel in model.channels})["vy"] for k in range(len(at_rate))]
+    online = np.concatenate([np.full(ahead, np.nan), steps])[: len(at_rate)]
+    assert np.array_equal(np.isnan(online), np.isnan(batch["vy"]))
+    assert np.isfinite(online).sum() > 100
+    assert np.nanmax(np.abs(online - batch["vy"])) <= 1e-9
+
+
+def test_example_that_was_trained_is_not_trained_again_unless_a_setting_changes(examples):
+    words = ["train", "split=mine", "estimator=sliding_mode", *QUICK["sliding_mode"], "tracking=none"]
+    assert examples(*words)[0] == 0
+    assert "up to date" in examples(*words)[2]
+    assert len(list((examples.folder / "outputs" / "train").iterdir())) == 1
+    assert examples(*words, "estimator.injection=6.0")[0] == 0
+    assert len(list((examples.folder / "outputs" / "train").iterdir())) == 2
+
+
+def block_with(words: str) -> str:
+    """The Python block of the page that has these words."""
+    blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    (found,) = (block for block in blocks if words in block)
+    return found
+
+
+def test_smallest_estimator_on_the_page_integrates_and_runs_online():
+    namespace = {"__name__": "smallest"}
+    exec(compile(block_with("class Leaky"), "smallest", "exec", dont_inherit=True), namespace)
+    model = namespace["Leaky"].from_config({"rate_hz": 20.0, "kept": 0.9})
+    drive, expected, stepper = planar_drive(5.0), 0.0, model.online()
+    (batch,) = model.estimate([drive.without_references()])
+    for k in range(len(drive)):
+        expected = 0.9 * expected + (drive["ay"][k] - drive["vx"][k] * drive["yaw_rate"][k]) / 20.0
+        assert batch["vy"][k] == pytest.approx(expected, abs=1e-12)
+        assert stepper.step({name: drive[name][k] for name in model.channels})["vy"] == pytest.approx(expected, abs=1e-12)
+    (started,) = model.estimate([drive.without_references()], {"vy": 2.0})
+    assert started["vy"][0] - batch["vy"][0] == pytest.approx(0.9 * 2.0)
+
+
+def test_ten_lines_of_python_train_and_compare(examples, capsys):
+    block = block_with("vehest.score")
+    assert len([line for line in block.splitlines() if line.strip()]) <= 10
+    write_laps()
+    exec(compile(block, "ten lines", "exec", dont_inherit=True), {"__name__": "ten_lines"})
+    rows = capsys.readouterr().out.splitlines()
+    assert [row.split("  ")[0] for row in rows] == ["Static map", "Sliding-mode observer", "Transformer"]
+    lap = vehest.read_recording("lap3.csv")
+    for name, row in zip(("static_map", "sliding_mode", "window_transformer"), rows, strict=True):
+        model = vehest.load_model(Path("models") / name)
+        assert f"{vehest.score(model, [lap])['fvu']:.3f}" in row
+
+
+def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
+    write_laps()
+    lap = vehest.read_recording("lap3.csv")
+    model = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
+    metrics = vehest.score(model, [lap])
+    scored = lap["vy_ref"][150::5]  # 20 Hz, from 1.5 s on
+    assert metrics["rmse_vy"] == pytest.approx(np.sqrt(np.mean(scored**2)), rel=1e-3)
+    with pytest.raises(DataError, match="no channel 'vy_ref' to score"):
+        vehest.score(model, [lap.without_references()])
+    with pytest.raises(DataError, match="no channel 'vy_ref', which training 'static_map' needs"):
+        vehest.train("static_map", [lap.without_references()], [lap])
+    with pytest.raises(ConfigurationError, match="n_hiden"):
+        vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"])
+
+
+def test_python_reads_references_of_a_declared_data_set_on_request(examples):
+    file = examples.folder / "raw" / "one.csv"
+    assert "vy_ref" not in vehest.read_recording(file, ["dataset=mine"])
+    assert "vy_ref" in vehest.read_recording(file, ["dataset=mine"], references=True)
+
+
+def test_python_trains_what_the_command_trains(examples):
+    words = ["split=mine", "estimator=ksnn", "training.max_epochs=2", "seed=3"]
+    assert examples("train", *words, "tracking=none")[0] == 0
+    (folder,) = (examples.folder / "outputs" / "train").iterdir()
+    laps = [vehest.read_recording(examples.folder / "raw" / f"{name}.csv", ["dataset=mine"], references=True) for name in ("one", "two")]
+    own = vehest.train("ksnn", laps[:1], laps[1:], ["training.max_epochs=2"], seed=3)
+    for name, values in vehest.load_model(folder).weights().items():
+        assert np.array_equal(values, own.weights()[name])
+
+
+def test_sliding_mode_observer_follows_exact_kinematics(examples):
+    train, test = (planar_drive(40.0, 100.0, seed=seed) for seed in (1, 3))
+    model = vehest.train("sliding_mode", [train], [train])
+    assert vehest.score(model, [test])["fvu"] < 0.1 * vehest.score(vehest.train("zero", [], []), [test])["fvu"]
+
+
+def test_sliding_mode_decays_as_its_gain_says(examples):
+    """d(v - v̂)/dt = -λ|ω|(v - v̂) in a steady turn, once û slides."""
+    model = estimator_class("sliding_mode").from_config({"rate_hz": 2000.0, "layer": 0.02})
+    model.values = {"gain": 4.0, "threshold": 0.0}
+    time = np.arange(4000) / 2000.0
+    steady = {"yaw_rate": 0.25, "vx": 20.0, "ay": 5.0, "ax": -0.25 * 1.5}  # v = 1.5 m/s, u = 20 m/s
+    drive = Recording("turn", "car", 2000.0, 0.0, {name: np.full(len(time), value) for name, value in steady.items()}, "simulated")
+    error = 1.5 - model.estimate([drive])[0]["vy"]
+    assert np.polyfit(time[1000:], np.log(error[1000:]), 1)[0] == pytest.approx(-4.0 * 0.25, rel=0.02)
+
+
+def test_transformers_train_as_members(examples):
+    kind = estimator_class("window_transformer")
+    data = FitData([planar_drive(20.0, seed=1, noise=0.02)], [planar_drive(10.0, seed=2, noise=0.02)])
+    training = SupervisedSettings(max_epochs=3, dtype="float64")
+    members = [kind.from_config({"dropout": 0.1}) for _ in range(3)]
+    for seed, member in enumerate(members):
+        member.seed(seed)
+    kind.fit_members(members, data, training, FitContext())
+    alone = kind.from_config({"dropout": 0.1})
+    alone.seed(2)
+    alone.fit(data, training)
+    for name, values in alone.weights().items():
+        assert np.allclose(values, members[2].weights()[name], rtol=0, atol=1e-8)
+
+
+def test_ekf_finds_the_motion_of_a_car_on_linear_tyres(examples):
+    drive = linear_drive(12.0, seed=3, noise={"yaw_rate": 0.002, "ay": 0.05, "steer": 0.0})[0]
+    model = estimator_class("saturating_ekf").from_config({"friction": 100.0, "deviations": [0.05, 0.002]})
+    model.fit(FitData([drive], [drive]), NoTraining())
+    assert vehest.score(model, [drive])["fvu"] < 0.02
+
+
+def test_ekf_goes_on_where_nothing_was_measured(examples):
+    drive = with_gaps(linear_drive(4.0, seed=3)[0], {"ay": slice(150, 250), "yaw_rate": slice(200, 300)})
+    model = estimator_class("saturating_ekf").from_config({})
+    model.values = {"variance_vy": 1e-4, "variance_yaw_rate": 1e-5}
+    (batch,), stepper = model.estimate([drive.without_references()]), model.online()
+    steps = [stepper.step({channel: drive[channel][k] for channel in model.channels})["vy"] for k in range(len(drive))]
+    assert np.isfinite(batch["vy"]).all()
+    assert np.abs(np.array(steps) - batch["vy"]).max() <= 1e-9
+    with pytest.raises(DataError, match="'steer' is NaN, which estimator 'saturating_ekf' cannot skip"):
+        stepper.step({"vx": 20.0, "steer": np.nan, "ay": 0.0, "yaw_rate": 0.0})

@@ -1,0 +1,270 @@
+"""Training through a filter: truncation, curriculum, placing, what learns in which phase, and that a killed training ends the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from small_car_drive import small_car_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.estimators.base import FitData
+from vehest.estimators.learned_ukf import LearnedUkf
+from vehest.training.context import FitContext
+from vehest.training.sequences import PhaseSettings
+from vehest.training.through_filter import Drive, ThroughFilterSettings, filter_phases, placed, sequences_of
+
+DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
+ONE_STEP = PhaseSettings(learning_rate=5e-3, max_epochs=3)
+THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
+
+
+def settings(**changes) -> ThroughFilterSettings:
+    known = {
+        "one_step": ONE_STEP,
+        "one_step_batch": 100,
+        "through": THROUGH,
+        "noise": THROUGH,
+        "steps": 40,
+        "batch_size": 3,
+        "validation_steps": 60,
+        "validation_drop_steps": 10,
+        "mirrored": 0.0,
+        "dtype": "float64",
+    }
+    return ThroughFilterSettings(**known | changes)
+
+
+def estimator(seed: int = 0, **config) -> LearnedUkf:
+    made = LearnedUkf.from_config({"width": 8} | config)
+    made.seed(seed)
+    return made
+
+
+def weights_of(made: LearnedUkf) -> np.ndarray:
+    return np.concatenate([values.ravel() for values in made.weights().values()])
+
+
+def drives(made: LearnedUkf, steps: int = 40) -> Drive:
+    """Sequences, and the filter made ready for them."""
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    made.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
+    made.filter.begin_noise(parts, 0.0)
+    return sequences_of(parts, steps)
+
+
+def numbered(*lengths: int) -> list[Drive]:
+    """Drives of which state 0 is the sample's number, state 1 the drive's."""
+    made = []
+    for number, length in enumerate(lengths):
+        states = torch.stack([torch.arange(float(length)), torch.full((length,), float(number))], 1)
+        made.append(Drive(states, states[:, :1], states))
+    return made
+
+
+# What is learnt from
+
+
+def test_drives_are_cut_from_their_start_and_remainders_are_left_out() -> None:
+    cut = sequences_of(numbered(25, 9, 10), 10)
+    assert cut.states[:, 0].tolist() == [[0.0, 0.0], [10.0, 0.0], [0.0, 2.0]]
+    assert cut.inputs.shape == (3, 10, 1)
+    with pytest.raises(DataError, match=r"no drive is 26 samples long.* lower training\.steps"):
+        sequences_of(numbered(25, 9), 26)
+
+
+def test_random_places_are_reproducible_fit_and_keep_each_drives_share() -> None:
+    def drawn(seed: int) -> Drive:
+        return placed(numbered(45, 9, 20), 10, torch.Generator().manual_seed(seed))
+
+    one, again, other = drawn(1), drawn(1), drawn(2)
+    assert torch.equal(one.states, again.states)
+    assert not torch.equal(one.states, other.states)
+    assert one.states[:, 0, 1].tolist() == [0.0] * 4 + [2.0] * 2
+    assert (one.states[:, 1:, 0] - one.states[:, :-1, 0] == 1.0).all(), "each is uninterrupted"
+
+
+def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others() -> None:
+    made = estimator()
+    drives(made)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    for placing, same in (("fixed", True), ("random", False)):
+        (phase,) = phases_of(made, parts, settings(placing=placing, start_spread=0.0))
+        generator = torch.Generator().manual_seed(0)
+        epochs = [{tuple(row) for batch in phase.batches(generator) for row in batch[0].states[:, 0].tolist()} for _ in range(2)]
+        assert (epochs[0] == epochs[1]) == same
+
+
+def phases_of(made: LearnedUkf, parts: list[Drive], training: ThroughFilterSettings):
+    from vehest.training.through_filter import Weights
+
+    weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
+    return filter_phases(made.filter, made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
+
+
+def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true() -> None:
+    made = estimator()
+    drives(made)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    (phase,) = phases_of(made, parts, settings(start_spread=0.2, placing="fixed"))
+    batches = list(phase.batches(torch.Generator().manual_seed(0)))
+    off = torch.cat([start - batch.states[:, 0] for batch, start in batches])
+    assert (off[:, :4] == 0.0).all()
+    assert 0.05 < float(off[:, 4].abs().max()) <= 0.2
+    assert off[:, 4].unique().numel() == len(off)
+
+
+def test_a_share_of_sequences_is_seen_in_a_mirror() -> None:
+    made = estimator()
+    drives(made)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    signs = [torch.tensor(part, dtype=torch.float64) for part in made.filter.mirror]
+    for share, allowed in ((0.0, {False}), (1.0, {True}), (0.5, {False, True})):
+        (phase,) = phases_of(made, parts, settings(mirrored=share, start_spread=0.0, placing="fixed"))
+        known = sequences_of(parts, 40)
+        seen = set()
+        for batch, start in phase.batches(torch.Generator().manual_seed(0)):
+            for row in range(len(start)):
+                (at,) = torch.nonzero((known.states[:, 0, 0] == start[row, 0]) & (known.states[:, 0, 3] == start[row, 3]))[0]
+                turned = not torch.equal(batch.states[row], known.states[at])
+                for own, whole, sign in zip(batch, known, signs, strict=True):
+                    assert torch.equal(own[row], whole[at] * sign if turned else whole[at])
+                seen.add(turned)
+        assert seen == allowed
+
+
+# Truncation
+
+
+def test_truncated_training_has_the_same_estimates_and_other_gradients() -> None:
+    made = estimator()
+    sequences = drives(made)
+    results = {}
+    for steps in (None, 40, 15):
+        made.filter.zero_grad()
+        estimated = made.filter.estimated(sequences, sequences.states[:, 0], steps)
+        (estimated - sequences.states).square().sum().backward()
+        gradient = torch.cat([p.grad.reshape(-1) for p in made.filter.parameters() if p.grad is not None])
+        results[steps] = (estimated.detach(), gradient)
+    assert torch.allclose(results[15][0], results[None][0], rtol=0, atol=1e-12)
+    assert torch.equal(results[40][1], results[None][1]), "as long as the sequence: nothing is cut"
+    off = float((results[15][1] - results[None][1]).norm() / results[None][1].norm())
+    assert 1e-4 < off < 2.0
+
+
+def test_truncated_gradients_do_not_reach_the_start() -> None:
+    made = estimator()
+    sequences = drives(made)
+    start = sequences.states[:, 0].clone().requires_grad_()
+    made.filter.estimated(sequences, start, 10)[:, 10:].sum().backward()
+    assert start.grad is None or not start.grad.any()
+    made.filter.estimated(sequences, start, None)[:, 10:].sum().backward()
+    assert start.grad.abs().max() > 0
+
+
+# Noise
+
+
+def test_noise_starts_where_the_models_residuals_say() -> None:
+    made = estimator(dynamics="pacejka", noise="constant")
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    made.filter.to(torch.float64).begin_noise(parts, 0.0)
+    with torch.no_grad():
+        model = made.filter.dynamics
+        steps = torch.cat([model.transition(d.states[:-1], d.inputs[:-1], 0.01) - d.states[1:] for d in parts])
+        seen = torch.cat([d.measurements - model.observation(d.states, d.inputs) for d in parts])
+        process = made.filter.process_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
+        observation = made.filter.observation_noise(parts[0].states[:1], parts[0].inputs[:1])[0]
+    expected = steps.T @ steps / len(steps)
+    assert torch.allclose(process[:4, :4], expected[:4, :4], rtol=1e-5, atol=2e-7)
+    assert float(process[4, 4]) == pytest.approx(1e-4, rel=1e-2), "a friction that is constant in training says nothing about its noise"
+    off = observation - seen.T @ seen / len(seen)
+    assert torch.allclose(off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7)
+
+
+def test_noise_given_is_not_started_from_residuals() -> None:
+    made = estimator()
+    fitted = made.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"))
+    assert np.isfinite(fitted.metrics["best_validation_loss"])
+    assert made.weights()["process_noise.unit"].tolist() == [1.0] * 5
+    other = estimator()
+    other.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12)))
+    assert (other.weights()["process_noise.unit"] != 1.0).all()
+
+
+# Phases
+
+
+def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them() -> None:
+    nothing = PhaseSettings(max_epochs=1, learning_rate=1e-300)
+    alone, after = estimator(through_filter=False), estimator(through_filter=False)
+    alone.fit(DATA, settings(noise=nothing))
+    after.fit(DATA, settings(noise=PhaseSettings(learning_rate=1e-2, max_epochs=2)))
+    changed = {name for name, values in after.weights().items() if not np.array_equal(values, alone.weights()[name])}
+    assert changed
+    assert all("noise" in name for name in changed)
+
+
+def test_through_the_filter_dynamics_and_noise_learn() -> None:
+    before, after = estimator(), estimator()
+    before.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-300)))
+    record = after.fit(DATA, settings(through=PhaseSettings(max_epochs=4, learning_rate=2e-3)))
+    assert record.metrics["best_validation_loss"] < record.metrics["start_validation_loss"]
+    changed = {name for name, values in after.weights().items() if not np.array_equal(values, before.weights()[name])}
+    assert changed >= {"dynamics.network.0.weight", "dynamics.car.learnt.log_yaw_inertia", "process_noise.constant.factor"}
+
+
+def test_a_curriculum_trains_on_shorter_sequences_first() -> None:
+    made = estimator()
+    drives(made)
+    parts = [made.drive(recording, torch.float64) for recording in DATA.train]
+    phases = phases_of(made, parts, settings(curriculum=[10, 20], curriculum_epochs=3))
+    assert [phase.name for phase in phases] == ["through_filter_10", "through_filter_20", "through_filter"]
+    assert [phase.settings.max_epochs for phase in phases] == [3, 3, 2]
+    lengths = [next(iter(phase.batches(torch.Generator().manual_seed(0))))[0].states.shape[1] for phase in phases]
+    assert lengths == [10, 20, 40]
+    assert [phase.prepare is not None for phase in phases] == [True, False, False], "the noise is started once"
+    record = made.fit(DATA, settings(curriculum=[10], curriculum_epochs=1))
+    assert record.history["phase"] == [0.0] * 3 + [1.0] + [2.0] * 2
+
+
+@pytest.mark.parametrize("stop", [2, 4], ids=["in the one-step phase", "through the filter"])
+def test_killed_training_goes_on_to_the_same_weights(tmp_path: Path, stop: int) -> None:
+    whole = estimator(seed=3)
+    record = whole.fit(DATA, settings())
+    left = stop
+
+    def die(progress) -> None:
+        nonlocal left
+        left -= 1
+        if not left:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimator(seed=3).fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path], on_progress=die))
+    resumed = estimator(seed=3)
+    again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
+    assert np.array_equal(weights_of(resumed), weights_of(whole))
+    assert again.history == record.history
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps must be at least 1"),
+        ({"truncate_steps": -1}, "truncate_steps must not be negative"),
+        ({"drop_steps": 40}, "more steps are dropped than a sequence has"),
+        ({"placing": "everywhere"}, "placing 'everywhere' is not one of: fixed, random"),
+        ({"start_noise": "guessed"}, "start_noise 'guessed' is not one of"),
+        ({"dtype": "float16"}, "dtype 'float16' is not one of"),
+        ({"drop_steps": 10, "curriculum": [10]}, r"lengths above drop_steps \(10\)"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        settings(**changes)

@@ -1,0 +1,202 @@
+"""Training: members as if alone, early stopping, checkpoints that go on to the same result, clean stops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy import optimize
+
+from conftest import planar_drive
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import settings_from_config
+from vehest.data.windows import windows_of
+from vehest.estimators.base import FitData
+from vehest.estimators.registry import estimator_class
+from vehest.training.checkpoints import resume_epoch
+from vehest.training.context import FitContext
+from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
+from vehest.training.supervised import SupervisedSettings
+
+DATA = FitData([planar_drive(30.0, seed=1, noise=0.05)], [planar_drive(15.0, seed=2, noise=0.05)])
+SHAPES = [("ksnn", {"n_hidden": 1, "bias": True}), ("gru", {"n_states": 2}), ("lstm", {"n_states": 2})]
+
+
+def _fit(name, config, seeds, settings, context=None, data=DATA):
+    kind = estimator_class(name)
+    members = []
+    for seed in seeds:
+        member = kind.from_config(config)
+        member.seed(seed)
+        members.append(member)
+    records = kind.fit_members(members, data, settings, context or FitContext())
+    return members, records
+
+
+def _weights(member):
+    return np.concatenate([values.astype(np.float64).ravel() for values in member.weights().values()])
+
+
+@pytest.mark.parametrize(("name", "config"), SHAPES)
+def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
+    settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
+    together, records = _fit(name, config, [0, 1, 2, 3], settings)
+    assert len({record.metrics["epochs"] for record in records}) > 1, "members must stop at different times for this to mean anything"
+    for seed, member, record in zip(range(4), together, records, strict=True):
+        (alone,), (own,) = _fit(name, config, [seed], settings)
+        assert own.metrics["epochs"] == record.metrics["epochs"]
+        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-8)
+        assert np.allclose(own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("name", "config"), SHAPES)
+def test_members_equal_training_each_alone_over_first_epochs_in_float32(name, config):
+    settings = SupervisedSettings(max_epochs=3)
+    together, _ = _fit(name, config, [0, 1, 2], settings)
+    for seed, member in enumerate(together):
+        (alone,), _ = _fit(name, config, [seed], settings)
+        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-5)
+
+
+def test_compiled_training_equals_plain_training():
+    plain = SupervisedSettings(dtype="float64", max_epochs=2, compiled=False)
+    compiled = SupervisedSettings(dtype="float64", max_epochs=2)
+    for name, config in SHAPES:
+        (one,), _ = _fit(name, config, [5], plain)
+        (other,), _ = _fit(name, config, [5], compiled)
+        assert np.allclose(_weights(one), _weights(other), rtol=0, atol=1e-9)
+
+
+def test_same_seed_gives_the_same_numbers_and_another_seed_others():
+    settings = SupervisedSettings(max_epochs=3)
+    (first,), _ = _fit("ksnn", {}, [7], settings)
+    (again,), _ = _fit("ksnn", {}, [7], settings)
+    (other,), _ = _fit("ksnn", {}, [8], settings)
+    assert np.array_equal(_weights(first), _weights(again))
+    assert not np.allclose(_weights(first), _weights(other))
+
+
+def test_early_stopping_keeps_the_best_weights_on_validation():
+    settings = SupervisedSettings(dtype="float64", max_epochs=40, patience=4, learning_rate=3e-2)
+    (member,), (record,) = _fit("ksnn", {"n_hidden": 2, "bias": True}, [0], settings)
+    losses = np.array(record.history["validation_loss"])
+    best = int(losses.argmin())
+    assert record.metrics["best_epoch"] == best + 1
+    assert len(losses) == min(best + 1 + settings.patience, settings.max_epochs)
+    windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
+    error = member._predict(windows.series, windows.starts) - windows.targets
+    assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
+
+
+def test_gamma_1_stays_in_its_range():
+    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], SupervisedSettings(max_epochs=10, learning_rate=5e-2))
+    gamma = member.weights()["gamma"][:, 0]
+    assert (gamma > 0).all()
+    assert (gamma <= 1).all()
+
+
+class _StopAfter:
+    """Asks to stop after so many batches."""
+
+    def __init__(self, batches: int) -> None:
+        self.left = batches
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+@pytest.mark.parametrize(("name", "config"), SHAPES)
+def test_interrupted_training_goes_on_to_the_same_result(tmp_path: Path, name, config):
+    settings = SupervisedSettings(max_epochs=12, patience=4)
+    whole, whole_records = _fit(name, config, [0, 1, 2], settings)
+    folders = [tmp_path / str(seed) for seed in range(3)]
+    _, records = _fit(name, config, [0, 1, 2], settings, FitContext(folders, should_stop=_StopAfter(25)))
+    assert all(record.interrupted for record in records)
+    assert records[0].metrics["epochs"] < whole_records[0].metrics["epochs"]
+    losses = records[0].history["validation_loss"]
+    assert records[0].metrics["best_validation_loss"] == min(losses)
+    resumed, resumed_records = _fit(name, config, [0, 1, 2], settings, FitContext(folders))
+    for one, other, record, resumed_record in zip(whole, resumed, whole_records, resumed_records, strict=True):
+        assert np.array_equal(_weights(one), _weights(other))
+        assert record.history == resumed_record.history
+
+
+def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path: Path):
+    settings = SupervisedSettings(max_epochs=10, patience=10)
+    (whole,), _ = _fit("ksnn", {}, [1], settings)
+    folders = [tmp_path / str(seed) for seed in range(3)]
+    _fit("ksnn", {}, [0, 1, 2], settings, FitContext(folders, should_stop=_StopAfter(30)))
+    assert resume_epoch(folders[1]) > 0
+    (resumed,), _ = _fit("ksnn", {}, [1], settings, FitContext([folders[1]]))
+    assert np.array_equal(_weights(whole), _weights(resumed))
+
+
+def test_damaged_checkpoint_starts_anew(tmp_path: Path):
+    settings = SupervisedSettings(max_epochs=4)
+    _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=_StopAfter(20)))
+    file = tmp_path / "checkpoint.safetensors"
+    file.write_bytes(file.read_bytes()[:100])
+    assert resume_epoch(tmp_path) == 0
+    (resumed,), _ = _fit("ksnn", {}, [0], settings, FitContext([tmp_path]))
+    (whole,), _ = _fit("ksnn", {}, [0], settings)
+    assert np.array_equal(_weights(whole), _weights(resumed))
+
+
+def test_diverging_training_is_one_clear_error():
+    with pytest.raises(DataError, match=r"lower training\.learning_rate"):
+        _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
+
+
+def test_ksnn_learns_exact_kinematics_better_than_a_zero_estimate():
+    settings = SupervisedSettings(max_epochs=25)
+    data = FitData([planar_drive(120.0, seed=1)], [planar_drive(40.0, seed=2)])
+    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], settings, data=data)
+    test = planar_drive(40.0, seed=3)
+    estimate = member.estimate([test.without_references()])[0]
+    known = ~np.isnan(estimate["vy"])
+    error = (estimate["vy"] - test["vy_ref"])[known]
+    assert np.var(error) < 0.3 * np.var(test["vy_ref"][known])
+
+
+def test_direct_search_finds_the_minimum_that_a_fine_grid_finds():
+    def cost(p):
+        return float((p[0] - 7.0) ** 2 + 30 * abs(p[1] - 0.11) + 5 * np.sin(3 * p[0]) ** 2)
+
+    record = nelder_mead_over_grid(cost, [(0, 50), (0, 0.5)], [(3, 20), (0, 0.3)], DirectSearchSettings(), FitContext())
+    grid = optimize.brute(cost, ((0, 50), (0, 0.5)), Ns=401, finish=optimize.fmin)
+    assert record.cost <= cost(grid) + 1e-6
+    assert len(record.starts) == 16
+
+
+def test_direct_search_stays_in_its_box():
+    record = nelder_mead_over_grid(
+        lambda p: float(-p.sum()), [(0, 2), (0, 1)], [(0.5, 1), (0.1, 0.5)], DirectSearchSettings(), FitContext()
+    )
+    assert np.allclose(record.best, [2, 1], atol=1e-3)
+    assert (record.best <= [2, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"learning_rate": -1.0}, "learning_rate must be positive"),
+        ({"batch_size": 0}, "batch_size must be at least 1"),
+        ({"patience": "soon"}, "patience must be a whole number"),
+        ({"dtype": "float16"}, "dtype 'float16' is not one of"),
+        ({"momentum": 0.9}, "momentum is not an option"),
+        ({"compiled": "yes"}, "compiled must be true or false"),
+    ],
+)
+def test_training_settings_that_make_no_sense_are_refused(config, message):
+    with pytest.raises(ConfigurationError, match=message):
+        settings_from_config(SupervisedSettings, config, "training")
+
+
+def test_training_leaves_the_global_random_state_alone():
+    torch.manual_seed(0)
+    before = torch.random.get_rng_state()
+    _fit("gru", {"n_states": 2}, [3], SupervisedSettings(max_epochs=1))
+    assert torch.equal(before, torch.random.get_rng_state())

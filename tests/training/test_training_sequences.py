@@ -1,0 +1,270 @@
+"""Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is kept, bad steps are skipped."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.training.checkpoints import load_checkpoint, resume_epoch
+from vehest.training.context import FitContext
+from vehest.training.sequences import Phase, PhaseSettings, train_phases
+
+X = torch.linspace(-2, 2, 48).unsqueeze(1)
+Y = torch.sin(2 * X)
+
+
+def _network() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(1, 8), nn.Tanh(), nn.Linear(8, 1))
+
+
+def _phase(network: nn.Module, name: str = "fit", trainable=None, loss=None, validation=None, **settings) -> Phase:
+    def batches(generator):
+        for rows in torch.randperm(len(X), generator=generator).split(16):
+            yield X[rows], Y[rows] + 0.1 * torch.randn(len(rows), 1, generator=generator)
+
+    def squared(batch):
+        return (network(batch[0]) - batch[1]).square().mean()
+
+    def judge():
+        return float((network(X) - Y).square().mean())
+
+    defaults = {"learning_rate": 1e-2, "max_epochs": 12}
+    return Phase(name, PhaseSettings(**{**defaults, **settings}), network, batches, loss or squared, validation or judge, trainable)
+
+
+def _two_phases(network: nn.Module) -> list[Phase]:
+    """The read-out first, then all together from a wrapper that shares its parameters."""
+    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2)
+    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=6, schedule="cosine")]
+
+
+class _StopAfter:
+    """Asks to stop after so many questions."""
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    def __call__(self) -> bool:
+        self.left -= 1
+        return self.left < 0
+
+
+def _flat(network: nn.Module) -> torch.Tensor:
+    return torch.cat([value.detach().reshape(-1) for value in network.parameters()])
+
+
+def _without_times(records):
+    return [repr({**vars(record), "seconds": 0.0}) for record in records]
+
+
+@pytest.mark.parametrize("often", [0.0, 1e9], ids=["checkpoint after every epoch", "checkpoint when stopped"])
+def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_path: Path, often: float) -> None:
+    whole = _network()
+    records = train_phases(_two_phases(whole), 3, FitContext())
+    assert [record.name for record in records] == ["read-out", "all"]
+    stops, interrupted = 0, True
+    while interrupted:  # each run gets eight questions further, in a fresh network as in a fresh process
+        resumed = _network()
+        context = FitContext([tmp_path], should_stop=_StopAfter(8))
+        again = train_phases(_two_phases(resumed), 3, context, checkpoint_seconds=often)
+        interrupted, stops = again[-1].interrupted, stops + 1
+    assert stops > 5
+    assert torch.equal(_flat(whole), _flat(resumed))
+    assert _without_times(again) == _without_times(records)
+
+
+def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_path: Path) -> None:
+    whole = _network()
+    train_phases(_two_phases(whole), 3, FitContext())
+    killed, left = _network(), 11
+
+    def die(progress) -> None:
+        nonlocal left
+        left -= 1
+        if not left:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_phases(_two_phases(killed), 3, FitContext([tmp_path], on_progress=die), checkpoint_seconds=0.0)
+    assert resume_epoch(tmp_path) == 10, "in the second phase"
+    resumed = _network()
+    train_phases(_two_phases(resumed), 3, FitContext([tmp_path]))
+    assert torch.equal(_flat(whole), _flat(resumed))
+
+
+def test_finished_training_is_not_done_again(tmp_path: Path) -> None:
+    one, other = _network(), _network()
+    records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
+    assert resume_epoch(tmp_path) == -1
+    asked = []
+    assert _without_times(train_phases(_two_phases(other), 3, FitContext([tmp_path], on_progress=asked.append))) == _without_times(records)
+    assert not asked
+    assert torch.equal(_flat(one), _flat(other))
+
+
+def test_members_keep_checkpoints_of_their_own_and_draw_other_batches(tmp_path: Path) -> None:
+    folders = [tmp_path / "0", tmp_path / "1"]
+    networks = [_network(), _network()]
+    for index, network in enumerate(networks):
+        train_phases([_phase(network)], index, FitContext(folders), folder_index=index)
+    assert [resume_epoch(folder) for folder in folders] == [-1, -1]
+    assert not torch.allclose(_flat(networks[0]), _flat(networks[1]))
+
+
+def test_checkpoint_of_another_network_starts_anew(tmp_path: Path) -> None:
+    train_phases([_phase(_network())], 0, FitContext([tmp_path], should_stop=_StopAfter(9)))
+    assert resume_epoch(tmp_path) > 0
+    other = nn.Linear(1, 1)
+    (record,) = train_phases([_phase(other)], 0, FitContext([tmp_path]))
+    assert record.epochs == 12
+
+
+def test_frozen_parameters_stay_and_learn_again_afterwards() -> None:
+    network = _network()
+    before = {name: value.detach().clone() for name, value in network.named_parameters()}
+    asked = {}
+
+    def loss(batch):
+        asked.update({name: value.requires_grad for name, value in network.named_parameters()})
+        return (network(batch[0]) - batch[1]).square().mean()
+
+    phase = _phase(network, trainable=lambda name: name.startswith("2."), loss=loss, weight_decay=0.1)
+    train_phases([phase], 0, FitContext())
+    assert asked == {"0.weight": False, "0.bias": False, "2.weight": True, "2.bias": True}
+    for name, value in network.named_parameters():
+        assert torch.equal(value, before[name]) == name.startswith("0."), name
+        assert value.requires_grad
+
+
+def test_best_validation_is_kept_and_the_start_is_a_candidate() -> None:
+    network, seen = _network(), []
+    losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
+
+    def validation() -> float:
+        seen.append(_flat(network))
+        return next(losses)
+
+    (record,) = train_phases([_phase(network, validation=validation, max_epochs=5)], 0, FitContext())
+    assert (record.start_loss, record.best_epoch, record.best_loss) == (5.0, 2, 2.0)
+    assert torch.equal(_flat(network), seen[2])
+    start = _flat(network)
+    (record,) = train_phases([_phase(network, validation=lambda: 1.0, patience=3)], 0, FitContext())
+    assert (record.best_epoch, record.epochs) == (0, 3), "no better than the start, and out of patience"
+    assert torch.equal(_flat(network), start)
+
+
+def test_validation_every_third_epoch_and_after_the_last() -> None:
+    (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
+    assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
+
+
+def test_gradients_are_clipped_element_by_element() -> None:
+    """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
+    line = nn.Linear(2, 1, bias=False)
+    gradient = torch.tensor([[50.0, 0.5]])
+    phase = Phase("clip", PhaseSettings(clip=3.0, max_epochs=1), line, lambda _: [0], lambda _: (line.weight * gradient).sum(), lambda: 0.0)
+    seen = []
+    step = torch.optim.AdamW.step
+
+    def watched(self, *arguments):
+        seen.append(line.weight.grad.clone())
+        return step(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", watched)
+        train_phases([phase], 0, FitContext())
+    assert torch.equal(seen[0], torch.tensor([[3.0, 0.5]]))
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_step_that_is_not_finite_is_skipped_and_counted(where: str) -> None:
+    network, calls, held = _network(), 0, []
+
+    def loss(batch):
+        nonlocal calls
+        calls += 1
+        held.append(_flat(network))
+        good = (network(batch[0]) - batch[1]).square().mean()
+        if calls != 2:
+            return good
+        return good * math.nan if where == "loss" else good + torch.sqrt(network[2].bias.sum() * 0.0)
+
+    (record,) = train_phases([_phase(network, loss=loss, max_epochs=1)], 0, FitContext())
+    assert record.skipped_steps == 1
+    assert not torch.equal(held[0], held[1])
+    assert torch.equal(held[1], held[2]), "the second step changed nothing"
+    assert math.isfinite(record.train_loss[0])
+
+
+def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error() -> None:
+    network = _network()
+    phase = _phase(network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf)
+    with pytest.raises(DataError, match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate"):
+        train_phases([phase], 0, FitContext())
+
+
+def test_bad_steps_with_good_ones_between_them_end_nothing() -> None:
+    network, calls = _network(), 0
+
+    def loss(batch):
+        nonlocal calls
+        calls += 1
+        return (network(batch[0]) - batch[1]).square().mean() * (1.0 if calls % 3 == 0 else math.nan)
+
+    (record,) = train_phases([_phase(network, loss=loss)], 0, FitContext())
+    assert record.skipped_steps == 24, "two of three in twelve epochs"
+
+
+def test_phase_without_a_finite_validation_is_an_error() -> None:
+    with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
+        train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())
+
+
+def test_cosine_schedule_falls_from_the_full_step_size_to_zero() -> None:
+    rates = []
+    step = torch.optim.AdamW.step
+
+    def watched(self, *arguments):
+        rates.append(self.param_groups[0]["lr"])
+        return step(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", watched)
+        train_phases([_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")], 0, FitContext())
+    expected = [0.1 * (1 + math.cos(math.pi * epoch / 4)) for epoch in range(4) for _ in range(3)]
+    assert rates == pytest.approx(expected)
+
+
+def test_stop_leaves_the_best_so_far_and_says_so(tmp_path: Path) -> None:
+    network = _network()
+    records = train_phases([_phase(network)], 0, FitContext([tmp_path], should_stop=_StopAfter(15)))
+    assert records[-1].interrupted
+    assert records[-1].epochs == 4
+    checkpoint = load_checkpoint(tmp_path)
+    assert checkpoint is not None
+    assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
+    assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
+
+
+def test_progress_counts_epochs_over_all_phases() -> None:
+    told = []
+    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
+    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
+    assert told[0].max_epochs == 19
+
+
+def test_phases_that_make_no_sense_are_refused() -> None:
+    network = _network()
+    with pytest.raises(ConfigurationError, match="different names"):
+        train_phases([_phase(network), _phase(network)], 0, FitContext())
+    with pytest.raises(ConfigurationError, match="no parameters to learn"):
+        train_phases([_phase(network, trainable=lambda name: False)], 0, FitContext())
+    for settings in ({"learning_rate": 0.0}, {"validate_every": 0}, {"clip": -1.0}, {"schedule": "linear"}):
+        with pytest.raises(ConfigurationError, match=next(iter(settings))):
+            PhaseSettings(**settings)  # type: ignore[arg-type]

@@ -1,0 +1,139 @@
+"""Dugoff's tyres and the single track on them: readable, compiled and through the filter the same, gradients finite at a slip of zero."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from dugoff_drive import FRONT, dugoff_track
+from vehest.estimators.filtering.track_filter import TrackFilter
+from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
+from vehest.evaluation.observability import observability_along
+from vehest.filters.unscented_scan import TorchModel
+from vehest.vehicle.dugoff import LoadedCar
+
+BOTH = pytest.mark.parametrize("tyres", ["plain", "smooth"])
+LOAD, SPEED = torch.tensor(9000.0, dtype=torch.float64), torch.tensor(25.0, dtype=torch.float64)
+
+
+def drawn(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def driven(count: int) -> tuple[Tensor, Tensor]:
+    """Points from straight ahead to a spin, and inputs from a standstill to fast."""
+    points = drawn(count, 5, 2) * torch.tensor([3.0, 1.0])
+    inputs = torch.stack([40.0 * torch.rand(count, dtype=torch.float64), 0.2 * drawn(count, seed=1), 4.0 * drawn(count, seed=2)], -1)
+    points[0], inputs[0, 1] = 0.0, 0.0
+    return points, inputs
+
+
+def force(tangent: Tensor, tyres: str) -> Tensor:
+    return FRONT.force(tangent, LOAD, SPEED, tyres)  # type: ignore[arg-type]
+
+
+def test_tyres_are_those_of_the_paper():
+    """Eqs. 9 and 10 at κ = 0, digit by digit."""
+    for tangent in (0.02, 0.05, 0.2, -0.1):
+        friction = FRONT.friction * (1.0 - FRONT.reduction * 25.0 * abs(tangent))
+        ratio = friction * 9000.0 / (2.0 * FRONT.cornering_stiffness * abs(tangent))
+        plain = ratio * (2.0 - ratio) if ratio <= 1.0 else 1.0
+        smooth = 2.0 / (np.exp(-4.0 * ratio) + 1.0) - 1.0
+        for tyres, used in (("plain", plain), ("smooth", smooth)):
+            expected = FRONT.cornering_stiffness * tangent * used
+            assert float(force(torch.tensor(tangent, dtype=torch.float64), tyres)) == pytest.approx(expected, rel=1e-12)
+
+
+@BOTH
+def test_the_gradient_at_a_slip_of_zero_is_the_cornering_stiffness(tyres):
+    slip = torch.tensor([0.0, 1e-12, -1e-12, 1e-4], dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(force(slip, tyres).sum(), slip)
+    torch.testing.assert_close(slope, torch.full_like(slope, FRONT.cornering_stiffness))
+
+
+@BOTH
+def test_the_gradient_is_that_of_finite_differences(tyres):
+    slip = torch.linspace(-0.3, 0.3, 61, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(force(slip, tyres).sum(), slip)
+    with torch.no_grad():
+        differences = (force(slip + 1e-6, tyres) - force(slip - 1e-6, tyres)) / 2e-6
+    torch.testing.assert_close(slope, differences, rtol=1e-6, atol=1.0)
+
+
+def test_braking_loads_the_front_axle():
+    front, rear = LoadedCar().loads(torch.tensor([0.0, -5.0]))
+    assert torch.allclose(front + rear, torch.tensor(1970.0 * 9.81))
+    assert front[1] - front[0] == pytest.approx(1970.0 * 5.0 * 0.52 / 2.88, rel=1e-5)
+
+
+@BOTH
+def test_the_compiled_track_is_the_readable_one(tyres):
+    track = dugoff_track(tyres, sees_sideslip=True)
+    readable, compiled = TorchModel(track.transition, track.observation), CompiledDugoffTrack(track)
+    points, inputs = (part.numpy() for part in driven(300))
+    for name, size in (("transition", 2), ("observation", 5)):
+        expected, found = (getattr(model, name)(points, inputs) for model in (readable, compiled))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+        upstream = drawn(300, 5, size, seed=3).numpy()
+        expected, found = (getattr(model, f"{name}_adjoint")(points, inputs, upstream, []) for model in (readable, compiled))
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_gradients_through_the_filter_reach_measurements_and_both_noises():
+    """Of compiled code, of automatic differentiation through readable code, and of finite differences."""
+    track = dugoff_track("smooth", sees_sideslip=True)
+    inputs = torch.stack([torch.tensor([[20.0], [2.0], [28.0]]).expand(3, 8), 0.05 * torch.ones(3, 8), torch.zeros(3, 8)], -1).double()
+    inputs[1, 4:, 0] = 8.0  # rolls, then drives
+    sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
+    given = [
+        (torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(3, 8, 5) * sizes),
+        (torch.tensor([0.05, 0.02]) * (1.0 + 0.3 * drawn(3, 8, 2, seed=4).abs())),
+        (sizes * (1.0 + 0.3 * drawn(3, 8, 5, seed=5).abs())),
+    ]
+    given[0][0, 3, 2] = torch.nan
+    weights = drawn(3, 8, 2, seed=6)
+
+    def outcome(parts: list[Tensor], *, compiled: bool = True) -> Tensor:
+        measurements, process, sensors = parts
+        noises = (torch.diag_embed(part.square()) for part in (process, sensors))
+        filtered = TrackFilter(track, compiled=compiled).filtered(measurements, inputs, *noises)
+        return (filtered.steps.filtered.mean * weights).sum()
+
+    def gradients(*, compiled: bool) -> list[Tensor]:
+        leaves = [part.clone().requires_grad_() for part in given]
+        return list(torch.autograd.grad(outcome(leaves, compiled=compiled), leaves))
+
+    for found, expected, size in zip(gradients(compiled=True), gradients(compiled=False), (sizes, 0.1, sizes), strict=True):
+        assert torch.isfinite(found).all()
+        scale = float((expected * size).abs().max())
+        torch.testing.assert_close(found * size, expected * size, rtol=0.0, atol=1e-8 * scale)
+    found = gradients(compiled=True)
+    for part, at in ((0, (0, 5, 4)), (0, (2, 2, 3)), (1, (0, 4, 0)), (1, (2, 1, 1)), (2, (2, 3, 2)), (2, (0, 6, 4))):
+        step = 1e-5 * float(given[part][at])
+        moved = []
+        for sign in (1.0, -1.0):
+            parts = [own.clone() for own in given]
+            parts[part][at] += sign * step
+            moved.append(float(outcome(parts)))
+        assert float(found[part][at]) == pytest.approx((moved[0] - moved[1]) / (2.0 * step), rel=1e-4, abs=1e-9)
+
+
+@pytest.mark.parametrize("seen", [[0, 1, 2, 3], [0, 1], [1]], ids=["all", "without forces", "yaw rate alone"])
+def test_the_state_is_observable_while_the_car_moves(seen):
+    """Section III-B, over two samples. The paper excludes δ = 0; this model is observable there too, since forces change with the state."""
+    track = dugoff_track("smooth")
+    states = np.array([[0.0, 0.0], [0.0, 0.0], [0.5, 0.3], [-1.0, 0.6], [4.0, -0.2]])
+    noise = np.array([0.06, 0.002, 100.0, 100.0])[seen]
+    for steer in (0.0, 0.08):
+        inputs = np.tile([20.0, steer, 0.0], (len(states), 1))
+        along = observability_along(
+            track.transition, lambda x, u: track.observation(x, u)[seen], states, inputs, sizes=np.array([1.0, 0.3]), noise=noise, steps=2
+        )
+        assert (along.rank == 2).all()
+    blind = observability_along(
+        track.transition, lambda x, u: 0.0 * x[:1], states, inputs, sizes=np.array([1.0, 0.3]), noise=np.ones(1), steps=2
+    )
+    assert (blind.rank == 0).all()

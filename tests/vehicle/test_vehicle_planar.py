@@ -1,0 +1,164 @@
+"""The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear single track."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from vehest.constants import GRAVITY
+from vehest.vehicle.integration import rk4
+from vehest.vehicle.parameters import SingleTrackParameters
+from vehest.vehicle.planar import F1TENTH, F1TENTH_START, PlanarCar
+from vehest.vehicle.positive import PositiveParameters
+from vehest.vehicle.single_track import lateral_acceleration, lateral_dynamics
+from vehest.vehicle.tyres import PacejkaTyres, TyreForces, magic_formula
+
+TYRES = {"friction": 0.8916, "B_x": 2.8, "C_x": 1.2, "D_x": 1.0}
+TYRES |= {f"{name}_{axle}": value for axle in ("front", "rear") for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))}
+
+
+@pytest.fixture
+def car() -> tuple[PlanarCar, PacejkaTyres]:
+    return PlanarCar().double().requires_grad_(False), PacejkaTyres(TYRES).double().requires_grad_(False)
+
+
+def rates(car, state: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+    chassis, tyres = car
+    return chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads())).rates
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_runge_kutta_is_an_independent_integrator(car):
+    """Over 10 ms from a drifting state; and its error falls with the fourth power of the step."""
+    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    known = solve_ivp(lambda _, x: rates(car, torch.from_numpy(x), inputs).numpy(), (0.0, 0.01), state.numpy(), rtol=1e-12, atol=1e-13)
+    errors = []
+    for steps in (1, 2):
+        own = state
+        for _ in range(steps):
+            own = rk4(lambda x, u: rates(car, x, u), own, inputs, 0.01 / steps)
+        errors.append(float((own - torch.from_numpy(known.y[:, -1])).abs().max()))
+    assert errors[0] < 1e-6
+    assert 10.0 < errors[0] / errors[1] < 24.0
+
+
+def test_a_car_that_rolls_straight_feels_drag_and_losses_alone(car):
+    state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
+    own = rates(car, state, inputs)
+    drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
+    assert float(own[0]) == pytest.approx(-drag / F1TENTH.mass)
+    assert own[1:3].abs().max() < 1e-12
+    assert float(own[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
+
+
+def test_mirrored_drives_give_mirrored_rates(car):
+    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    mirror = tensor(1.0, -1.0, -1.0, 1.0)
+    assert torch.allclose(rates(car, mirror * state, tensor(-0.2, 8.0)), mirror * rates(car, state, inputs), atol=1e-12)
+
+
+def test_accelerations_are_what_an_accelerometer_reads(car):
+    """ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1)."""
+    chassis, tyres = car
+    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+    assert float(own.ax) == pytest.approx(float(own.rates[0] - 2.5 * -0.6))
+    assert float(own.ay) == pytest.approx(float(own.rates[1] + 2.5 * 3.0))
+
+
+def test_loads_carry_the_weight_and_balance(car):
+    front, rear = car[0].loads()
+    assert float(front + rear) == pytest.approx(F1TENTH.mass * GRAVITY)
+    assert float(front * (F1TENTH.wheelbase - 0.115)) == pytest.approx(float(rear * 0.115))
+
+
+def test_for_small_slips_it_is_the_linear_single_track(car):
+    chassis, tyres = car
+    front, rear = (float(load) * 0.8916 * 0.8095 * 5.948 * 2.2754 for load in chassis.loads())
+    linear = SingleTrackParameters(F1TENTH.mass, 0.46, F1TENTH.wheelbase - 0.115, 0.115, front, rear)
+    speed, sideslip, yaw_rate, steer = 4.0, 2e-4, 3e-3, 1e-3
+    state, inputs = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed), tensor(steer, 0.0)
+    own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
+    dynamics, acceleration = lateral_dynamics(linear, tensor(speed)), lateral_acceleration(linear, tensor(speed))
+    x = tensor(sideslip, yaw_rate)
+    expected = (dynamics.A[0] @ x + dynamics.B[0] * steer).numpy()
+    assert float(own.rates[2]) == pytest.approx(expected[1], rel=1e-3)
+    assert float(own.ay) == pytest.approx(float(acceleration.C[0] @ x + acceleration.D[0] * steer), rel=1e-3)
+    assert float(own.rates[1]) / speed == pytest.approx(expected[0], rel=1e-3)
+
+
+def test_the_magic_formula_has_its_slope_its_peak_and_its_curvature():
+    stiffness, shape = tensor(5.948), tensor(2.2754)
+    slip = torch.linspace(-0.6, 0.6, 2001, dtype=torch.float64)
+    curve = magic_formula(slip, stiffness, shape)
+    assert float(magic_formula(tensor(1e-6), stiffness, shape)) == pytest.approx(1e-6 * 5.948 * 2.2754, rel=1e-6)
+    peak = math.tan(math.pi / (2.0 * 2.2754)) / 5.948
+    assert float(magic_formula(tensor(peak), stiffness, shape)) == pytest.approx(1.0, abs=1e-12)
+    assert float(curve.max()) <= 1.0
+    assert torch.allclose(curve, -curve.flip(0), atol=1e-15)
+    flatter = magic_formula(slip, stiffness, shape, -2.0)
+    by_hand = np.sin(2.2754 * np.arctan(5.948 * 0.3 + 2.0 * (5.948 * 0.3 - np.arctan(5.948 * 0.3))))
+    assert float(flatter[1500]) == pytest.approx(by_hand)
+
+
+def test_forces_oppose_sliding_and_scale_with_friction_and_load(car):
+    chassis, tyres = car
+    slips = chassis.slips(tensor(3.0, 0.5, 0.0, 3.5), tensor(0.0, 0.0))
+    own = tyres(slips, chassis.loads())
+    assert float(own.front_y) < 0.0
+    assert float(own.rear_y) < 0.0
+    assert float(own.front_x) > 0.0, "wheels that turn faster than the car rolls push it"
+    half = tyres(slips, tuple(0.5 * load for load in chassis.loads()), tensor(2.0 * 0.8916)[0])
+    for one, other in zip(own, half, strict=True):
+        assert float(other) == pytest.approx(float(one))
+
+
+def test_curvature_is_learnt_only_where_it_is_asked_for():
+    plain, curved = PacejkaTyres(TYRES), PacejkaTyres(TYRES, with_curvature=True)
+    assert sum(p.numel() for p in curved.parameters()) - sum(p.numel() for p in plain.parameters()) == 3
+    chassis = PlanarCar()
+    slips = chassis.slips(torch.tensor([3.0, 0.5, 1.0, 3.5]), torch.tensor([0.1, 0.0]))
+    for one, other in zip(plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True):
+        assert one.item() == pytest.approx(other.item(), rel=1e-5)
+
+
+def test_gradients_reach_every_parameter_and_batches_work(car):
+    chassis, tyres = (module.requires_grad_() for module in car)
+    state = tensor(3.0, -0.6, 2.5, 3.4).repeat(2, 3, 1)
+    inputs = tensor(0.2, 8.0).repeat(2, 3, 1)
+    outcome = rk4(lambda x, u: rates(car, x, u), state, inputs, 0.01)
+    assert outcome.shape == (2, 3, 4)
+    outcome.square().sum().backward()
+    for parameter in (*chassis.parameters(), *tyres.parameters()):
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()
+    assert all(chassis.learnt.get_parameter(f"log_{name}").grad.abs() > 0 for name in F1TENTH_START)
+
+
+def test_positive_parameters_stay_positive_and_may_be_fixed():
+    own = PositiveParameters({"mass": 5.1, "inertia": 0.46}, frozenset({"mass"}))
+    assert [name for name, _ in own.named_parameters()] == ["log_inertia"]
+    with torch.no_grad():
+        own.get_parameter("log_inertia").sub_(20.0)
+    assert 0.0 < own["inertia"].item() < 1e-8
+    assert own["mass"].item() == pytest.approx(5.1)
+    for wrong in ({"mass": 0.0}, {"mass": math.nan}):
+        with pytest.raises(ValueError, match="mass must be positive"):
+            PositiveParameters(wrong)
+    with pytest.raises(ValueError, match="no parameter 'x'"):
+        PositiveParameters({"mass": 1.0}, frozenset({"x"}))
+
+
+def test_forces_of_no_tyre_leave_the_car_to_its_inertia():
+    chassis = PlanarCar().double().requires_grad_(False)
+    none = TyreForces(*(tensor(0.0)[0],) * 4)
+    own = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
+    drag = 0.1 + 0.01 * 3.0 + 0.1 * 9.0
+    assert own.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
