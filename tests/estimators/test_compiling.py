@@ -1,12 +1,17 @@
-"""Compilation that keeps a first training waiting is said beforehand, once."""
+"""Compilation that keeps a first training waiting is said beforehand, once, and what it compiles has the digits of every later run."""
 
 from __future__ import annotations
 
+import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+import vehest
 from vehest.estimators.kernels import planar_car
 from vehest.stages.compiling import has_to_compile
 
@@ -17,3 +22,26 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, 
     assert not has_to_compile("luenberger")
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
     assert not has_to_compile("learned_ukf")
+
+
+@pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
+def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path: Path, kernels: str) -> None:
+    here = Path(__file__).parent
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])}
+    command = [sys.executable, str(here / "digits.py"), kernels]
+    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2))
+    assert list(tmp_path.rglob("*.nbc"))
+    assert first == second
+
+
+def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only() -> None:
+    """`fastmath` outside `kernels.compiling` would bring back a first run with digits of its own."""
+    source = Path(vehest.__file__).parent
+    decorated = [
+        f"{path.relative_to(source)}:{call.lineno}"
+        for path in source.rglob("*.py")
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("numba.njit", "njit", "numba.jit")
+        if any(keyword.arg == "fastmath" for keyword in call.keywords)
+    ]
+    assert decorated == []

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from torch import Tensor
 
 from vehest.estimators.kernels import lanes
 from vehest.estimators.kernels.activation import sigmoid, tanh
-from vehest.estimators.kernels.lanes import affine, outer
+from vehest.estimators.kernels.compiling import entry, part
+from vehest.estimators.kernels.lanes import affine, copy_rows, outer
 
 TRACE_ROWS = 5  # reset, update, candidate, U_n h, and the state before the step
 
@@ -18,28 +18,28 @@ def last_state(input_weight: Tensor, state_weight: Tensor, bias: Tensor, prepare
     return lanes.last_state(_forward, _backward, TRACE_ROWS, input_weight, state_weight, bias, prepared, starts, n_window)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@entry(fastmath=True)
 def _forward(input_weight, state_weight, bias, inputs, trace, states):  # type: ignore[no-untyped-def]
     for m in range(inputs.shape[0]):
         for block in range(inputs.shape[1]):
             kept = trace[min(m, trace.shape[0] - 1), min(block, trace.shape[1] - 1)]
-            states[m, block] = _forward_block(input_weight[m], state_weight[m], bias[m], inputs[m, block], kept)
+            _forward_block(input_weight[m], state_weight[m], bias[m], inputs[m, block], kept, states[m, block])
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@entry(fastmath=True)
 def _backward(input_weight, state_weight, inputs, trace, adjoint, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
     for m in range(inputs.shape[0]):
         for block in range(inputs.shape[1]):
             _backward_block(state_weight[m], inputs[m, block], trace[m, block], adjoint[m, block], to_input[m], to_state[m], to_bias[m])
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
-def _forward_block(input_weight, state_weight, bias, inputs, trace):  # type: ignore[no-untyped-def]
+@part(fastmath=True)
+def _forward_block(input_weight, state_weight, bias, inputs, trace, state):  # type: ignore[no-untyped-def]
     n_states, n_lanes = bias.shape[1], inputs.shape[2]
-    state = np.zeros((n_states, n_lanes), bias.dtype)
+    state[:] = 0
     for k in range(inputs.shape[0]):
         gate, before = trace[k], trace[k, 4 * n_states :]
-        before[:] = state
+        copy_rows(state, before)
         for i in range(n_states):
             reset, update, candidate, recurrent = gate[i], gate[n_states + i], gate[2 * n_states + i], gate[3 * n_states + i]
             reset[:], update[:], candidate[:], recurrent[:] = bias[0, i], bias[1, i], bias[2, i], bias[0, i] * 0
@@ -54,10 +54,9 @@ def _forward_block(input_weight, state_weight, bias, inputs, trace):  # type: ig
                 update[lane] = sigmoid(update[lane])
                 candidate[lane] = tanh(candidate[lane] + reset[lane] * recurrent[lane])
                 state[i, lane] = candidate[lane] + update[lane] * (before[i, lane] - candidate[lane])
-    return state
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")
+@part(fastmath=True)
 def _backward_block(state_weight, inputs, trace, adjoint, to_input, to_state, to_bias):  # type: ignore[no-untyped-def]
     n_states, n_lanes = adjoint.shape
     one = adjoint.dtype.type(1)

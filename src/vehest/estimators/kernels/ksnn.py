@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from vehest.estimators.kernels.activation import tanh
+from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.threads import over_members
 
 LANES = 64
@@ -76,7 +76,7 @@ class _Predict(torch.autograd.Function):
         return torch.from_numpy(gradient), None, None, None, None, None, None
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@entry(fastmath=True, nogil=True)
 def _weighted_sum(jacobian, weights, gradient):  # type: ignore[no-untyped-def]
     members, blocks, n_local, width = jacobian.shape
     row = np.empty(LANES, weights.dtype)
@@ -85,7 +85,8 @@ def _weighted_sum(jacobian, weights, gradient):  # type: ignore[no-untyped-def]
         for block in range(blocks):
             used = min(LANES, weights.shape[1] - block * LANES)
             row[:] = 0  # lanes without a window count for nothing
-            row[:used] = weights[m, block * LANES : block * LANES + used]
+            for lane in range(used):
+                row[lane] = weights[m, block * LANES + lane]
             for p in range(n_local):
                 for c in range(width // LANES):
                     derivative = jacobian[m, block, p, c * LANES : (c + 1) * LANES]
@@ -95,7 +96,7 @@ def _weighted_sum(jacobian, weights, gradient):  # type: ignore[no-untyped-def]
                     gradient[m, p, c] += total
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@entry(fastmath=True, nogil=True)
 def _recursion(theta, series, starts, yaw_rate_max, step, n_hidden, n_window, values, jacobian):  # type: ignore[no-untyped-def]
     members, n_local = theta.shape[:2]
     dtype = theta.dtype
@@ -115,7 +116,8 @@ def _recursion(theta, series, starts, yaw_rate_max, step, n_hidden, n_window, va
                 at = k if wanted else 0
                 _gather(series, first, k, steps[at], step)
                 _forward(theta[m], per_width, step, n_hidden, steps[at], neurons[at], scratch, state)
-            values[m, block * LANES : (block + 1) * LANES] = state[:LANES]
+            for lane in range(LANES):
+                values[m, block * LANES + lane] = state[lane]
             if wanted:
                 jacobian[m, block] = 0
                 state[:LANES], state[LANES:] = 1, 0  # derivatives of the prediction by v and û after the last step
@@ -123,7 +125,7 @@ def _recursion(theta, series, starts, yaw_rate_max, step, n_hidden, n_window, va
                     _backward(theta[m], step, n_hidden, steps[k], neurons[k], scratch, state, jacobian[m, block])
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@part(fastmath=True, nogil=True)
 def _gather(series, first, k, now, step):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         t = first[lane] + k
@@ -133,7 +135,7 @@ def _gather(series, first, k, now, step):  # type: ignore[no-untyped-def]
         now[THRUST + lane] = step * series[t, 3]
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@part(fastmath=True, nogil=True)
 def _forward(theta, per_width, step, n_hidden, now, neurons, scratch, state):  # type: ignore[no-untyped-def]
     """One step of all lanes; ``state`` holds v and û."""
     n_local = theta.shape[0]
@@ -182,7 +184,7 @@ def _forward(theta, per_width, step, n_hidden, now, neurons, scratch, state):  #
         state[LANES + lane] = now[LANES + lane] * now[U + lane] + now[3 * LANES + lane] * now[THRUST + lane] - now[F2 + lane]
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@part(fastmath=True, nogil=True)
 def _choose(theta, side, column, now, neuron, offset):  # type: ignore[no-untyped-def]
     """w₂, b₂, w₃ of one neuron of the lanes' first (side 0) or second (side 1) active model."""
     w2, b2, w3 = theta[side, column], theta[side, column + 1], theta[side, column + 2]
@@ -198,7 +200,7 @@ def _choose(theta, side, column, now, neuron, offset):  # type: ignore[no-untype
             neuron[LANES + lane] = w3 if here else neuron[LANES + lane]
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
+@part(fastmath=True, nogil=True)
 def _backward(theta, step, n_hidden, now, neurons, scratch, state, jacobian):  # type: ignore[no-untyped-def]
     """Adjoint of one step; ``state`` holds the derivatives by v and û, ``jacobian`` (P, parameters · lanes) adds up those by parameters."""
     n_local = theta.shape[0]

@@ -125,6 +125,14 @@ def _gather(series, starts, inputs):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
+def copy_rows(rows, out):  # type: ignore[no-untyped-def]
+    """The first rows of ``out`` become ``rows``. An assignment would take longer to compile: it checks shapes and words a message."""
+    for i in range(rows.shape[0]):
+        for lane in range(rows.shape[1]):
+            out[i, lane] = rows[i, lane]
+
+
+@numba.njit(inline="always")
 def affine(out, weight, rows):  # type: ignore[no-untyped-def]
     """out[lane] += Σ_c weight[c] rows[c, lane]."""
     for c in range(weight.shape[0]):

@@ -13,13 +13,14 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import sigmoid, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.compiling import entry, part
+from vehest.estimators.kernels.lanes import copy_rows
 from vehest.filters.unscented_scan import Array, PointModel
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
@@ -27,7 +28,9 @@ from vehest.vehicle.tyres import STILL
 BLOCK = 110  # points at a time
 FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = range(5)
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz", "afn"})
+_FAST = {"nogil": True, "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"}}
+compiled = entry(**_FAST)
+piece = part(**_FAST)
 
 
 class CompiledPlanarCar(PointModel):
@@ -113,7 +116,7 @@ def _kind_of(dynamics: Dynamics) -> int | None:
     return RATES if isinstance(dynamics, NeuralCar) else None
 
 
-@compiled
+@piece
 def _columns(points, inputs, first, end, x, u):  # type: ignore[no-untyped-def]
     """Points of some sequences side by side; rows of u are steering angle, its sine and cosine, and current."""
     count, n = points.shape[1:]
@@ -126,7 +129,7 @@ def _columns(points, inputs, first, end, x, u):  # type: ignore[no-untyped-def]
             u[0, p], u[1, p], u[2, p], u[3, p] = inputs[b, 0], sine, cosine, inputs[b, 1]
 
 
-@compiled
+@piece
 def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
     """Rows back into points of some sequences."""
     count = points.shape[1]
@@ -136,7 +139,7 @@ def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
                 points[b, s, i] = rows[i, (b - first) * count + s]
 
 
-@compiled
+@piece
 def _layer(weight, offset, below, above):  # type: ignore[no-untyped-def]
     np.dot(weight, below, above)
     for i in range(above.shape[0]):
@@ -146,7 +149,7 @@ def _layer(weight, offset, below, above):  # type: ignore[no-untyped-def]
             row[p] += value
 
 
-@compiled
+@piece
 def _squash(rows):  # type: ignore[no-untyped-def]
     for i in range(rows.shape[0]):
         row = rows[i]
@@ -154,7 +157,7 @@ def _squash(rows):  # type: ignore[no-untyped-def]
             row[p] = sigmoid(row[p])
 
 
-@compiled
+@piece
 def _rise(above, below, flat):  # type: ignore[no-untyped-def]
     """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
 
@@ -163,7 +166,7 @@ def _rise(above, below, flat):  # type: ignore[no-untyped-def]
     return above * below if min(above, below) > flat else above * 0
 
 
-@compiled
+@piece
 def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
     W1, b1, W2, b2, W3, b3 = layers
     _layer(W1, b1, f, h1)
@@ -173,7 +176,7 @@ def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
     _layer(W3, b3, h2, o)
 
 
-@compiled
+@piece
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Writes ``f_bar``, and adds to the gradients when learning."""
     W1, _, W2, _, W3, _ = layers
@@ -194,7 +197,7 @@ def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients)
         _add_layer(h1_bar, f, dW1, db1)
 
 
-@compiled
+@piece
 def _add_layer(above_bar, below, dW, db):  # type: ignore[no-untyped-def]
     product = np.empty_like(dW)
     np.dot(above_bar, below.T, product)
@@ -207,7 +210,7 @@ def _add_layer(above_bar, below, dW, db):  # type: ignore[no-untyped-def]
         db[i] += total
 
 
-@compiled
+@piece
 def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
     """Slips (front, rear, ratio), and what the network sees."""
     _, theta, constants, kind = car
@@ -219,21 +222,18 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
         slips[1, p] = math.atan((x[1, p] - lr * x[2, p]) / along)
         slips[2, p] = (x[3, p] - x[0, p]) / along
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
-        for i in range(5):
-            f[i] = x[i]
-        f[5] = u[0]
-        for i in range(3):
-            f[6 + i] = slips[i]
+        copy_rows(x[:5], f)
+        copy_rows(u[:1], f[5:])
+        copy_rows(slips[:3], f[6:])
         if kind == UNSCALED_FORCES:
-            f[9] = u[3]
+            copy_rows(u[3:], f[9:])
     elif kind in (PACEJKA_AND_RATES, RATES):
-        for i in range(4):
-            f[i] = x[i]
-        f[4] = u[0]
-        f[5] = u[3]
+        copy_rows(x[:4], f)
+        copy_rows(u[:1], f[4:])
+        copy_rows(u[3:], f[5:])
 
 
-@compiled
+@piece
 def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
     angle = math.atan(stiffness * slip)
@@ -242,14 +242,14 @@ def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
     return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
 
 
-@compiled
+@piece
 def _loads(theta, constants):  # type: ignore[no-untyped-def]
     """Weight over wheelbase [N/m], and static loads of front and rear axle [N]."""
     weight = constants[0] * constants[8] / constants[1]
     return weight, weight * theta[0], weight * (constants[1] - theta[0])
 
 
-@compiled
+@piece
 def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
@@ -277,7 +277,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
             forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf)[0]
 
 
-@compiled
+@piece
 def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
     """Writes ``o_bar`` and ``slips_bar`` from the gradients of the forces (rows of ``slope``), and adds to the others."""
     _, theta, constants, kind = car
@@ -333,7 +333,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 dtheta[i] += total[i]
 
 
-@compiled
+@piece
 def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
     """Rows of ``out`` are ax, ay, dr/dt, dω/dt."""
     _, theta, constants, _ = car
@@ -352,7 +352,7 @@ def _chassis(x, u, car, forces, out):  # type: ignore[no-untyped-def]
         out[3, p] = radius / powertrain * (torque * current - radius * (front_x + rear_x) - viscous * rim - coulomb * np.sign(rim))
 
 
-@compiled
+@piece
 def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
     """Writes the gradients of the forces, rows of ``slope``, and adds to the others; ``out`` is what `_chassis` wrote."""
     _, theta, constants, _ = car
@@ -397,7 +397,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
         dtheta[8] += d_coulomb
 
 
-@compiled
+@piece
 def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
     """Rows of ``out`` are ax, ay, dr/dt, dω/dt; everything else is kept for the adjoint."""
     layers, _, _, kind = car
@@ -418,7 +418,7 @@ def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
             out[i, p] = plain[i, p] + (o[i, p] if kind == PACEJKA_AND_RATES else 0)
 
 
-@compiled
+@piece
 def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Adds to ``x_bar`` and, when learning, to the gradients of parameters."""
     layers, theta, constants, kind = car
@@ -456,7 +456,7 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
     _slips_adjoint(x, theta[0], constants, slips_bar, x_bar, learning, dtheta)
 
 
-@compiled
+@piece
 def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
     lf, still = constants[1] - lr, constants[6]
     d_lf, d_lr = lr * 0, lr * 0
@@ -477,7 +477,7 @@ def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # typ
         dtheta[0] += d_lr - d_lf
 
 
-@compiled
+@piece
 def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
     for p in range(x.shape[1]):
         rates[0, p] = motion[0, p] + x[1, p] * x[2, p]
@@ -487,7 +487,7 @@ def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
         rates[4, p] = 0
 
 
-@compiled
+@piece
 def _block_of(sequences, count, block):  # type: ignore[no-untyped-def]
     """Sequences in a block, so that blocks are about equal."""
     most = max(block // count, 1)
@@ -495,7 +495,7 @@ def _block_of(sequences, count, block):  # type: ignore[no-untyped-def]
     return (sequences + pieces - 1) // pieces
 
 
-@compiled
+@piece
 def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
     """For what the network sees, slips, both hidden layers, the network's outputs, forces, and rates without what a network adds."""
     W1, _, W2, _, _, _ = car[0]
@@ -510,12 +510,12 @@ def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
     )
 
 
-@compiled
+@piece
 def _four_rooms(columns, car, dtype):  # type: ignore[no-untyped-def]
     return _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype)
 
 
-@compiled
+@piece
 def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
     """The four stages of the Runge-Kutta method."""
     step = car[2][3]
@@ -561,7 +561,8 @@ def _observation(points, inputs, car, block, out):  # type: ignore[no-untyped-de
         x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
         _columns(points, inputs, first, end, x, u)
         _motion(x, u, car, _room(columns, car, points.dtype), expected)
-        expected[2], expected[3] = x[2], x[3]
+        for p in range(columns):
+            expected[2, p], expected[3, p] = x[2, p], x[3, p]
         _put(expected, out, first, end)
 
 
@@ -613,7 +614,8 @@ def _observation_adjoint(points, inputs, car, block, upstream, out, learning, gr
         _motion(x, u, car, room, np.empty((4, columns), points.dtype))
         _columns(upstream, inputs, first, end, up, u)
         x_bar = np.zeros_like(x)
-        x_bar[2], x_bar[3] = up[2], up[3]
-        up[2], up[3] = 0, 0
+        for p in range(columns):
+            x_bar[2, p], x_bar[3, p] = up[2, p], up[3, p]
+            up[2, p], up[3, p] = 0, 0
         _motion_adjoint(x, u, car, room, up, x_bar, learning, gradients)
         _put(x_bar, out, first, end)

@@ -1,0 +1,25 @@
+"""How kernels whose sums may be reordered are compiled: with the same digits on the first run as on every later one.
+
+A compiled function that calls another has a copy of it in its own object, optimised once more for where it stands. The process
+that compiles runs the callee's first version, one that reads the cache runs the copy; where sums may be reordered, their last
+digits differ. So a callee is made part of its callers, and exists nowhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+
+
+def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a function that Python calls, kept in the compile cache; ``options`` as those of ``numba.njit``."""
+    return numba.njit(cache=True, error_model="numpy", **options)  # type: ignore[no-any-return]
+
+
+def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a function that only compiled functions call; ``options`` as those of ``numba.njit``."""
+    return numba.njit(  # type: ignore[no-any-return]
+        forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", **options
+    )
