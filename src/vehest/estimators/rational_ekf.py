@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -35,6 +36,7 @@ CURVES = TYRE_PARAMETERS[:4]
 ASSUMED = {"steer": 0.02, "tyres": 0.003}  # rad √s, 1/√s: where nothing is tuned
 CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
 ROLLING = (0.05, 0.2, 1.0, 2.0)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
+LOST = 1.0  # rad, standard deviation of a sideslip angle of which nothing is known any more
 LARGEST = (1.5, 5.0, 20.0, 100.0)  # the same units: what estimates are kept within
 FRICTION_START = 0.1  # standard deviation of its logarithm
 GIVEN_DEVIATION = 0.1  # of the logarithms of curves that nobody fitted
@@ -106,7 +108,7 @@ class RationalSettings(SingleTrackSettings):
         filter: ``extended`` or ``unscented``.
         bound: factor by which tyre parameters may leave those that the filter started with.
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²]; 0: never, as in the paper. Straight ahead
-            offsets of sensors are all that there is to adapt to. Only of the extended filter.
+            offsets of sensors are all that there is to adapt to.
         noise: levels of noise.
         curves: axle curves.
     """
@@ -129,8 +131,6 @@ class RationalSettings(SingleTrackSettings):
             raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
         if not self.adapt_above >= 0.0:
             raise ConfigurationError(f"estimator.adapt_above must not be negative, not {self.adapt_above}")
-        if self.adapt_above and self.filter == "unscented":
-            raise ConfigurationError("estimator.adapt_above needs estimator.filter=extended; set one of the two back")
         for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
             given = [name for name in names if getattr(getattr(self, group), name) is not None]
             if given and len(given) < len(names):
@@ -425,6 +425,7 @@ class RationalFilter(SingleTrackEstimator):
             -bound,
             bound,
             np.square(ROLLING),
+            LOST**2,
             1.0 / self.settings.rate_hz,
             self.settings.minimum_speed,
             self.settings.adapt_above,
@@ -438,15 +439,31 @@ class RationalFilter(SingleTrackEstimator):
         """The same for the filters of `vehest.filters.nonlinear`; inputs are speed and steering angle."""
         levels = self.levels if levels is None else levels
         track, bound = self.track(), torch.as_tensor(self.bounds())
-        tyres = torch.full((len(self.settings.adapted),), levels["tyres"], dtype=torch.float64)
+        n_tyres = len(self.settings.adapted)
+        tyres = torch.full((n_tyres,), levels["tyres"], dtype=torch.float64)
         noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
+
+        def process_noise(states: Tensor, inputs: Tensor) -> Tensor:
+            moved = states[..., 1] + track.step * states[..., 3]
+            return track.process_noise(states, inputs, levels["steer"], tyres * self._adapts(moved, inputs).unsqueeze(-1))
+
+        def free(states: Tensor, inputs: Tensor) -> Tensor:
+            adapts = self._adapts(states[..., 1], inputs).unsqueeze(-1)
+            return torch.cat([torch.ones_like(states[..., :4], dtype=torch.bool), adapts.expand(*adapts.shape[:-1], n_tyres)], -1)
+
         return NonlinearModel(
             track.transition,
             track.observation,
-            lambda states, inputs: track.process_noise(states, inputs, levels["steer"], tyres),
+            process_noise,
             lambda states, inputs: noise.expand(*states.shape[:-1], 2, 2),
             lambda states: torch.maximum(torch.minimum(states, bound), -bound),
+            self._found_again,
+            free if self._holds else None,
         )
+
+    def _adapts(self, yaw_rate: Tensor, inputs: Tensor) -> Tensor:
+        """Whether the car corners hard enough for its tyres to show."""
+        return (inputs[..., 0] * yaw_rate).abs() >= self.settings.adapt_above
 
     def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredDrive:
         """Stretch by stretch: where the car moves the filter, where it hardly does the rolling car."""
@@ -456,7 +473,9 @@ class RationalFilter(SingleTrackEstimator):
         rule = cubature_rule(n)
         while at < len(samples):
             if slow[at]:
-                state = self._rolled(samples[at], state)
+                state = Gaussian(
+                    *(p.numpy() for p in self._rolled(Gaussian(*map(torch.as_tensor, state)), torch.as_tensor(samples[at, [1, 3]])))
+                )
                 nothing = (np.zeros((1, 2)), np.eye(2)[None], np.zeros((1, 2), np.bool_))
                 _write(out, slice(at, at + 1), state.mean[None], state.covariance[None], *nothing)
                 at += 1
@@ -475,13 +494,25 @@ class RationalFilter(SingleTrackEstimator):
             at = end
         return FilteredDrive(*out, state)
 
-    def _rolled(self, sample: FloatArray, state: Gaussian[FloatArray]) -> Gaussian[FloatArray]:
+    def _found_again(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+        """The motion of a car that rolls, where the sideslip angle is lost; without measurements the model may be unstable."""
+        lost = ~((state.covariance[..., 0, 0] < LOST**2) & (state.mean[..., 0].abs() < LARGEST[0]))
+        if not bool(lost.any()):
+            return state
+        anew = self._rolled(state, inputs)
+        return Gaussian(
+            torch.where(lost[..., None], anew.mean, state.mean), torch.where(lost[..., None, None], anew.covariance, state.covariance)
+        )
+
+    def _rolled(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+        """The state with the motion of a car that rolls without slip, under speed and steering angle, (..., 2)."""
         car = self.settings.car
-        turn = sample[3] / (car.cg_to_front_axle + car.cg_to_rear_axle)
-        mean, covariance = state.mean.copy(), state.covariance.copy()
-        mean[:4] = [car.cg_to_rear_axle * turn, sample[1] * turn, 0.0, 0.0]
-        covariance[:4], covariance[:, :4] = 0.0, 0.0
-        covariance[range(4), range(4)] = np.square(ROLLING)
+        turn = inputs[..., 1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
+        mean, covariance = state.mean.clone(), state.covariance.clone()
+        mean[..., :4] = torch.stack([car.cg_to_rear_axle * turn, inputs[..., 0] * turn, 0.0 * turn, 0.0 * turn], -1)
+        covariance[..., :4, :] = 0.0
+        covariance[..., :, :4] = 0.0
+        covariance[..., range(4), range(4)] = torch.as_tensor(ROLLING, dtype=covariance.dtype).square()
         return Gaussian(mean, covariance)
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:

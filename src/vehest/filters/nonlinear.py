@@ -31,6 +31,9 @@ class NonlinearModel:
         process_noise: Q of the estimated state, (..., n, n).
         observation_noise: R of the predicted state, (..., m, m).
         constrain: puts a state back into what is possible, such as a friction above 0; none: everything is.
+        restart: what is known instead after a prediction that leaves too little known, of state and u[k]; none: nothing else.
+        free: bool, which states a measurement may change, (..., n), of the predicted state; none: all. What is held keeps its variance
+            (Schmidt's consider state).
     """
 
     transition: Function
@@ -38,6 +41,8 @@ class NonlinearModel:
     process_noise: Function
     observation_noise: Function
     constrain: Callable[[Tensor], Tensor] | None = None
+    restart: Callable[[Gaussian[Tensor], Tensor], Gaussian[Tensor]] | None = None
+    free: Function | None = None
 
     def possible(self, state: Tensor) -> Tensor:
         """States that `constrain` allows."""
@@ -180,8 +185,13 @@ def _conditioned(
     innovation = torch.where(measured, torch.where(measured, y, zero) - expected, zero)
     covariance, factor, lost = factorised(symmetric(own + noise), repair=repair)
     gain = torch.cholesky_solve(cross.mT, factor).mT
+    reduction = gain @ covariance @ gain.mT
+    if model.free is not None:
+        gain = torch.where(model.free(state.mean, u).unsqueeze(-1), gain, zero)
+        both = gain @ cross.mT
+        reduction = both + both.mT - gain @ covariance @ gain.mT
     mean = model.possible(state.mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1))
-    posterior = Gaussian(mean, symmetric(state.covariance - gain @ covariance @ gain.mT))
+    posterior = Gaussian(mean, symmetric(state.covariance - reduction))
     whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False).squeeze(-1)
     determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     count = measured.sum(-1, dtype=y.dtype)
@@ -225,6 +235,7 @@ def _filtered(
         repaired = torch.zeros(batch, dtype=torch.bool, device=measurements.device)
         if k > 0:
             state, repaired = predict(state, inputs[..., k - 1, :])
+            state = state if model.restart is None else model.restart(state, inputs[..., k, :])
         predictions.append(state)
         own = update(state, measurements[..., k, :], inputs[..., k, :])
         updates.append(own)

@@ -13,8 +13,6 @@ import numpy as np
 
 from vehest.vehicle.rational_tyres import rational_axle
 
-LOST = 1.0  # rad, standard deviation of a sideslip angle of which nothing is known any more
-
 _axle = numba.njit(rational_axle)
 
 
@@ -28,6 +26,7 @@ def scan(  # type: ignore[no-untyped-def]
     lower,
     upper,
     rolling,
+    lost,
     step,
     minimum_speed,
     adapt_above,
@@ -53,6 +52,8 @@ def scan(  # type: ignore[no-untyped-def]
         lower: of states, (n,).
         upper: of states, (n,).
         rolling: variances of the first four states of a car that rolls, (4,).
+        lost: variance of β [rad²] from which on, as from β's limit on, the motion is guessed anew: that of a car that rolls. Without
+            measurements the model may be unstable.
         step: Δt [s].
         minimum_speed: [m/s].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
@@ -66,125 +67,166 @@ def scan(  # type: ignore[no-untyped-def]
         measured: out, (T, 2).
     """
     n = len(mean)
-    mass, inertia, front_arm, rear_arm = car
     left, gain, cross = np.empty((n, n)), np.empty((n, 2)), np.empty((n, 2))
-    per_rate, per_turn = np.zeros(n), np.zeros(n)  # derivatives of β' and r' one step later
+    per_rate, per_turn = np.zeros(n), np.zeros(n)
     parameters = nominal.copy()
     for k in range(len(samples)):
         vx, steer = samples[k, 1], samples[k, 3]
         if vx < minimum_speed:
-            _roll(mean, cov, rolling, rear_arm * steer / (front_arm + rear_arm), vx * steer / (front_arm + rear_arm))
+            _roll(mean, cov, rolling, car, vx, steer)
             _note(k, mean, cov, means, deviations, sideslip_cov)
             innovation[k], measured[k] = 0.0, False
             innovation_cov[k] = np.eye(2)
             continue
         if k > 0:
-            speed, before = max(samples[k - 1, 1], minimum_speed), samples[k - 1, 3]
+            speed = max(samples[k - 1, 1], minimum_speed)
             for i, index in enumerate(adapted):
                 parameters[index] = nominal[index] * math.exp(mean[4 + i])
-            turn = mean[1] / speed
-            front = _axle(before - mean[0] - front_arm * turn, parameters[0], parameters[1], parameters[4])
-            rear = _axle(-mean[0] + rear_arm * turn, parameters[2], parameters[3], parameters[4])
-            along = 1.0 / (mass * speed)
-            per_rate[0] = -(front.per_slip + rear.per_slip) * along
-            per_rate[1] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / speed * along - 1.0
-            per_turn[0] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / inertia
-            per_turn[1] = -(front_arm * front_arm * front.per_slip + rear_arm * rear_arm * rear.per_slip) / (inertia * speed)
-            for i, index in enumerate(adapted):
-                by_front, by_rear = 0.0, 0.0
-                if index == 0:
-                    by_front = front.per_log_c1
-                elif index == 1:
-                    by_front = front.per_log_c2
-                elif index == 2:
-                    by_rear = rear.per_log_c1
-                elif index == 3:
-                    by_rear = rear.per_log_c2
-                else:
-                    by_front, by_rear = front.per_log_friction, rear.per_log_friction
-                per_rate[4 + i] = (by_front + by_rear) * along
-                per_turn[4 + i] = (front_arm * by_front - rear_arm * by_rear) / inertia
-            rate = (front.force + rear.force) * along - mean[1]
-            acceleration = (front_arm * front.force - rear_arm * rear.force) / inertia
-            mean[0] += step * mean[2]
-            mean[1] += step * mean[3]
-            mean[2], mean[3] = rate, acceleration
-            for j in range(n):  # A P
-                left[0, j] = cov[0, j] + step * cov[2, j]
-                left[1, j] = cov[1, j] + step * cov[3, j]
-                first, second = 0.0, 0.0
-                for i in range(n):
-                    first += per_rate[i] * cov[i, j]
-                    second += per_turn[i] * cov[i, j]
-                left[2, j], left[3, j] = first, second
-                for i in range(4, n):
-                    left[i, j] = cov[i, j]
-            for i in range(n):  # A P Aᵀ
-                cov[i, 0] = left[i, 0] + step * left[i, 2]
-                cov[i, 1] = left[i, 1] + step * left[i, 3]
-                first, second = 0.0, 0.0
-                for j in range(n):
-                    first += left[i, j] * per_rate[j]
-                    second += left[i, j] * per_turn[j]
-                cov[i, 2], cov[i, 3] = first, second
-                for j in range(4, n):
-                    cov[i, j] = left[i, j]
-            rate, acceleration = front.per_slip * along, front_arm * front.per_slip / inertia
-            spread = step * variances[2]
-            cov[2, 2] += spread * rate * rate
-            cov[2, 3] += spread * rate * acceleration
-            cov[3, 2] += spread * rate * acceleration
-            cov[3, 3] += spread * acceleration * acceleration
-            if abs(vx * mean[1]) >= adapt_above:
-                for i in range(4, n):
-                    cov[i, i] += step * variances[i - 1]
-            _make_symmetric(cov)
+            front = _move(mean, car, parameters, adapted, speed, samples[k - 1, 3], step, per_rate, per_turn)
+            _spread(cov, per_rate, per_turn, step, left)
+            _add_noise(cov, front, car, speed, step, variances, abs(speed * mean[1]) >= adapt_above)
             _clip(mean, lower, upper)
-            if not cov[0, 0] < LOST * LOST:  # without measurements the model may be unstable: begin anew
-                _roll(mean, cov, rolling, mean[0], mean[1])
-        for i in range(n):
-            cross[i, 0] = cov[i, 1]
-            cross[i, 1] = vx * (cov[i, 2] + cov[i, 1])
-        for j in range(2):
-            value = samples[k, 0] if j == 0 else samples[k, 2]
-            measured[k, j] = not math.isnan(value)
-            expected = mean[1] if j == 0 else vx * (mean[2] + mean[1])
-            innovation[k, j] = value - expected if measured[k, j] else 0.0
-            if not measured[k, j]:
-                cross[:, j] = 0.0
-        S = innovation_cov[k]
-        S[0, 0] = cross[1, 0] + variances[0] if measured[k, 0] else 1.0
-        S[1, 1] = vx * (cross[2, 1] + cross[1, 1]) + variances[1] if measured[k, 1] else 1.0
-        S[0, 1] = cross[1, 1] if measured[k, 0] and measured[k, 1] else 0.0
-        S[1, 0] = S[0, 1]
-        determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
-        for i in range(n):
-            gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
-            gain[i, 1] = (cross[i, 1] * S[0, 0] - cross[i, 0] * S[0, 1]) / determinant
-        if abs(vx * mean[1]) < adapt_above:
-            gain[4:] = 0.0
+            if not (cov[0, 0] < lost and abs(mean[0]) < upper[0]):
+                _roll(mean, cov, rolling, car, vx, steer)
+        held = abs(vx * mean[1]) < adapt_above
+        _innovate(mean, cov, samples[k], variances, cross, innovation[k], innovation_cov[k], measured[k])
+        _gain(cross, innovation_cov[k], held, gain)
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
         _clip(mean, lower, upper)
-        for i in range(n):  # (I - K H) P (I - K H)ᵀ + K R Kᵀ, row by row
-            for j in range(n):
-                left[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
-        for i in range(n):
-            seen_rate, seen_ay = left[i, 1], vx * (left[i, 2] + left[i, 1])
-            for j in range(n):
-                total = left[i, j]
-                if measured[k, 0]:
-                    total += (gain[i, 0] * variances[0] - seen_rate) * gain[j, 0]
-                if measured[k, 1]:
-                    total += (gain[i, 1] * variances[1] - seen_ay) * gain[j, 1]
-                cov[i, j] = total
-        _make_symmetric(cov)
+        _reduce(cov, gain, cross, vx, variances, measured[k], left)
         _note(k, mean, cov, means, deviations, sideslip_cov)
 
 
 @numba.njit(inline="always")
-def _roll(mean, cov, rolling, sideslip, yaw_rate):  # type: ignore[no-untyped-def]
-    mean[0], mean[1], mean[2], mean[3] = sideslip, yaw_rate, 0.0, 0.0
+def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn):  # type: ignore[no-untyped-def]
+    """f: mean one step later, in place; writes the rows of A for β' and r', returns the front axle's force and slopes."""
+    mass, inertia, front_arm, rear_arm = car
+    turn = mean[1] / speed
+    front = _axle(steer - mean[0] - front_arm * turn, parameters[0], parameters[1], parameters[4])
+    rear = _axle(-mean[0] + rear_arm * turn, parameters[2], parameters[3], parameters[4])
+    along = 1.0 / (mass * speed)
+    per_rate[0] = -(front.per_slip + rear.per_slip) * along
+    per_rate[1] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / speed * along - 1.0
+    per_turn[0] = (rear_arm * rear.per_slip - front_arm * front.per_slip) / inertia
+    per_turn[1] = -(front_arm * front_arm * front.per_slip + rear_arm * rear_arm * rear.per_slip) / (inertia * speed)
+    for i, index in enumerate(adapted):
+        by_front, by_rear = 0.0, 0.0
+        if index == 0:
+            by_front = front.per_log_c1
+        elif index == 1:
+            by_front = front.per_log_c2
+        elif index == 2:
+            by_rear = rear.per_log_c1
+        elif index == 3:
+            by_rear = rear.per_log_c2
+        else:
+            by_front, by_rear = front.per_log_friction, rear.per_log_friction
+        per_rate[4 + i] = (by_front + by_rear) * along
+        per_turn[4 + i] = (front_arm * by_front - rear_arm * by_rear) / inertia
+    rate = (front.force + rear.force) * along - mean[1]
+    acceleration = (front_arm * front.force - rear_arm * rear.force) / inertia
+    mean[0] += step * mean[2]
+    mean[1] += step * mean[3]
+    mean[2], mean[3] = rate, acceleration
+    return front
+
+
+@numba.njit(inline="always")
+def _spread(cov, per_rate, per_turn, step, left):  # type: ignore[no-untyped-def]
+    """A P Aᵀ, in place: β and r are moved by their rates, β' and r' come from all states, tyre parameters stay."""
+    n = len(cov)
+    for j in range(n):  # A P
+        left[0, j] = cov[0, j] + step * cov[2, j]
+        left[1, j] = cov[1, j] + step * cov[3, j]
+        first, second = 0.0, 0.0
+        for i in range(n):
+            first += per_rate[i] * cov[i, j]
+            second += per_turn[i] * cov[i, j]
+        left[2, j], left[3, j] = first, second
+        for i in range(4, n):
+            left[i, j] = cov[i, j]
+    for i in range(n):
+        cov[i, 0] = left[i, 0] + step * left[i, 2]
+        cov[i, 1] = left[i, 1] + step * left[i, 3]
+        first, second = 0.0, 0.0
+        for j in range(n):
+            first += left[i, j] * per_rate[j]
+            second += left[i, j] * per_turn[j]
+        cov[i, 2], cov[i, 3] = first, second
+        for j in range(4, n):
+            cov[i, j] = left[i, j]
+
+
+@numba.njit(inline="always")
+def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ignore[no-untyped-def]
+    """Q = Δt B Λ Bᵀ of the steering angle and, where they wander, of the tyre parameters; Eqs. 41 to 45."""
+    rate, acceleration = front.per_slip * (1.0 / (car[0] * speed)), car[2] * front.per_slip / car[1]
+    spread = step * variances[2]
+    cov[2, 2] += spread * rate * rate
+    cov[2, 3] += spread * rate * acceleration
+    cov[3, 2] += spread * rate * acceleration
+    cov[3, 3] += spread * acceleration * acceleration
+    if wandering:
+        for i in range(4, len(cov)):
+            cov[i, i] += step * variances[i - 1]
+    _make_symmetric(cov)
+
+
+@numba.njit(inline="always")
+def _innovate(mean, cov, sample, variances, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
+    """Innovations of yaw rate and ay = u (β' + r), their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0."""
+    vx = sample[1]
+    for i in range(len(mean)):
+        cross[i, 0] = cov[i, 1]
+        cross[i, 1] = vx * (cov[i, 2] + cov[i, 1])
+    for j in range(2):
+        value = sample[0] if j == 0 else sample[2]
+        measured[j] = not math.isnan(value)
+        expected = mean[1] if j == 0 else vx * (mean[2] + mean[1])
+        innovation[j] = value - expected if measured[j] else 0.0
+        if not measured[j]:
+            cross[:, j] = 0.0
+    S[0, 0] = cross[1, 0] + variances[0] if measured[0] else 1.0
+    S[1, 1] = vx * (cross[2, 1] + cross[1, 1]) + variances[1] if measured[1] else 1.0
+    S[0, 1] = cross[1, 1] if measured[0] and measured[1] else 0.0
+    S[1, 0] = S[0, 1]
+
+
+@numba.njit(inline="always")
+def _gain(cross, S, held, gain):  # type: ignore[no-untyped-def]
+    """K = P Hᵀ S⁻¹, the rows of tyre parameters that are held 0."""
+    determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
+    for i in range(len(gain)):
+        gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
+        gain[i, 1] = (cross[i, 1] * S[0, 0] - cross[i, 0] * S[0, 1]) / determinant
+    if held:
+        gain[4:] = 0.0
+
+
+@numba.njit(inline="always")
+def _reduce(cov, gain, cross, vx, variances, measured, left):  # type: ignore[no-untyped-def]
+    """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row: Joseph's form, which holds for any gain."""
+    n = len(cov)
+    for i in range(n):
+        for j in range(n):
+            left[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
+    for i in range(n):
+        seen_rate, seen_ay = left[i, 1], vx * (left[i, 2] + left[i, 1])
+        for j in range(n):
+            total = left[i, j]
+            if measured[0]:
+                total += (gain[i, 0] * variances[0] - seen_rate) * gain[j, 0]
+            if measured[1]:
+                total += (gain[i, 1] * variances[1] - seen_ay) * gain[j, 1]
+            cov[i, j] = total
+    _make_symmetric(cov)
+
+
+@numba.njit(inline="always")
+def _roll(mean, cov, rolling, car, vx, steer):  # type: ignore[no-untyped-def]
+    turn = steer / (car[2] + car[3])
+    mean[0], mean[1], mean[2], mean[3] = car[3] * turn, vx * turn, 0.0, 0.0
     for i in range(4):
         cov[i, :] = 0.0
         cov[:, i] = 0.0
