@@ -19,10 +19,11 @@ from vehest.data.splits import VALIDATION
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table, as_code
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import REFERENCE, fixed, line_of
-from vehest.studies.artefacts import EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 
+TAKES = "parts"
 RACE_CARS = "race_cars"
 """Test set of simulated race cars, which make the second choice."""
 
@@ -76,7 +77,7 @@ class Step:
 
     part: str
     title: str
-    artefacts: StudyArtefacts
+    artefacts: PartArtefacts
     models: tuple[EvaluatedModel, ...]
     validation: dict[str, FloatArray]
     race_cars: dict[str, FloatArray]
@@ -133,7 +134,7 @@ def choices_of(steps: Sequence[Step]) -> dict[str, Choice]:
     return choices
 
 
-def build_parts(artefacts: PartsArtefacts) -> Document:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report: which step the simulated cars choose, and what every step does on the real car.
 
     Raises:
@@ -154,10 +155,10 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         _traces(choices[SHIPPED]),
         PATENT_NOTE,
     ]
-    return Document(artefacts.title, blocks)
+    return {REPORT: Document(artefacts.title, blocks)}
 
 
-def steps_of(artefacts: PartsArtefacts) -> list[Step]:
+def steps_of(artefacts: StudyArtefacts) -> list[Step]:
     """All steps in the order of the pipeline.
 
     Raises:
@@ -180,7 +181,7 @@ def steps_of(artefacts: PartsArtefacts) -> list[Step]:
     return steps
 
 
-def _real(part: StudyArtefacts) -> str:
+def _real(part: PartArtefacts) -> str:
     """The test set of the real car."""
     (name,) = (name for name in part.split.tests if name not in (RACE_CARS, OTHER_SIMULATOR))
     return name
@@ -193,7 +194,7 @@ def _weights_at_zero(models: Sequence[EvaluatedModel]) -> FloatArray:
     return np.array([load_model(model.model_folder).weights()["beta"][0, 0] for model in models], dtype=np.float64)
 
 
-def _values(part: StudyArtefacts, models: tuple[EvaluatedModel, ...], test_set: str) -> dict[str, FloatArray]:
+def _values(part: PartArtefacts, models: tuple[EvaluatedModel, ...], test_set: str) -> dict[str, FloatArray]:
     metrics = ("fvu", "rmse_vy", "rmse_sideslip")
     if test_set not in (VALIDATION, *part.split.tests):
         return {metric: np.full(len(models), np.nan) for metric in metrics}
@@ -252,7 +253,7 @@ def _verdict(step: Step) -> str:
     return "That is within what was asked for, short of the goal." if step.fvu <= WANTED_FVU else "**That misses what was asked for.**"
 
 
-def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
+def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     protocol = next(iter(artefacts.parts.values())).protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
@@ -273,7 +274,7 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
     return ["## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)]
 
 
-def _facts(artefacts: PartsArtefacts) -> list[str]:
+def _facts(artefacts: StudyArtefacts) -> list[str]:
     """What holds for all parts once, what holds for some with their names."""
     of_parts: dict[str, list[str]] = {}
     for name, part in artefacts.parts.items():
@@ -332,7 +333,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
     )
 
 
-def _reasons(artefacts: PartsArtefacts) -> str:
+def _reasons(artefacts: StudyArtefacts) -> str:
     known = [f"- **{artefacts.titles[name]}** (`{name}`): {REASONS[name]}." for name in artefacts.parts if name in REASONS]
     return "Why each step is there:\n\n" + "\n".join(known)
 

@@ -132,6 +132,8 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
         ("a: [1", "cannot be read as YAML"),
         ("a: !!python/object/apply:os.system ['true']", "cannot be read as YAML"),
         ("a: 2020-13-45", "cannot be read as YAML"),
+        ("a: !!timestamp soon", "a value is not what its tag"),
+        ("a: !!bool perhaps", "a value is not what its tag"),
         ("a: *nothing", "cannot be read as YAML"),
     ],
 )

@@ -25,8 +25,8 @@ from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from
 from vehest.sources.base import kind_of, open_source
 from vehest.stages.config import compose_config
 from vehest.stages.config_files import choices
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
-from vehest_papers.sim_to_real import build_parts
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest_papers.sim_to_real import documents
 
 PROTOCOL = Protocol(rate_hz=20.0)
 SPLITS = [name for name in choices("split") if name.startswith("sim_to_real_")]
@@ -94,7 +94,7 @@ ERRORS = {  # part -> (on validation, on race cars, on another simulation's car,
 }
 
 
-def part(folder: Path, name: str) -> StudyArtefacts:
+def part(folder: Path, name: str) -> PartArtefacts:
     """A part whose seeds err by given sizes on a drive of 60 s, which stands for validation and tests."""
     recording = planar_drive(60.0, 20.0, seed=3)
     file = folder / "lap.parquet"
@@ -122,7 +122,7 @@ def part(folder: Path, name: str) -> StudyArtefacts:
             found = accuracy([score(estimate, recording, span, PROTOCOL)])
             head = ("toy", "ksnn", model.variant, "sim", span.dataset, "", where, "all", "nominal", 20.0, "causal", seed)
             rows += [(*head, metric, value, "", None, None) for metric, value in found.items()]
-    return StudyArtefacts(
+    return PartArtefacts(
         study="toy",
         title="Toy",
         about="",
@@ -144,10 +144,10 @@ def part(folder: Path, name: str) -> StudyArtefacts:
 
 
 @pytest.fixture(scope="module")
-def artefacts(tmp_path_factory: pytest.TempPathFactory) -> PartsArtefacts:
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
     folder = tmp_path_factory.mktemp("toy")
     parts = {name: part(folder, name) for name in ERRORS}
-    return PartsArtefacts("toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, [])
+    return StudyArtefacts("toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, [])
 
 
 def overview(document: Document) -> pd.DataFrame:
@@ -156,7 +156,7 @@ def overview(document: Document) -> pd.DataFrame:
 
 
 def test_validation_cars_choose_first_even_where_the_real_car_says_otherwise(artefacts):
-    table = overview(build_parts(artefacts))
+    table = overview(documents(artefacts)["report"])
     assert table.loc["rough", "chosen"] == "first", (
         "the lowest error on validation cars of those laid down beforehand, the highest on the real"
     )
@@ -166,21 +166,21 @@ def test_validation_cars_choose_first_even_where_the_real_car_says_otherwise(art
 
 
 def test_race_cars_choose_second_and_another_simulation_third_among_those_that_have_not_learnt_on_it(artefacts):
-    table = overview(build_parts(artefacts))
+    table = overview(documents(artefacts)["report"])
     assert table.loc["one", "chosen"] == "second"
     assert table.loc["level", "chosen"] == "third"
     assert np.isnan(table.loc["one", "other_simulator_rmse_vy"]), "the lowest error there, but not asked"
 
 
 def test_shipped_seed_is_that_of_the_third_choice(artefacts):
-    table = overview(build_parts(artefacts))
+    table = overview(documents(artefacts)["report"])
     assert table.loc["level", "model_seed"] == 1, "the best on the other simulation's car, not on the real one"
     assert table.loc["level", "model_fvu"] == table.loc["level", "fvu_max"]
     assert table["model_fvu"].notna().sum() == 1
 
 
 def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path):
-    document = build_parts(artefacts)
+    document = documents(artefacts)["report"]
     write_document(document, tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     values = [overview(document).loc[name, "fvu_median"] for name in ("rough", "one", "level")]
@@ -195,7 +195,7 @@ def test_study_refuses_a_part_that_learns_on_the_real_car_or_stops_on_other_rang
     one = artefacts.parts["one"]
     real = replace(one, split=replace(one.split, train=(Span("ferrari", "other"),)))
     with pytest.raises(DataError, match="part 'one' learns or chooses on 'ferrari', which is not simulated"):
-        build_parts(replace(artefacts, parts={**artefacts.parts, "one": real}))
+        documents(replace(artefacts, parts={**artefacts.parts, "one": real}))
     other = replace(one, split=replace(one.split, validation=(Span("sim", "elsewhere"),)))
     with pytest.raises(DataError, match="stop or choose on different ranges"):
-        build_parts(replace(artefacts, parts={**artefacts.parts, "one": other}))
+        documents(replace(artefacts, parts={**artefacts.parts, "one": other}))

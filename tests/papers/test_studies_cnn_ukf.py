@@ -27,10 +27,10 @@ from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score_all
 from vehest.report.document import Figure, Table
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
-from vehest_papers.cnn_ukf import build_parts, paper, reasons, robustness, tables, traces
+from vehest_papers.cnn_ukf import documents, paper, reasons, robustness, tables, traces
 from vehest_papers.cnn_ukf.subjects import OFFLINE, Prepared, Run, candidate_of, chosen, losses, runs_of
 
 ROOT = Path(__file__).parents[2]
@@ -61,7 +61,7 @@ def fitted_models(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
+def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     """All five candidates on four test manoeuvres of six seconds."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)}
@@ -102,7 +102,7 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
                     seed,
                 )
                 rows += [(*head, metric, value, "1", None, None) for metric, value in figures.items()]
-    return StudyArtefacts(
+    return PartArtefacts(
         study="cnn_ukf",
         title="t",
         about="a",
@@ -119,15 +119,15 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
 
 
 @pytest.fixture(scope="module")
-def runs(part: StudyArtefacts) -> dict[str, list[Run]]:
+def runs(part: PartArtefacts) -> dict[str, list[Run]]:
     return runs_of(part, Prepared(part))
 
 
-def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part: StudyArtefacts) -> None:
+def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part: PartArtefacts) -> None:
     names = ("full", "limited", "limited_alone", "causal", "ferrari")
-    alone = StudyArtefacts(**{**vars(part), "models": part.models[:2]})
+    alone = PartArtefacts(**{**vars(part), "models": part.models[:2]})
     parts = {**dict.fromkeys(names, part), "limited_alone": alone}
-    document = build_parts(PartsArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))
+    document = documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
     text = "\n".join(block if isinstance(block, str) else block.caption for block in document.blocks)
     shown = {block.name for block in document.blocks if isinstance(block, Figure)}
     assert {*(f"figure_{number}" for number in range(4, 15)), "groups_limited"} == shown
@@ -138,14 +138,14 @@ def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_a
     assert "training ends 6 epochs after the best mean likelihood" in text
 
 
-def test_a_report_without_its_main_part_is_refused(part: StudyArtefacts) -> None:
+def test_a_report_without_its_main_part_is_refused(part: PartArtefacts) -> None:
     with pytest.raises(DataError, match="needs part 'full'"):
-        build_parts(PartsArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
+        documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
 
 
-def test_candidates_have_the_papers_names(part: StudyArtefacts) -> None:
+def test_candidates_have_the_papers_names(part: PartArtefacts) -> None:
     assert list(dict.fromkeys(candidate_of(model) for model in part.models)) == list(paper.CANDIDATES)
-    twice = StudyArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
+    twice = PartArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
     with pytest.raises(DataError, match="Model-based was trained twice with one seed"):
         runs_of(twice, Prepared(twice))
 
@@ -159,7 +159,7 @@ def test_the_study_prepares_references_as_the_pipeline_prepares_recordings() -> 
     assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
 
 
-def test_references_and_accelerations_are_low_passed_before_they_are_scored(part: StudyArtefacts) -> None:
+def test_references_and_accelerations_are_low_passed_before_they_are_scored(part: PartArtefacts) -> None:
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
     assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(loaded_ay(noisy), 2))
@@ -179,7 +179,7 @@ def test_losses_are_those_of_the_samples_that_count(runs: dict[str, list[Run]]) 
     assert len(set(manoeuvre.tolist())) == len(TESTS)
 
 
-def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not_spin(part: StudyArtefacts, tmp_path: Path) -> None:
+def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not_spin(part: PartArtefacts, tmp_path: Path) -> None:
     calm = Prepared(part).recording("car", "test_j_turn_1")
     references, spans = dict(part.references), list(SPLIT.tests["test"])
     for name, factor, spun in (("test_j_turn_2", 1.5, False), ("test_j_turn_3", 2.0, True)):
@@ -189,14 +189,14 @@ def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not
         write_recording(flagged, references["car", name])
         spans.append(Span("car", name, 1.5))
     split = Split("made", SPLIT.train, SPLIT.validation, {"test": tuple(spans)})
-    more = StudyArtefacts(**{**vars(part), "references": references, "split": split})
+    more = PartArtefacts(**{**vars(part), "references": references, "split": split})
     assert traces.manoeuvre_of(more, Prepared(more), "J-turn").recording == "test_j_turn_2"
     with pytest.raises(DataError, match="no test manoeuvre is a skidpad"):
         traces.manoeuvre_of(part, Prepared(part), "skidpad")
 
 
 def test_what_networks_say_is_held_against_the_reference_of_the_same_time(
-    part: StudyArtefacts, runs: dict[str, list[Run]], monkeypatch: pytest.MonkeyPatch
+    part: PartArtefacts, runs: dict[str, list[Run]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepared = Prepared(part)
 
@@ -232,7 +232,7 @@ def test_stiffness_is_changed_in_a_copy_of_either_axle() -> None:
         robustness.with_stiffness(estimator_class("sideslip_ffnn").from_config({}), 0.1, 0.1)
 
 
-def test_wrong_tyres_cost_the_model_more_than_nothing_and_a_network_alone_nothing(part: StudyArtefacts, runs: dict[str, list[Run]]) -> None:
+def test_wrong_tyres_cost_the_model_more_than_nothing_and_a_network_alone_nothing(part: PartArtefacts, runs: dict[str, list[Run]]) -> None:
     table = robustness.errors({name: runs[name][:1] for name in (paper.MODEL, paper.DATA)}, Prepared(part))
     of = {candidate: own["mse"].to_numpy() for candidate, own in table.groupby("candidate")}
     assert of[paper.MODEL].argmin() == robustness.COMBINATIONS.index((0.0, 0.0))
@@ -303,9 +303,9 @@ def test_ratios_of_causal_preprocessing_are_of_the_same_seed() -> None:
     assert frame.loc[0, "seeds"] == "3, 1"
 
 
-def test_manoeuvres_in_two_ranges_are_refused(part: StudyArtefacts) -> None:
+def test_manoeuvres_in_two_ranges_are_refused(part: PartArtefacts) -> None:
     spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
-    twice = StudyArtefacts(**{**vars(part), "split": Split("made", SPLIT.train, SPLIT.validation, {"test": spans})})
+    twice = PartArtefacts(**{**vars(part), "split": Split("made", SPLIT.train, SPLIT.validation, {"test": spans})})
     with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
         runs_of(twice, Prepared(twice))
 

@@ -12,7 +12,7 @@ import pytest
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.sweep import interval
 from vehest_papers.ksnn import paper, scatter, tables
 from vehest_papers.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
@@ -38,7 +38,7 @@ FIGURES = {
 }
 
 
-def part(figures=FIGURES, drop: str = "") -> StudyArtefacts:
+def part(figures=FIGURES, drop: str = "") -> PartArtefacts:
     rows, models = [], []
     for (estimator, variant, seed), (validation, *fvus) in figures.items():
         values = {("validation", "rmse_vy"): validation, ("validation", "fvu"): validation**2}
@@ -52,7 +52,7 @@ def part(figures=FIGURES, drop: str = "") -> StudyArtefacts:
                 own = ("ksnn", estimator, variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", seed, metric, value)
                 rows.append((*own, "1", None, None))
         models.append(EvaluatedModel(estimator, variant, f"{estimator} {variant}", seed, Path("m"), Path("e")))
-    return StudyArtefacts(
+    return PartArtefacts(
         study="ksnn",
         title="t",
         about="a",
@@ -163,7 +163,7 @@ def test_families_are_ordered_as_they_come_out(fvus, expected):
 @pytest.mark.parametrize(("fvu", "expected"), [(0.105, "are **not** why the order differs"), (0.2, "The largest factor is 2.00.")])
 def test_tilted_sensors_are_named_as_a_reason_only_where_they_change_something(fvu, expected):
     before, after = (runs_of(part({("ksnn", "linear_no_bias_p2", 0): (0.1, 0.05, value)})) for value in (0.1, fvu))
-    titles = PartsArtefacts("s", "t", "a", "c", {"scheme_1": "Scheme 1"}, {}, [])
+    titles = StudyArtefacts("s", "t", "a", "c", {"scheme_1": "Scheme 1"}, {}, [])
     blocks = tilted(titles, {"scheme_1": before, "tilted_1": after}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")})
     assert expected in str(blocks[-1])
     assert tilted(titles, {"scheme_1": before}, {"scheme_1": (paper.TABLE_IV, "c2", "f2")}) == []

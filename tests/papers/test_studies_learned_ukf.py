@@ -19,11 +19,11 @@ from vehest.estimators.learned_ukf import LearnedUkf, LearnedUkfSettings
 from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
 from vehest.report.document import Figure, Table, write_document
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest.studies.kit.reading import median_and_range
 from vehest.training.through_filter import Drive
-from vehest_papers.learned_ukf import build_parts, paper, tables
+from vehest_papers.learned_ukf import documents, paper, tables
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, swapped
@@ -74,7 +74,7 @@ def filter_of(seed: int = 0, **settings: object) -> LearnedUkf:
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
+def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     """Five filters and a network, two seeds each, on two sets of three sequences."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: recording(name, seed=number) for number, name in enumerate(SPANS)}
@@ -109,7 +109,7 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
             head = ("learned_ukf", name, variant, "car", "car", "simulated")
             tail = ("all", "nominal", 100.0, "causal", seed)
             rows += [(*head, test, *tail, metric, value, "1", None, None) for (test, metric), value in figures.items()]
-    return StudyArtefacts(
+    return PartArtefacts(
         study="learned_ukf",
         title="t",
         about="a",
@@ -131,7 +131,7 @@ def constant(own: Recording) -> Estimate:
     return Estimate(own.id, "velocity_gru", 100.0, own.start_time, {**channels, "sideslip": channels["vy"] / channels["vx"]})
 
 
-def model(part: StudyArtefacts, candidate: str, seed: int = 0) -> EvaluatedModel:
+def model(part: PartArtefacts, candidate: str, seed: int = 0) -> EvaluatedModel:
     return models_by_candidate(part)[candidate][seed]
 
 
@@ -148,16 +148,16 @@ def test_candidates_have_the_papers_names(settings, candidate):
 
 
 def test_two_variants_under_one_name_are_refused(part):
-    twice = StudyArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
+    twice = PartArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
     with pytest.raises(DataError, match="NNT was trained twice with one seed"):
         models_by_candidate(twice)
 
 
 def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path):
     titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "length_500": "Sequences of 500"}
-    length = StudyArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
-    artefacts = PartsArtefacts("learned_ukf", "t", "a", "c", titles, {"simulated": part, "length_500": length}, ["real"])
-    document = build_parts(artefacts)
+    length = PartArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
+    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, {"simulated": part, "length_500": length}, ["real"])
+    document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
     figures = {block.name for block in document.blocks if isinstance(block, Figure)}
@@ -177,10 +177,10 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
 
 def test_study_without_its_parts_or_test_sets_is_refused(part):
     with pytest.raises(DataError, match="needs one of the parts: real, simulated"):
-        build_parts(PartsArtefacts("s", "t", "a", "c", {}, {}, []))
-    other = StudyArtefacts(**{**vars(part), "split": Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})})
+        documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
+    other = PartArtefacts(**{**vars(part), "split": Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})})
     with pytest.raises(DataError, match="must be called tyre_a and tyre_d"):
-        build_parts(PartsArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
+        documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
 
 
 @pytest.mark.parametrize("candidate", ["NNT", "NNTF_U", "NNTF_UH", "NNTF_UH*"])
@@ -231,7 +231,7 @@ def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
 
 
 def test_protocol_without_sequences_is_refused(part):
-    whole = StudyArtefacts(**{**vars(part), "protocol": Protocol(100.0, 0.0, 0.2)})
+    whole = PartArtefacts(**{**vars(part), "protocol": Protocol(100.0, 0.0, 0.2)})
     with pytest.raises(ConfigurationError, match=r"needs evaluation\.sequence_seconds"):
         drives_of(whole, loaded(model(part, "NNTF")), "tyre_a")
 
@@ -247,7 +247,7 @@ def test_validation_chooses_the_seed_and_tests_do_not(part):
 def test_a_metric_that_is_missing_is_said(part):
     metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
     with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
-        runs_of(StudyArtefacts(**{**vars(part), "metrics": metrics}))
+        runs_of(PartArtefacts(**{**vars(part), "metrics": metrics}))
 
 
 def test_tables_show_median_and_range_beside_the_paper():
@@ -311,20 +311,20 @@ def test_only_what_departs_from_the_paper_is_said(part):
     ]
     training = {**AS_THE_PAPER, "batch_size": 6, "through": {**PHASE, "max_epochs": 300, "schedule": "cosine"}, "mirrored": 0.5}
     changed = [EvaluatedModel(**{**vars(own), "training": training}) for own in part.models if own.estimator == "learned_ukf"]
-    text = "\n".join(departures({"real": StudyArtefacts(**{**vars(part), "models": changed})}))
+    text = "\n".join(departures({"real": PartArtefacts(**{**vars(part), "models": changed})}))
     assert "Batches of 6 sequences" in text
     assert "300 epochs (paper: 1000, of one batch each); a step size of 0.0005 that falls to zero along a cosine" in text
     assert "mirror" in text
-    table = settings_table({"real": StudyArtefacts(**{**vars(part), "models": changed})})
+    table = settings_table({"real": PartArtefacts(**{**vars(part), "models": changed})})
     assert table[(table["candidate"] == "NNT") & (table["setting"] == "through.max_epochs")]["value"].tolist() == [300]
 
 
 def test_lengths_are_those_of_trainings_through_the_filter(part):
-    own = StudyArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
+    own = PartArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
     row = lengths({"length_500": own}).iloc[0]
     assert (row["steps"], row["epochs"]) == (500, 1000)
     with pytest.raises(DataError, match="was not trained through the filter"):
-        lengths({"length_500": StudyArtefacts(**{**vars(part), "models": [model(part, "GRU")]})})
+        lengths({"length_500": PartArtefacts(**{**vars(part), "models": [model(part, "GRU")]})})
 
 
 def test_published_figures_agree_with_the_text_of_the_paper():

@@ -23,7 +23,7 @@ from vehest.data.store import write_recording
 from vehest.report.document import Document, write_document
 from vehest.report.recording_figures import Distribution, beyond
 from vehest.simulation.plant.parameters import Vehicle
-from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
+from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents
 from vehest_papers.proving_ground.handling import HandlingPoints, characteristic, single_track_gradient
 from vehest_papers.proving_ground.noise import spectra
@@ -65,7 +65,7 @@ def _stored(folder: Path, name: str, kind: str, recordings: list[Recording]) -> 
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory) -> SurveyArtefacts:
+def study(tmp_path_factory) -> StudyArtefacts:
     """Three simulated drives, of which one spun, and a real one."""
     folder = tmp_path_factory.mktemp("store")
     spin = {"spun": True, "gave_up_at": 12.5, "largest_sideslip": 2.0, "stood": True}
@@ -76,7 +76,7 @@ def study(tmp_path_factory) -> SurveyArtefacts:
     ]
     real = replace(_drive("day", 4, 80.0, 100.0), kind="real", vehicle="the real one")
     datasets = [_stored(folder, "sim_two_cars", "simulated", simulated), _stored(folder, "ferrari_250lm", "real", [real])]
-    return SurveyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run pipelines/x.yaml", datasets, [])
+    return StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run pipelines/x.yaml", datasets=datasets)
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +248,7 @@ def test_pages_say_what_is_simulated_and_what_is_real(made):
 
 
 def test_without_the_real_recording_the_page_says_how_to_get_it(study):
-    made = documents(replace(study, datasets=study.datasets[:1], absent=[REAL]))
+    made = documents(replace(study, datasets=study.datasets[:1], absent_datasets=[REAL]))
     text = "\n".join(block for block in made["ferrari_250_lm"].blocks if isinstance(block, str))
     assert "absent from this report" in text
     assert "somebody's licence" in text
@@ -348,7 +348,7 @@ def test_needed_recordings_that_are_missing_are_one_clear_line(survey_place):
 def test_a_signal_while_pages_are_drawn_leaves_nothing_and_the_next_run_goes_on(survey_place, monkeypatch):
     place, reports = survey_place, survey_place.folder / "outputs" / "report"
 
-    def interrupted(made, folder):
+    def interrupted(made, folder, **_):
         write_document(made["report"], folder)
         assert any(reports.glob(f"{ASIDE_PREFIX}*/report.md"))
         os.kill(os.getpid(), signal.SIGTERM)

@@ -26,8 +26,8 @@ from vehest.evaluation.metrics import UNITS, Protocol, accuracy, score
 from vehest.report.document import Column, Document, Figure, Table, formatted, write_document
 from vehest.report.figures import decimated
 from vehest.report.style import MISSING, colour_of, decimals_for, fixed, lines_of, on_dark, significant
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, StudyArtefacts
-from vehest.studies.drive import build, leaderboard
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
+from vehest.studies.drive import comparison, leaderboard
 from vehest.studies.kit.timings import timings_of_study
 
 RATE = 20.0
@@ -59,7 +59,7 @@ def estimate_of(recording: Recording, span: Span, size: float, phase: float) -> 
     return Estimate("lap", "any", RATE, part.start_time, {"vy": vy, "sideslip": np.arctan2(vy, part["vx"])})
 
 
-def study(folder: Path, tests: dict[str, tuple[Span, ...]] | None = None) -> StudyArtefacts:
+def study(folder: Path, tests: dict[str, tuple[Span, ...]] | None = None) -> PartArtefacts:
     recording = drive()
     write_recording(recording, folder / "lap.parquet")
     tests = tests or {"test": (Span("toy", "lap", 60.0, 85.0),)}
@@ -85,7 +85,7 @@ def study(folder: Path, tests: dict[str, tuple[Span, ...]] | None = None) -> Stu
             rows += metric_rows(model, "", {"n_parameters": 10.0 * (number + 1), "epochs": epochs})
             model.model_folder.mkdir(parents=True)
             history(epochs).to_csv(model.model_folder / "history.csv", index=False)
-    return StudyArtefacts(
+    return PartArtefacts(
         study="toy",
         title="A toy study",
         about="What a *paragraph* says.",
@@ -113,7 +113,7 @@ def history(epochs: int) -> pd.DataFrame:
     return pd.DataFrame({"epoch": epoch, "train_loss": 1.0 / epoch, "validation_loss": 1.5 / epoch})
 
 
-def with_value(artefacts: StudyArtefacts, value: float, **where: object) -> StudyArtefacts:
+def with_value(artefacts: PartArtefacts, value: float, **where: object) -> PartArtefacts:
     metrics = artefacts.metrics.copy()
     hit = np.logical_and.reduce([(metrics[name] == wanted).to_numpy() for name, wanted in where.items()])
     assert hit.any()
@@ -128,34 +128,34 @@ def row_of(board: pd.DataFrame, estimator: str, test_set: str = "test") -> pd.Se
 
 
 @pytest.fixture(scope="module")
-def artefacts(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     return study(tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture(scope="module")
-def written(artefacts: StudyArtefacts, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(artefacts: PartArtefacts, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    write_document(build(artefacts), folder)
+    write_document(comparison(artefacts), folder)
     return folder
 
 
 # The leaderboard
 
 
-def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test(artefacts: StudyArtefacts) -> None:
+def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test(artefacts: PartArtefacts) -> None:
     row = row_of(leaderboard(artefacts), "ksnn")
     assert row["seed"] == 1  # lowest on validation, highest on test
     assert row["rmse_sideslip"] == row["rmse_sideslip_max"] > row["rmse_sideslip_min"]
 
 
-def test_lower_seed_wins_a_tie_on_validation(artefacts: StudyArtefacts) -> None:
+def test_lower_seed_wins_a_tie_on_validation(artefacts: PartArtefacts) -> None:
     tied = with_value(artefacts, 0.05, estimator="ksnn", test_set="validation", metric="rmse_vy")
     assert row_of(leaderboard(tied), "ksnn")["seed"] == 0
     backwards = replace(tied, models=list(reversed(tied.models)))
     assert row_of(leaderboard(backwards), "ksnn")["seed"] == 0
 
 
-def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts: StudyArtefacts) -> None:
+def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts: PartArtefacts) -> None:
     recording = drive()
     time = recording.time
     scored = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9)
@@ -187,36 +187,36 @@ def test_leaderboard_is_sorted_by_the_chosen_seeds_sideslip_error_within_each_te
     assert board["test_set"].tolist() == ["late"] * 5 + ["early"] * 5
     for _, part in board.groupby("test_set"):
         assert part["rmse_sideslip"].is_monotonic_increasing
-    document = build(artefacts)
+    document = comparison(artefacts)
     names = [block.name for block in document.blocks if not isinstance(block, str)]
     assert {"leaderboard_late", "leaderboard_early", "traces_late", "traces_early", "zoom_early"} <= set(names)
 
 
-def test_method_without_epochs_and_seeds_has_neither_in_the_leaderboard(artefacts: StudyArtefacts) -> None:
+def test_method_without_epochs_and_seeds_has_neither_in_the_leaderboard(artefacts: PartArtefacts) -> None:
     row = row_of(leaderboard(artefacts), "luenberger")
     assert math.isnan(row["epochs"])
     assert math.isnan(row["rmse_sideslip_std"])
     assert row["n_seeds"] == 1
 
 
-def test_narrower_subsets_and_other_conditions_do_not_enter(artefacts: StudyArtefacts) -> None:
+def test_narrower_subsets_and_other_conditions_do_not_enter(artefacts: PartArtefacts) -> None:
     other = artefacts.metrics.assign(value=99.0)
     metrics = pd.concat([artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")])
     pd.testing.assert_frame_equal(leaderboard(replace(artefacts, metrics=metrics)), leaderboard(artefacts))
 
 
-def test_metrics_read_back_from_csv_give_the_same_leaderboard(artefacts: StudyArtefacts, tmp_path: Path) -> None:
+def test_metrics_read_back_from_csv_give_the_same_leaderboard(artefacts: PartArtefacts, tmp_path: Path) -> None:
     artefacts.metrics.to_csv(tmp_path / "metrics.csv", index=False)
     again = replace(artefacts, metrics=pd.read_csv(tmp_path / "metrics.csv"))
     pd.testing.assert_frame_equal(leaderboard(again), leaderboard(artefacts))
 
 
-def test_diverged_estimator_comes_last_and_shows_dashes(artefacts: StudyArtefacts) -> None:
+def test_diverged_estimator_comes_last_and_shows_dashes(artefacts: PartArtefacts) -> None:
     for metric in ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip"):
         artefacts = with_value(artefacts, math.nan, estimator="gru", metric=metric)
     board = leaderboard(artefacts)
     assert board["estimator"].tolist()[-1] == "gru"
-    document = build(artefacts)
+    document = comparison(artefacts)
     table = next(block for block in document.blocks if isinstance(block, Table) and block.name == "leaderboard_test")
     headers, rows, _ = formatted(table)
     cells = dict(zip(headers, rows[-1], strict=True))
@@ -225,13 +225,13 @@ def test_diverged_estimator_comes_last_and_shows_dashes(artefacts: StudyArtefact
     assert any("No finite error" in block and "GRU" in block for block in document.blocks if isinstance(block, str))
 
 
-def test_two_values_for_one_run_are_refused(artefacts: StudyArtefacts) -> None:
+def test_two_values_for_one_run_are_refused(artefacts: PartArtefacts) -> None:
     twin = with_value(artefacts, 7.0, estimator="gru", seed=1, test_set="test", metric="rmse_vy").metrics
     with pytest.raises(DataError, match=r"rmse_vy of gru/states_5, seed 1, on 'test' is both"):
         leaderboard(replace(artefacts, metrics=pd.concat([artefacts.metrics, twin])))
 
 
-def test_several_seeds_without_validation_metrics_are_refused(artefacts: StudyArtefacts) -> None:
+def test_several_seeds_without_validation_metrics_are_refused(artefacts: PartArtefacts) -> None:
     metrics = artefacts.metrics[artefacts.metrics["test_set"] != "validation"]
     with pytest.raises(DataError, match="no metrics on the validation range"):
         leaderboard(replace(artefacts, metrics=metrics))
@@ -240,11 +240,11 @@ def test_several_seeds_without_validation_metrics_are_refused(artefacts: StudyAr
 # The words
 
 
-def words_of(artefacts: StudyArtefacts) -> str:
-    return "\n\n".join(block for block in build(artefacts).blocks if isinstance(block, str))
+def words_of(artefacts: PartArtefacts) -> str:
+    return "\n\n".join(block for block in comparison(artefacts).blocks if isinstance(block, str))
 
 
-def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts: StudyArtefacts) -> None:
+def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts: PartArtefacts) -> None:
     """Luenberger is the only one with a single seed here: its figure is taken away, then KS-NN is compared with a twin of itself."""
     text = words_of(artefacts)
     best = leaderboard(artefacts).iloc[0]
@@ -260,14 +260,14 @@ def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts: StudyArt
     assert "which is not told apart from Twin" in text
 
 
-def test_no_winner_without_the_baselines(artefacts: StudyArtefacts) -> None:
+def test_no_winner_without_the_baselines(artefacts: PartArtefacts) -> None:
     models = [model for model in artefacts.models if model.estimator not in ("zero", "static_map")]
     text = words_of(replace(artefacts, models=models))
     assert "**no estimator can be called best**" in text
     assert "was not compared with v = 0 and which was not compared with the static map" in text
 
 
-def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts: StudyArtefacts) -> None:
+def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts: PartArtefacts) -> None:
     board = leaderboard(artefacts)
     assert row_of(board, "ksnn")["against_best"] == "lowest"
     assert row_of(board, "gru")["beats_zero"] == row_of(board, "gru")["beats_static_map"] == "yes"
@@ -278,11 +278,11 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
 
 
 @pytest.mark.parametrize(("kind", "words"), [("simulated", "**Simulated data:**"), ("real", "**Real data:**")])
-def test_report_says_on_its_first_page_whether_data_are_real(artefacts: StudyArtefacts, kind: str, words: str) -> None:
-    assert any(str(block).startswith(words) for block in build(replace(artefacts, kinds={"toy": kind})).blocks[:2])
+def test_report_says_on_its_first_page_whether_data_are_real(artefacts: PartArtefacts, kind: str, words: str) -> None:
+    assert any(str(block).startswith(words) for block in comparison(replace(artefacts, kinds={"toy": kind})).blocks[:2])
 
 
-def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artefacts: StudyArtefacts) -> None:
+def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artefacts: PartArtefacts) -> None:
     assert "hardly excites sideslip" not in words_of(artefacts)
     assert "limit of" not in words_of(artefacts)
     short = [replace(model, training={"max_epochs": 11}) for model in artefacts.models]
@@ -291,9 +291,9 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
 
 
-def test_patent_is_mentioned_exactly_where_a_ksnn_takes_part(artefacts: StudyArtefacts) -> None:
+def test_patent_is_mentioned_exactly_where_a_ksnn_takes_part(artefacts: PartArtefacts) -> None:
     def text(models: Sequence[EvaluatedModel]) -> str:
-        return "".join(block for block in build(replace(artefacts, models=models)).blocks if isinstance(block, str))
+        return "".join(block for block in comparison(replace(artefacts, models=models)).blocks if isinstance(block, str))
 
     assert "PCT/IT2023/050058" in text(artefacts.models)
     assert "PCT/IT2023/050058" not in text([model for model in artefacts.models if model.estimator != "ksnn"])
@@ -324,7 +324,7 @@ def test_rows_of_markdown_tables_have_as_many_cells_as_their_header(written: Pat
     assert any(r"GRU \| 5 &lt;states>" in line for line in lines)
 
 
-def test_csv_tables_read_back_with_every_digit(artefacts: StudyArtefacts, written: Path) -> None:
+def test_csv_tables_read_back_with_every_digit(artefacts: PartArtefacts, written: Path) -> None:
     board = leaderboard(artefacts)
     table = pd.read_csv(written / "tables" / "leaderboard_test.csv", float_precision="round_trip")
     assert table.columns.tolist() == [*board.columns, "interval"]
@@ -333,8 +333,8 @@ def test_csv_tables_read_back_with_every_digit(artefacts: StudyArtefacts, writte
     assert table.loc[table["n_seeds"] == 1, "rmse_sideslip_median"].isna().all()
 
 
-def test_same_artefacts_give_the_same_bytes(artefacts: StudyArtefacts, written: Path, tmp_path: Path) -> None:
-    write_document(build(artefacts), tmp_path)
+def test_same_artefacts_give_the_same_bytes(artefacts: PartArtefacts, written: Path, tmp_path: Path) -> None:
+    write_document(comparison(artefacts), tmp_path)
     files = [path.relative_to(written) for path in written.rglob("*.*")]
     assert len(files) == 2 + 3 + 2 * 6
     for file in files:
@@ -347,10 +347,10 @@ from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from test_report import study
 from vehest.report.document import write_document
-from vehest.studies.drive import build
+from vehest.studies.drive import comparison
 folder = Path(sys.argv[1])
 (folder / "study").mkdir()
-write_document(build(study(folder / "study")), folder, page=False)
+write_document(comparison(study(folder / "study")), folder, page=False)
 """
 
 
@@ -462,7 +462,7 @@ def test_page_loads_nothing_from_anywhere(written: Path) -> None:
     assert "prefers-color-scheme: dark" in style[1]
 
 
-def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefacts: StudyArtefacts, written: Path) -> None:
+def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefacts: PartArtefacts, written: Path) -> None:
     page = Page((written / "report.html").read_text(encoding="utf-8"))
     best = leaderboard(artefacts).iloc[0]
     rows = [row for row in page.rows if row[0] == best["title"]]

@@ -99,7 +99,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
 
 
 def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
-    monkeypatch.setattr("vehest_papers.ksnn.build_parts", lambda artefacts: Document(artefacts.title, ["no tables"]))
+    monkeypatch.setattr("vehest_papers.ksnn.documents", lambda artefacts: {"report": Document(artefacts.title, ["no tables"])})
     file = parts_place.folder / "pipelines" / "both.yaml"
     content = yaml.safe_load(file.read_text())
     content["parts"] = {"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}}

@@ -171,7 +171,7 @@ def test_changed_code_and_data_are_told_apart(checked: Place, monkeypatch: pytes
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
-    monkeypatch.setattr(study_keys, "code_of_report", lambda study, drawn_by: "other")
+    monkeypatch.setattr(study_keys, "code_of_report", lambda study: "other")
     assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
 
 

@@ -57,6 +57,8 @@ def parse_yaml(text: str, where: str) -> Any:
         return yaml.load(text, _EVENTS)
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{where} cannot be read as YAML ({first_line(error)})") from None
+    except (AttributeError, LookupError):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
+        raise DataError(f"{where} cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)") from None
 
 
 def check_yaml(text: str, where: str) -> None:

@@ -26,6 +26,9 @@ PATENT_NOTE = (
 )
 """What every report with a KS-NN ends with."""
 
+REPORT = "report"
+"""Document of a study that one starts with."""
+
 PNG_DPI = 150
 PNG_COLOURS = 256
 _PATH = re.compile(r'\bd="[^"]*"')
@@ -117,13 +120,14 @@ class Document:
                     raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
 
 
-def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bool = True) -> None:
+def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bool = True, on_page: Sequence[str | Table] = ()) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
         documents: name of the file -> document; ``report`` is the one to start with.
         folder: an existing folder.
         page: whether to write the self-contained pages too.
+        on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
 
     Raises:
         ValueError: tables or figures of two documents share a name, or a name is no file name.
@@ -133,7 +137,7 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bo
     for name, document in documents.items():
         if not _NAME.fullmatch(name):
             raise ValueError(f"'{name}' cannot name a file of a report")
-        write_document(document, folder, page=page, name=name)
+        write_document(document, folder, page=page, name=name, on_page=on_page if name == REPORT else ())
 
 
 def write_document(

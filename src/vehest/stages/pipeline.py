@@ -20,18 +20,18 @@ from vehest.data.limits import use_limits
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import read_yaml
-from vehest.stages.artefacts import Artefact
+from vehest.stages.artefacts import Artefact, find
 from vehest.stages.comparison import Compared, compare, raise_failures
 from vehest.stages.config import Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
 from vehest.stages.ingest import STAGE as INGEST
-from vehest.stages.parts import AbsentPart, PartsJob, plan_parts, write_parts
+from vehest.stages.ingest import plan_ingest
 from vehest.stages.publishing import Publication, publish_study
-from vehest.stages.report import ReportJob, leaderboard_of, overview_of, plan_report, write_report
+from vehest.stages.report import AbsentPart, PartJob, ReportJob, ShownDatasets, plan_report, prose_of, shown_in_terminal, write_report
 from vehest.stages.study_keys import Keys, keys_of_study
-from vehest.stages.survey import SurveyJob, ingest_all, plan_survey, write_survey
 from vehest.stages.tracking import Tracker
 from vehest.stages.workshop import NotThereYet, Workshop
+from vehest.studies.artefacts import AbsentDataset
 from vehest.studies.registry import study_module, study_names
 
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
@@ -242,12 +242,10 @@ def _part(name: str, part: PartFile | None, file: Path) -> Part:
 def _check_module(name: str, form: str, file: Path) -> None:
     if name not in study_names():
         raise ConfigurationError(f"'{file}': there is no study module '{name}'; there are: {', '.join(study_names())}")
-    module = study_module(name)
-    takes = {"build": "split and sweeps", "build_parts": "parts", "documents": "datasets"}
-    wanted = {"split": "build", "parts": "build_parts", "datasets": "documents"}[form]
-    if not hasattr(module, wanted):
-        known = " or ".join(words for function, words in takes.items() if hasattr(module, function))
-        raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {known or 'something else'}")
+    takes = getattr(study_module(name), "TAKES", None)
+    if takes != form:
+        draws = "split and sweeps" if takes == "split" else takes or "something else"
+        raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {draws}")
 
 
 def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
@@ -342,31 +340,32 @@ def run_pipeline(
         NotThereYet: in a dry run.
         Stopped: a signal came.
     """
+    parts: dict[str, PartJob] = {}
+    absent: list[AbsentPart] = []
+    datasets = ShownDatasets()
     if pipeline.datasets:
-        return _run_survey(pipeline, configs[""], overrides, workshop, only_report=only_report)
-    first = next(iter(configs.values()))[0]
-    workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn, workshop.stop.requested)
-    workshop.tags = {"vehest.study": pipeline.study}
-    compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
-    raise_failures(compared.values(), workshop)
-    jobs = {name: _report_job(pipeline, own, overrides) for name, own in compared.items()}
-    if not pipeline.in_parts:
-        (job,) = jobs.values()
-        report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
-        return _published(pipeline, configs, report, overrides, workshop, table=leaderboard_of(job))
-    whole = PartsJob(
+        datasets = _ingest_all(pipeline, configs[""], workshop, only_report=only_report)
+    else:
+        first = next(iter(configs.values()))[0]
+        workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn, workshop.stop.requested)
+        workshop.tags = {"vehest.study": pipeline.study}
+        compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
+        raise_failures(compared.values(), workshop)
+        parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if part.name in compared}
+    job = ReportJob(
         study=pipeline.study,
         title=pipeline.title,
         about=pipeline.about,
-        command=_command(pipeline, overrides),
+        command=" ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides]),
         module=pipeline.report,
         titles={part.name: part.title for part in pipeline.parts},
-        parts=jobs,
+        parts=parts,
         absent=absent,
+        datasets=datasets,
     )
-    report = workshop.ensure(plan_parts(whole, workshop.output), lambda folder: write_parts(whole, folder))
-    left_out = {part.name: f"part '{part.name}'" for part in absent}
-    return _published(pipeline, configs, report, overrides, workshop, overview=overview_of(report), absent=left_out)
+    report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
+    left_out = {part.name: f"part '{part.name}'" for part in absent} | {own.name: f"data set '{own.name}'" for own in datasets.absent}
+    return _published(pipeline, configs, job, report, overrides, workshop, left_out)
 
 
 def _run_parts(
@@ -403,72 +402,69 @@ def datasets_of(pipeline: Pipeline, configs: Configs, workshop: Workshop) -> dic
     return {name: own for part in configs.values() for name, own in workshop.datasets_of(part[0]).items()}
 
 
-def _report_job(pipeline: Pipeline, compared: Compared, overrides: Sequence[str]) -> ReportJob:
-    return ReportJob(
-        study=pipeline.study,
-        title=pipeline.title,
-        about=pipeline.about,
-        command=_command(pipeline, overrides),
-        module=pipeline.report,
-        members=compared.members,
-        evaluation=compared.evaluation,
-        data_titles=compared.data_titles,
-        training=compared.facts,
-    )
+def _part_job(part: Part, compared: Compared) -> PartJob:
+    return PartJob(part.title, compared.members, compared.evaluation, compared.data_titles, compared.facts)
 
 
-def _run_survey(
-    pipeline: Pipeline, configs: Sequence[Config], overrides: Sequence[str], workshop: Workshop, *, only_report: bool
-) -> PipelineOutcome:
-    try:
-        here, ingested, absent = ingest_all(configs, pipeline.optional_datasets, workshop, only_report=only_report)
-    except NotThereYet:
+def _ingest_all(pipeline: Pipeline, configs: Sequence[Config], workshop: Workshop, *, only_report: bool) -> ShownDatasets:
+    """Ingest the data sets of a study of recordings alone, those left out whose raw files are not here though it can go on without them.
+
+    Raises:
+        MissingError: raw files are not here, or ``only_report`` and recordings are not there.
+        NotThereYet: in a dry run, after all were looked at.
+        Stopped: a signal came; what was ingested stays.
+    """
+    here: list[Config] = []
+    ingested: list[Artefact] = []
+    absent: list[AbsentDataset] = []
+    waits = False
+    for config in configs:
+        dataset = config["dataset"]
+        try:
+            plan = plan_ingest(config)
+        except MissingError as error:
+            if dataset["name"] not in pipeline.optional_datasets:
+                raise
+            workshop.messages.warn(f"{error}; the study goes on without it")
+            absent.append(AbsentDataset(dataset["name"], *(prose_of(dataset, key) for key in ("title", "licence", "citation"))))
+            continue
+        if only_report and find(plan) is None:
+            raise MissingError(f"data set '{plan.label}' has not been ingested; run 'vehest run' first")
+        try:
+            ingested.append(workshop.ingest(config))
+            here.append(config)
+        except NotThereYet:
+            waits = True
+    if waits:
         workshop.messages.line("plan", "report", pipeline.study)
-        raise
-    job = SurveyJob(
-        study=pipeline.study,
-        title=pipeline.title,
-        about=pipeline.about,
-        command=_command(pipeline, overrides),
-        module=pipeline.report,
-        configs=here,
-        ingested=ingested,
-        absent=absent,
-    )
-    report = workshop.ensure(plan_survey(job, workshop.output), lambda folder: write_survey(job, folder))
-    names = {dataset.name: f"data set '{dataset.name}'" for dataset in absent}
-    return _published(pipeline, {"": configs}, report, overrides, workshop, overview=overview_of(report), absent=names)
-
-
-def _command(pipeline: Pipeline, overrides: Sequence[str]) -> str:
-    return " ".join([f"vehest run pipelines/{pipeline.file.name}", *overrides])
+        raise NotThereYet
+    return ShownDatasets(here, ingested, absent)
 
 
 def _published(
     pipeline: Pipeline,
     configs: Configs,
+    job: ReportJob,
     report: Artefact,
     overrides: Sequence[str],
     workshop: Workshop,
-    table: pd.DataFrame | None = None,
-    overview: pd.DataFrame | None = None,
-    absent: Mapping[str, str] | None = None,
+    absent: Mapping[str, str],
 ) -> PipelineOutcome:
     """What a pipeline made, published as it is written: not what overrides changed.
 
     Args:
         pipeline: the study.
         configs: its jobs.
-        report: its report.
+        job: its report.
+        report: the same, drawn.
         overrides: what changed it.
         workshop: where stages ran.
-        table: its leaderboard.
-        overview: its overview.
         absent: name of what the study went on without -> what it is, for people.
     """
+    table, overview = shown_in_terminal(job, report)
     publication = None
     if pipeline.publish and not overrides:
-        publication = Publication(pipeline.study, absent or {}, _keys(pipeline, configs, absent or {}, workshop))
+        publication = Publication(pipeline.study, absent, _keys(pipeline, configs, absent, workshop))
     with workshop.messages.off_record():
         folder = None if workshop.dry_run else publish_study(publication, report, workshop.messages)
     return PipelineOutcome(report, pd.DataFrame() if table is None else table, folder, overview, publication)

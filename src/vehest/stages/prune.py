@@ -24,7 +24,7 @@ from vehest.data.files import ASIDE_PREFIX, aside_of, is_left_over, writing_erro
 from vehest.data.text_files import read_json
 from vehest.estimators.registry import estimator_module
 from vehest.sources.base import source_module
-from vehest.stages import downsample, evaluate, ingest, parts, report, survey, sweep, train
+from vehest.stages import downsample, evaluate, ingest, report, sweep, train
 from vehest.stages.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.stages.finished import FINISHED
 
@@ -145,8 +145,7 @@ def _code_of(artefact: Artefact, models: Sequence[Artefact]) -> str | None:
             return evaluate.code_of_evaluation(estimator_module(str(model.config["estimator"]["name"])))
         if artefact.stage == sweep.STAGE:
             return sweep.code_of_sweep()
-        drawn_by = parts if "parts" in config else survey if "datasets" in config else report
-        return report.code_of_report(str(config["module"]), drawn_by.__name__)
+        return report.code_of_report(str(config["module"]))
     except (VehestError, KeyError, TypeError, StopIteration):
         return None
 

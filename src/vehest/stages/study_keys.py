@@ -9,13 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from vehest.data.splits import dataset_names
 from vehest.estimators.registry import estimator_module
 from vehest.sources.base import kind_of, source_module
-from vehest.stages import parts, report, survey
 from vehest.stages.comparison import resampling_fact, training_facts
 from vehest.stages.config import Config
 from vehest.stages.downsample import code_of_downsampling
@@ -56,7 +54,7 @@ def keys_of_study(
         shown = [config for config in configs[""] if config["dataset"]["name"] not in absent]
         keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in shown}
         about |= {"datasets": [_titled(config) for config in configs[""]]}
-        return keys | {"report": _of_report(pipeline, survey, about)}
+        return keys | {"report": _of_report(pipeline, about)}
     for part in pipeline.parts:
         if part.name in absent:
             continue
@@ -65,7 +63,7 @@ def keys_of_study(
         keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in ingests if _ingest_name(config) not in keys}
         keys |= {f"{part.name}: {name}" if part.name else name: entry for name, entry in _of_jobs(own)}
         about[f"part {part.name}"] = [part.title, *training_facts(own), resampling_fact(own), *(_titled(config) for config in ingests)]
-    return keys | {"report": _of_report(pipeline, parts if pipeline.in_parts else report, about)}
+    return keys | {"report": _of_report(pipeline, about)}
 
 
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
@@ -89,8 +87,8 @@ def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, st
     return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
 
 
-def _of_report(pipeline: Pipeline, drawn_by: ModuleType, about: Mapping[str, Any]) -> dict[str, str]:
-    return {CODE: code_of_report(pipeline.report, drawn_by.__name__), CONFIGURATION: _hash(about)}
+def _of_report(pipeline: Pipeline, about: Mapping[str, Any]) -> dict[str, str]:
+    return {CODE: code_of_report(pipeline.report), CONFIGURATION: _hash(about)}
 
 
 def _ingest_name(config: Config) -> str:

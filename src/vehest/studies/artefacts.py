@@ -118,8 +118,8 @@ class EvaluatedModel:
 
 
 @dataclass(frozen=True)
-class StudyArtefacts:
-    """Everything a study module may look at.
+class PartArtefacts:
+    """One comparison: estimators that learnt on one split and were scored on it.
 
     Args:
         study: name of the study.
@@ -161,37 +161,9 @@ class StudyArtefacts:
         )
 
 
-@dataclass(frozen=True)
-class PartsArtefacts:
-    """Everything that a study in parts may look at.
-
-    Args:
-        study: name of the study.
-        title: its title.
-        about: a paragraph on what is compared, from the pipeline file.
-        command: the command that makes this report.
-        titles: part -> title, of all there are in the pipeline file.
-        parts: part -> what was compared in it.
-        absent: parts whose raw files were not here.
-    """
-
-    study: str
-    title: str
-    about: str
-    command: str
-    titles: Mapping[str, str]
-    parts: Mapping[str, StudyArtefacts]
-    absent: Sequence[str]
-
-    @property
-    def metrics(self) -> pd.DataFrame:
-        """Metrics of all parts, `METRIC_COLUMNS`; ``trained_on`` is followed by the part: ``sim_two_cars/scheme_1``."""
-        return of_parts({name: part.metrics for name, part in self.parts.items()})
-
-
 def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
-    """Tables of all parts as one; ``trained_on`` is followed by the part."""
-    named = [table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") for name, table in tables.items()]
+    """Tables of all parts as one; ``trained_on`` is followed by the part, where it has a name."""
+    named = [table.assign(trained_on=table["trained_on"].fillna("") + f"/{name}") if name else table for name, table in tables.items()]
     return pd.concat(named, ignore_index=True)
 
 
@@ -242,21 +214,38 @@ class AbsentDataset:
 
 
 @dataclass(frozen=True)
-class SurveyArtefacts:
-    """Everything that a study of recordings alone may look at.
+class StudyArtefacts:
+    """Everything that a study module may look at: parts that compare estimators, or data sets.
 
     Args:
         study: name of the study.
         title: its title.
-        about: a paragraph on what is shown, from the pipeline file.
+        about: a paragraph on what is compared or shown, from the pipeline file.
         command: the command that makes this report.
-        datasets: in the order of the pipeline file.
-        absent: those that could not be read.
+        titles: part -> title, of all there are in the pipeline file.
+        parts: part -> what was compared in it; a study that is not in parts has one without a name.
+        absent: parts whose raw files were not here.
+        datasets: of a study of recordings alone, in the order of the pipeline file.
+        absent_datasets: data sets that could not be read.
     """
 
     study: str
     title: str
     about: str
     command: str
-    datasets: Sequence[StoredDataset]
-    absent: Sequence[AbsentDataset]
+    titles: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
+    absent: Sequence[str] = ()
+    datasets: Sequence[StoredDataset] = ()
+    absent_datasets: Sequence[AbsentDataset] = ()
+
+    @property
+    def only(self) -> PartArtefacts:
+        """What was compared in a study that is not in parts."""
+        (part,) = self.parts.values()
+        return part
+
+    @property
+    def metrics(self) -> pd.DataFrame:
+        """Metrics of all parts, `METRIC_COLUMNS`; after ``trained_on`` the part, if it has a name: ``sim_two_cars/scheme_1``."""
+        return of_parts({name: part.metrics for name, part in self.parts.items()})

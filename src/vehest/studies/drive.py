@@ -1,6 +1,6 @@
 """The study of one car: estimators trained on some ranges of its drives and compared on others.
 
-Used by the pipelines ``ferrari_drive`` and ``quickstart``. `build` makes the report, `leaderboard` the table in it.
+Used by the pipelines ``ferrari_drive`` and ``quickstart``. `documents` makes the report, `leaderboard` the table in it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ from vehest.data.errors import printable
 from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import MISSING, REFERENCE, Line, decimals_for, fixed, lines_of
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
+TAKES = "split"
 ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
 
@@ -34,8 +35,13 @@ _OTHER_RANGES = (("sideslip", TRAINING), ("sideslip", VALIDATION), ("vy", VALIDA
 _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rmse_sideslip_std")
 
 
-def build(artefacts: StudyArtefacts) -> Document:
-    """The report of a study: headline, how it was made, then each test set, then the training.
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
+    """The report of a study that is not in parts; see `comparison`."""
+    return {REPORT: comparison(artefacts.only)}
+
+
+def comparison(artefacts: PartArtefacts) -> Document:
+    """The report of a comparison: headline, how it was made, then each test set, then the training.
 
     Raises:
         DataError: metrics are missing or ambiguous, or an estimate does not cover its range.
@@ -51,7 +57,7 @@ def build(artefacts: StudyArtefacts) -> Document:
     return Document(artefacts.title, blocks)
 
 
-def leaderboard(artefacts: StudyArtefacts) -> pd.DataFrame:
+def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     """One row per test set and (estimator, variant), the lowest RMSE(β) of a test set first.
 
     The figures are those of the seed with the lowest rmse_vy on the validation range (the lower seed of two equals): test
@@ -129,7 +135,7 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 # The words
 
 
-def _headline(artefacts: StudyArtefacts) -> list[Block]:
+def _headline(artefacts: PartArtefacts) -> list[Block]:
     titles = {name: as_text(models[0].title) for name, models in by_name(artefacts.models).items()}
     verdicts = [
         verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
@@ -143,13 +149,13 @@ def _headline(artefacts: StudyArtefacts) -> list[Block]:
     return blocks
 
 
-def _where(artefacts: StudyArtefacts, test_set: str) -> str:
+def _where(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
     kind = " and ".join(sorted({artefacts.kinds[span.dataset] for span in spans}))
     return f"test set `{test_set}` ({kind}; {_spans_in_words(spans)})"
 
 
-def _data_sentence(artefacts: StudyArtefacts) -> str:
+def _data_sentence(artefacts: PartArtefacts) -> str:
     kinds = {dataset: artefacts.kinds[dataset] for dataset in artefacts.split.datasets}
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
@@ -159,7 +165,7 @@ def _data_sentence(artefacts: StudyArtefacts) -> str:
     return f"**Real and simulated data:** {parts}."
 
 
-def _budget_sentence(artefacts: StudyArtefacts) -> str:
+def _budget_sentence(artefacts: PartArtefacts) -> str:
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = f"{counts[0]} {_plural('seed', counts[0])} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
@@ -172,7 +178,7 @@ def _budget_sentence(artefacts: StudyArtefacts) -> str:
     return words + "."
 
 
-def _how_it_was_made(artefacts: StudyArtefacts, board: pd.DataFrame) -> list[Block]:
+def _how_it_was_made(artefacts: PartArtefacts, board: pd.DataFrame) -> list[Block]:
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
@@ -199,7 +205,7 @@ def _how_it_was_made(artefacts: StudyArtefacts, board: pd.DataFrame) -> list[Blo
     return ["## How it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges]
 
 
-def _ranges(artefacts: StudyArtefacts) -> pd.DataFrame:
+def _ranges(artefacts: PartArtefacts) -> pd.DataFrame:
     split = artefacts.split
     roles = [("training", split.train), ("validation", split.validation)]
     roles += [(f"test: {name}", spans) for name, spans in split.tests.items()]
@@ -237,7 +243,7 @@ def _plural(word: str, count: int) -> str:
 # One test set
 
 
-def _test_set(artefacts: StudyArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> list[Block]:
+def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> list[Block]:
     file = re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
     blocks: list[Block] = [f"## Test set `{test_set}`", *_leaderboard_table(board, f"leaderboard_{file}", test_set)]
     lost = board[~np.isfinite(board["rmse_sideslip"])]
@@ -305,7 +311,7 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
     return [standing, seeds]
 
 
-def _spread(artefacts: StudyArtefacts, board: pd.DataFrame, test_set: str, name: str, lines: dict[Name, Line]) -> Figure:
+def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: str, lines: dict[Name, Line]) -> Figure:
     runs, groups = runs_of(artefacts), by_name(artefacts.models)
     rows = []
     for row in board.to_dict("records"):
@@ -344,7 +350,7 @@ class _Drive:
     zoom: tuple[float, float]
 
     @classmethod
-    def of(cls, artefacts: StudyArtefacts, board: pd.DataFrame, test_set: str) -> _Drive:
+    def of(cls, artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> _Drive:
         """Read the chosen seeds' estimates."""
         models = {(model.estimator, model.variant, model.seed): model for model in artefacts.models}
         chosen = {(row["estimator"], row["variant"]): row["seed"] for row in board.to_dict("records")}
@@ -435,7 +441,7 @@ def _figures_of(drive: _Drive, board: pd.DataFrame, file: str, lines: dict[Name,
 # The training
 
 
-def _training(artefacts: StudyArtefacts, board: pd.DataFrame, lines: dict[Name, Line]) -> list[Block]:
+def _training(artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, Line]) -> list[Block]:
     models = {(model.estimator, model.variant, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []

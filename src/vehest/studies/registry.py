@@ -1,7 +1,11 @@
 """Names of the modules that draw studies.
 
-A study called ``name`` is the module ``vehest.studies.name`` with a function that builds its report, or an entry point of another package
-in the group ``vehest.studies``; those that re-create papers come so, from ``vehest_papers``.
+A study called ``name`` is the module ``vehest.studies.name``, or an entry point of another package in the group ``vehest.studies``;
+those that re-create papers come so, from ``vehest_papers``. Such a module has
+
+- ``TAKES``: what its pipelines name, ``split``, ``parts`` or ``datasets``;
+- ``documents(artefacts: StudyArtefacts) -> {name: Document}``, of which one starts with ``report``;
+- ``leaderboard(artefacts: PartArtefacts) -> DataFrame``, if it takes a split, or a table ``overview`` in its report, for the terminal.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ Parts it knows: ``full``, which it needs, with one test set ``test`` of manoeuvr
 ``limited_alone``, ``causal`` on the same test set, and ``ferrari``.
 """
 
-from vehest_papers.cnn_ukf.document import build_parts
+from vehest_papers.cnn_ukf.document import documents
 
-__all__ = ["build_parts"]
+TAKES = "parts"
+
+__all__ = ["TAKES", "documents"]

@@ -11,14 +11,14 @@ from vehest.constants import FloatArray
 from vehest.evaluation.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import median_and_range
 from vehest_papers.cnn_ukf.subjects import LINES, Prepared, Run, Runs, chosen
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
 
 
-def figure_4(parts: Mapping[str, StudyArtefacts], prepared: Mapping[str, Prepared], titles: Mapping[str, str], data: str) -> Figure:
+def figure_4(parts: Mapping[str, PartArtefacts], prepared: Mapping[str, Prepared], titles: Mapping[str, str], data: str) -> Figure:
     """How often which sideslip angle and lateral acceleration is driven: training, validation and test of each part together."""
     driven = {name: _driven(part, prepared[name]) for name, part in parts.items()}
     labels = ("sideslip angle [deg]", "lateral acceleration [m/s²]")
@@ -48,7 +48,7 @@ def figure_4(parts: Mapping[str, StudyArtefacts], prepared: Mapping[str, Prepare
     return Figure("figure_4", caption, figure)
 
 
-def _driven(part: StudyArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatArray]:
+def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatArray]:
     """Sideslip angle [deg] and lateral acceleration [m/s²] of all samples."""
     spans = [*part.split.train, *part.split.validation, *(span for own in part.split.tests.values() for span in own)]
     pieces = [prepared.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]

@@ -10,9 +10,9 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.estimators.cnn_ukf import MOST_NOISE
 from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
-from vehest.report.document import Block, Column, Document, Table, as_code
+from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, listed
-from vehest.studies.artefacts import PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.order import differences, order_in_words, pairs_table
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.cnn_ukf import distributions, paper, reasons, robustness, tables, traces
@@ -34,7 +34,7 @@ ON_THE_SAME_TEST = (FULL, LIMITED, ALONE, CAUSAL)
 ROMAN = {FULL: "II", LIMITED: "III"}
 
 
-def build_parts(artefacts: PartsArtefacts) -> Document:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
@@ -66,10 +66,10 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     if FERRARI in artefacts.parts:
         blocks += _ferrari(artefacts.parts[FERRARI], artefacts.titles[FERRARI])
     blocks += _filters_and_budget(artefacts, parts, runs)
-    return Document(artefacts.title, blocks, data)
+    return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
+def departures(parts: Mapping[str, PartArtefacts]) -> list[str]:
     """Sentences, of what departs; settings from the trainings."""
     trainings = {candidate_of(model): model.training for part in parts.values() for model in part.models}
     lines = [
@@ -108,7 +108,7 @@ def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
     ]
 
 
-def overview(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> Table:
+def overview(artefacts: StudyArtefacts, runs: Mapping[str, Runs]) -> Table:
     """What the terminal shows: both errors of both sets, beside the paper's."""
     rows = []
     for name in (FULL, LIMITED):
@@ -130,7 +130,7 @@ def overview(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> Table:
     return Table("overview", caption, pd.DataFrame(rows), columns)
 
 
-def _headline(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> list[Block]:
+def _headline(artefacts: StudyArtefacts, runs: Mapping[str, Runs]) -> list[Block]:
     kinds = [f"**{artefacts.titles[name]}: {words_of_kinds(part).upper()} data**" for name, part in artefacts.parts.items()]
     words = "; ".join(kinds) + ". The paper's recordings are real, of a BMW 545i, and not public."
     if artefacts.absent:
@@ -150,7 +150,7 @@ def _headline(artefacts: PartsArtefacts, runs: Mapping[str, Runs]) -> list[Block
     return [words, "\n\n".join(sentences), artefacts.about]
 
 
-def _how_it_was_made(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefacts]) -> list[Block]:
+def _how_it_was_made(artefacts: StudyArtefacts, parts: Mapping[str, PartArtefacts]) -> list[Block]:
     protocol = parts[FULL].protocol
     facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
     lines = [
@@ -186,7 +186,7 @@ def _how_it_was_made(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefac
     ]
 
 
-def _set(name: str, artefacts: PartsArtefacts, runs: Runs, prepared: Prepared, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _set(name: str, artefacts: StudyArtefacts, runs: Runs, prepared: Prepared, data: dict[str, pd.DataFrame]) -> list[Block]:
     """Table II or III and what belongs to it."""
     part, title = artefacts.parts[name], artefacts.titles[name]
     kind, published = words_of_kinds(part).upper(), paper.TABLES[name]
@@ -232,7 +232,7 @@ def _set(name: str, artefacts: PartsArtefacts, runs: Runs, prepared: Prepared, d
     return blocks
 
 
-def _traces(name: str, part: StudyArtefacts, picked: Mapping[str, Run], prepared: Prepared, kind: str) -> list[Block]:
+def _traces(name: str, part: PartArtefacts, picked: Mapping[str, Run], prepared: Prepared, kind: str) -> list[Block]:
     warm_up = part.protocol.warm_up_seconds
     if name == LIMITED:
         turn = traces.manoeuvre_of(part, prepared, "J-turn")
@@ -285,7 +285,7 @@ def _causal(runs: Mapping[str, Runs], kind: str) -> list[Block]:
     return ["## What causal preprocessing costs", tables.causal_cost(runs[FULL], runs[CAUSAL], "causal", caption)]
 
 
-def _ferrari(part: StudyArtefacts, title: str) -> list[Block]:
+def _ferrari(part: PartArtefacts, title: str) -> list[Block]:
     kind = words_of_kinds(part).upper()
     caption = (
         f"{title}: the paper's methods as their titles say, beside the other families, read at {part.protocol.rate_hz:g} Hz. Learnt on "
@@ -295,7 +295,7 @@ def _ferrari(part: StudyArtefacts, title: str) -> list[Block]:
     return ["## Another car, without tyre forces", tables.another_car_table(part, "ferrari", caption)]
 
 
-def _filters_and_budget(artefacts: PartsArtefacts, parts: Mapping[str, StudyArtefacts], runs: Mapping[str, Runs]) -> list[Block]:
+def _filters_and_budget(artefacts: StudyArtefacts, parts: Mapping[str, PartArtefacts], runs: Mapping[str, Runs]) -> list[Block]:
     titled = {name: (artefacts.titles[name], own) for name, own in runs.items()}
     blocks: list[Block] = ["## Filters and budget"]
     if LIMITED in runs:

@@ -23,7 +23,7 @@ from vehest.evaluation.manoeuvres import Kpis, is_nonlinear, kpis, manoeuvres_of
 from vehest.evaluation.metrics import Scored, score_all
 from vehest.evaluation.significance import sequence_labels
 from vehest.report.style import Line
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.cnn_ukf import paper
 
 TEST = "test"
@@ -97,7 +97,7 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
     return of_filter if isinstance(of_filter, DugoffUkf) else None
 
 
-def runs_of(part: StudyArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
+def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     """Candidate -> its seeds, in the order of Table II.
 
     Args:
@@ -165,7 +165,7 @@ class Prepared:
     sample counts as non-linear is a matter of the low-passed lateral acceleration.
     """
 
-    def __init__(self, part: StudyArtefacts) -> None:
+    def __init__(self, part: PartArtefacts) -> None:
         self._part = part
         self._read: dict[tuple[str, str], Recording] = {}
 

@@ -19,7 +19,7 @@ from vehest.evaluation.consistency import COVERAGE
 from vehest.evaluation.manoeuvres import is_nonlinear, sideslip_error
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import median_and_range, metric_values
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, chosen, filter_of
@@ -66,7 +66,7 @@ def accuracy(runs: Runs, published: Mapping[str, paper.Published], name: str, ca
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def consistency(part: StudyArtefacts, runs: Runs, name: str, caption: str) -> Table:
+def consistency(part: PartArtefacts, runs: Runs, name: str, caption: str) -> Table:
     """Against the reference as measured: MSE, coverage of the bands of vy and NIS, from the evaluation's own metrics."""
     known = metric_values(part)
     rows: list[dict[str, object]] = [
@@ -237,7 +237,7 @@ def causal_cost(offline: Runs, causal: Runs, name: str, caption: str) -> Table:
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def another_car(part: StudyArtefacts) -> pd.DataFrame:
+def another_car(part: PartArtefacts) -> pd.DataFrame:
     """Errors of every estimator on another car's test range, best first.
 
     Columns: title, median (of RMSE(β) over seeds [deg]), rmse, validation, nonlinear and largest (in words), n_seeds.
@@ -269,7 +269,7 @@ def another_car(part: StudyArtefacts) -> pd.DataFrame:
     return pd.DataFrame(rows).sort_values("median", kind="stable", ignore_index=True)
 
 
-def another_car_table(part: StudyArtefacts, name: str, caption: str) -> Table:
+def another_car_table(part: PartArtefacts, name: str, caption: str) -> Table:
     """`another_car` as it is shown."""
     columns = {
         "title": Column("estimator"),
@@ -282,7 +282,7 @@ def another_car_table(part: StudyArtefacts, name: str, caption: str) -> Table:
     return Table(name, caption, another_car(part), columns)
 
 
-def budget(parts: Mapping[str, tuple[str, StudyArtefacts, Runs]], name: str, caption: str) -> Table:
+def budget(parts: Mapping[str, tuple[str, PartArtefacts, Runs]], name: str, caption: str) -> Table:
     """Seeds, epochs and parameters, by part and candidate."""
     rows = []
     for title, part, runs in parts.values():

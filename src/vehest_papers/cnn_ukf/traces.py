@@ -17,7 +17,7 @@ from vehest.evaluation.manoeuvres import group_of, sideslip_error
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.subjects import LINES, TEST, Prepared, Run
 
@@ -25,7 +25,7 @@ HYBRIDS = (paper.DEEP, paper.CNN)
 LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
-def manoeuvre_of(part: StudyArtefacts, prepared: Prepared, group: str) -> Span:
+def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin.
 
     Raises:

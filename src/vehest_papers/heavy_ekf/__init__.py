@@ -3,6 +3,8 @@
 Parts it knows: ``truck``, which it needs, with test sets ``TYRES_laps`` and ``TYRES_fast``, and ``ferrari``, which it goes on without.
 """
 
-from vehest_papers.heavy_ekf.document import build_parts
+from vehest_papers.heavy_ekf.document import documents
 
-__all__ = ["build_parts"]
+TAKES = "parts"
+
+__all__ = ["TAKES", "documents"]

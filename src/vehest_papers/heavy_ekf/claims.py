@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from vehest.evaluation.ranking import Name, Ranking
 from vehest.report.document import Block, as_text
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.claims import Claim, bound_claim, claims_table, order_claim
 from vehest.studies.kit.reading import words_of_kinds
 from vehest.studies.kit.standing import ranking_of, verdict_sentences
@@ -20,20 +20,20 @@ LAPS, FAST, REAL = "nominal_laps", "nominal_fast", "test"
 ASKED = [(better, worse) for better, worse in paper.GAINS]
 
 
-def titles_of(part: StudyArtefacts) -> dict[Name, str]:
+def titles_of(part: PartArtefacts) -> dict[Name, str]:
     """Estimator and variant -> what it is called in this report, for all models of a part."""
     names = {(model.estimator, model.variant) for model in part.models}
     return {name: paper.VARIANTS[name[1]] if name[0] == FAMILY else BASELINE_TITLES.get(name[0], ": ".join(name)) for name in names}
 
 
-def rankings_of(part: StudyArtefacts) -> dict[str, Ranking]:
+def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
     """Test set -> its ranking, with the pairs whose order the paper claims among those compared."""
     variant_of = {title: variant for variant, title in paper.VARIANTS.items()}
     asked = [((FAMILY, variant_of[better]), (FAMILY, variant_of[worse])) for better, worse in ASKED]
     return {test: ranking_of(part, test, asked=asked) for test in part.split.tests}
 
 
-def claims_blocks(truck: StudyArtefacts, ferrari: StudyArtefacts | None, part_titles: Sequence[str]) -> list[Block]:
+def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, part_titles: Sequence[str]) -> list[Block]:
     """The table of claims, then a sentence a test on who may be called best, then what to mind."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
@@ -63,7 +63,7 @@ def _on_the_fast_lap(better: str, worse: str) -> str:
     return f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
 
 
-def baseline_errors(part: StudyArtefacts) -> Mapping[tuple[str, str], float]:
+def baseline_errors(part: PartArtefacts) -> Mapping[tuple[str, str], float]:
     """(baseline's title, test set) -> RMSE(β) [deg], as evaluated."""
     metrics = part.metrics
     chosen = metrics[

@@ -10,8 +10,8 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.transforms import SpeedFromWheels
-from vehest.report.document import Block, Column, Document, Figure, Table, as_code
-from vehest.studies.artefacts import PartsArtefacts, StudyArtefacts
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.heavy_ekf import claims, laps, paper, tables, tyres, watching
 from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
@@ -22,7 +22,7 @@ NOMINAL = "nominal_laps"
 REAL_TRACE = "sideslip_ferrari"
 
 
-def build_parts(artefacts: PartsArtefacts) -> Document:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
@@ -54,7 +54,7 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
         *[block for block in of_ferrari if not _is_real_trace(block)],
         *_how_it_was_made(artefacts),
     ]
-    return Document(artefacts.title, blocks, {})
+    return {REPORT: Document(artefacts.title, blocks, {})}
 
 
 def _is_real_trace(block: Block) -> bool:
@@ -62,7 +62,7 @@ def _is_real_trace(block: Block) -> bool:
     return isinstance(block, Figure) and block.name == REAL_TRACE
 
 
-def _asked(artefacts: PartsArtefacts) -> list[Block]:
+def _asked(artefacts: StudyArtefacts) -> list[Block]:
     kinds = [f"**{artefacts.titles[name]}: {words_of_kinds(part).upper()} data**" for name, part in artefacts.parts.items()]
     words = "; ".join(kinds) + ". The paper's recordings are real, of another vehicle, and not public."
     if artefacts.absent:
@@ -71,7 +71,7 @@ def _asked(artefacts: PartsArtefacts) -> list[Block]:
     return [words, artefacts.about]
 
 
-def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
+def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     first = artefacts.parts[TRUCK]
     facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
     lines = [
@@ -114,7 +114,7 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
 
 
 def _truck(
-    part: StudyArtefacts,
+    part: PartArtefacts,
     filters: Mapping[str, Filter],
     rmse: tables.Rmse,
     drives: Mapping[str, Recording],
@@ -171,7 +171,7 @@ def _truck(
     return blocks
 
 
-def _ferrari(part: StudyArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse) -> list[Block]:
+def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse) -> list[Block]:
     data = words_of_kinds(part).upper()
     settings = filters[paper.RATTE].fitted.settings
     span = part.split.tests["test"][0]

@@ -16,7 +16,7 @@ from vehest.estimators.filtering.tyre_fit import TyreFit, axle_force, axle_motio
 from vehest.estimators.model_files import load_model
 from vehest.estimators.rational_ekf import RationalFilter
 from vehest.report.style import REFERENCE, Line
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import recordings_of
 from vehest_papers.heavy_ekf import paper
 
@@ -52,7 +52,7 @@ class Filter:
         return self.fitted.estimate([drive.without_references()])[0]
 
 
-def filters_of(part: StudyArtefacts) -> dict[str, Filter]:
+def filters_of(part: PartArtefacts) -> dict[str, Filter]:
     """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first.
 
     Raises:
@@ -71,13 +71,13 @@ def filters_of(part: StudyArtefacts) -> dict[str, Filter]:
     return {name: found[name] for name in paper.VARIANTS.values() if name in found}
 
 
-def whole_drive(part: StudyArtefacts, test: str) -> Recording:
+def whole_drive(part: PartArtefacts, test: str) -> Recording:
     """The recording that a test set is a part of, all of it, references included, at the evaluation rate."""
     span = part.split.tests[test][0]
     return read_recording(part.references[span.dataset, span.recording])
 
 
-def validation_drives(part: StudyArtefacts) -> list[Recording]:
+def validation_drives(part: PartArtefacts) -> list[Recording]:
     """Drives that the filters were neither fitted nor tuned to."""
     return recordings_of(part, part.split.validation)
 
@@ -99,7 +99,7 @@ def moving(drive: Recording, minimum_speed: float) -> FloatArray:
     return np.where(drive["vx"] >= minimum_speed, 1.0, np.nan)
 
 
-def rmse_of(part: StudyArtefacts, filters: Mapping[str, Filter]) -> dict[tuple[str, str], float]:
+def rmse_of(part: PartArtefacts, filters: Mapping[str, Filter]) -> dict[tuple[str, str], float]:
     """(name, test set) -> RMSE(β) [deg], as evaluated."""
     metrics = part.metrics[
         (part.metrics["metric"] == "rmse_sideslip") & (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")

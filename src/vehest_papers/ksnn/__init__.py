@@ -4,6 +4,8 @@ Parts it knows: ``scheme_1`` and ``scheme_2``, which it needs; ``one_vehicle``, 
 ``ferrari_devbot``, which it goes on without. Test sets of the schemes are called ``c2`` and ``f2``.
 """
 
-from vehest_papers.ksnn.document import build_parts
+from vehest_papers.ksnn.document import documents
 
-__all__ = ["build_parts"]
+TAKES = "parts"
+
+__all__ = ["TAKES", "documents"]

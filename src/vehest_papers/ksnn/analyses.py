@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.data.recording import Recording
 from vehest.report.document import Block
-from vehest.studies.artefacts import EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.reading import recordings_of, words_of_kinds
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.activation import activation
@@ -28,7 +28,7 @@ TESTED_ON = {"scheme_1": ("Ferrari F-2", "f2"), "scheme_2": ("Corvette C-2", "c2
 Runs = Mapping[str, pd.DataFrame]
 
 
-def of_the_data(artefacts: PartsArtefacts) -> list[Block]:
+def of_the_data(artefacts: StudyArtefacts) -> list[Block]:
     """Table I, Figures 4 and 5: the four sets, and the real drive where it is at hand."""
     first, second = artefacts.parts["scheme_1"], artefacts.parts["scheme_2"]
     sets: dict[str, list[Recording]] = {
@@ -45,7 +45,7 @@ def of_the_data(artefacts: PartsArtefacts) -> list[Block]:
     return data_quality(sets, source)
 
 
-def of_activation(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
+def of_activation(artefacts: StudyArtefacts, runs: Runs) -> list[Block]:
     """Figure 3: a network with three local models, as in the paper's example, or the chosen one where there is none."""
     part, own = artefacts.parts["scheme_1"], runs["scheme_1"]
     networks = own[own["estimator"] == "ksnn"]
@@ -56,7 +56,7 @@ def of_activation(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
     return activation(_trained(part, run, "scheme_1"), recordings_of(part, [span for spans in part.split.tests.values() for span in spans]))
 
 
-def of_sensitivities(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
+def of_sensitivities(artefacts: StudyArtefacts, runs: Runs) -> list[Block]:
     """Figure 7: KS-NN linear no bias beside the Luenberger observer, a column a scheme."""
     columns = []
     for name in TRAINED_ON:
@@ -67,7 +67,7 @@ def of_sensitivities(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
     return sensitivities(columns) if columns else []
 
 
-def of_residuals(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
+def of_residuals(artefacts: StudyArtefacts, runs: Runs) -> list[Block]:
     """Figure 8: KS-NN nonlinear no bias, Luenberger and LSTM on the car that they have not learnt on."""
     panels = []
     for name, (title, test) in TESTED_ON.items():
@@ -81,7 +81,7 @@ def of_residuals(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
     return residuals(panels) if panels else []
 
 
-def of_interpretation(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
+def of_interpretation(artefacts: StudyArtefacts, runs: Runs) -> list[Block]:
     """Section IV: networks of both schemes, and how an estimate comes about where a test drive slides most."""
     picked = {name: chosen_by_category(runs[name]) for name in TRAINED_ON}
     linear, nonlinear = (
@@ -99,11 +99,11 @@ def of_interpretation(artefacts: PartsArtefacts, runs: Runs) -> list[Block]:
     return interpretation(linear, nonlinear, drive, stretch, f"{title}, {words_of_kinds(part)}, recording {drive.id}")
 
 
-def model_of(part: StudyArtefacts, run: pd.Series) -> EvaluatedModel:
+def model_of(part: PartArtefacts, run: pd.Series) -> EvaluatedModel:
     """The model of a run."""
     key = (run["estimator"], run["variant"], run["seed"])
     return next(model for model in part.models if (model.estimator, model.variant, model.seed) == key)
 
 
-def _trained(part: StudyArtefacts, run: pd.Series, name: str) -> Trained:
+def _trained(part: PartArtefacts, run: pd.Series, name: str) -> Trained:
     return Trained.of(model_of(part, run), f"{TRAINED_ON[name]}, {words_of_kinds(part)}")

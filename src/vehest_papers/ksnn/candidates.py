@@ -30,7 +30,7 @@ _NAMES = {
 }
 
 
-def runs_of(part: artefacts.StudyArtefacts) -> pd.DataFrame:
+def runs_of(part: artefacts.PartArtefacts) -> pd.DataFrame:
     """One row a run, in the order of the pipeline.
 
     Columns: estimator, variant, title, category, structure, seed, ``n_parameters``, ``epochs``, and for each set

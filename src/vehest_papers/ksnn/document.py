@@ -9,9 +9,9 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Table, as_code
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, percent_below
-from vehest.studies.artefacts import PartsArtefacts
+from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
 from vehest.studies.sweep import interval, mean_and_half
 from vehest_papers.ksnn import analyses, paper, scatter, tables
@@ -29,7 +29,7 @@ ONE_SIMULATOR = (
 ALIKE = " With cars that differ this much, structure pays; the two simulated cars are most likely too much alike to show it."
 
 
-def build_parts(artefacts: PartsArtefacts) -> Document:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
@@ -67,10 +67,10 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     blocks += ["## What the networks have learnt", *analyses.of_interpretation(artefacts, runs)]
     blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), PATENT_NOTE]
     data = {f"candidates_{name}": tables.candidates(runs[name], list(tables.SETS)) for name in SCHEMES}
-    return Document(artefacts.title, blocks, data)
+    return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def _headline(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
+def _headline(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
     kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
     schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
     others = [f"{artefacts.titles[name]}: {kind}" for name, kind in kinds.items() if name not in SCHEMES]
@@ -100,7 +100,7 @@ def _scheme_sentence(title: str, runs: pd.DataFrame, other: str) -> str:
     return words + "."
 
 
-def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
+def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     first = artefacts.parts["scheme_1"]
     protocol = first.protocol
     facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
@@ -133,7 +133,7 @@ def _how_it_was_made(artefacts: PartsArtefacts) -> list[Block]:
     ]
 
 
-def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
+def _schemes(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
     kind = words_of_kinds(artefacts.parts["scheme_1"]).upper()
     columns = [scatter.Scheme(artefacts.titles[name], runs[name], *known) for name, known in SCHEMES.items()]
     caption = (
@@ -156,7 +156,7 @@ def _schemes(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> lis
     return blocks
 
 
-def _other_cars(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame], *, alike: bool) -> list[Block]:
+def _other_cars(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame], *, alike: bool) -> list[Block]:
     """Both schemes with other cars, where their recordings are at hand; ``alike`` where the cars of the schemes are simulated."""
     blocks: list[Block] = []
     for name in ("devbot_ferrari", "ferrari_devbot"):
@@ -179,7 +179,7 @@ def _shares_a_car(spans: Sequence[Span], others: Sequence[Span]) -> bool:
     return bool({span.dataset for span in spans} & {span.dataset for span in others})
 
 
-def overview(artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame]) -> Table:
+def overview(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> Table:
     """What the terminal shows: FVU on the car not trained on, beside the paper's."""
     rows = []
     for name, (published, own, other) in SCHEMES.items():

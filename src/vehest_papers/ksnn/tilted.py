@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.report.document import Block, Column, Table
 from vehest.report.style import fixed
-from vehest.studies.artefacts import PartsArtefacts
+from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.sweep import interval, mean_and_half
 from vehest_papers.ksnn.candidates import chosen_by_category, seeds_like
 from vehest_papers.ksnn.paper import Published
@@ -26,7 +26,7 @@ shift a_y by just these amounts, on top of what is drawn."""
 
 
 def tilted(
-    artefacts: PartsArtefacts, runs: Mapping[str, pd.DataFrame], schemes: Mapping[str, tuple[Mapping[str, Published], str, str]]
+    artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame], schemes: Mapping[str, tuple[Mapping[str, Published], str, str]]
 ) -> list[Block]:
     """FVU on the other car without and with the tilt, where a part ``tilted_1`` or ``tilted_2`` is there.
 

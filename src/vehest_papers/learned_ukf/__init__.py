@@ -4,6 +4,8 @@ Parts it knows: ``real`` and ``simulated``, of which it needs one, each with the
 same candidate trained on sequences of different length, which it goes on without.
 """
 
-from vehest_papers.learned_ukf.document import build_parts
+from vehest_papers.learned_ukf.document import documents
 
-__all__ = ["build_parts"]
+TAKES = "parts"
+
+__all__ = ["TAKES", "documents"]

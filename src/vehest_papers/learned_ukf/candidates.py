@@ -14,7 +14,7 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.evaluation.metrics import weighted_squared_errors
 from vehest.evaluation.significance import sequence_labels
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
 
@@ -47,7 +47,7 @@ def candidate_of(model: EvaluatedModel) -> str:
     return _NETWORKS.get(model.estimator, model.title)
 
 
-def models_by_candidate(part: StudyArtefacts) -> dict[str, list[EvaluatedModel]]:
+def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
     """Candidate -> its seeds, in the order of Table II; others come last.
 
     Raises:
@@ -63,7 +63,7 @@ def models_by_candidate(part: StudyArtefacts) -> dict[str, list[EvaluatedModel]]
     return {name: sorted(groups[name], key=lambda model: model.seed) for name in order}
 
 
-def runs_of(part: StudyArtefacts) -> pd.DataFrame:
+def runs_of(part: PartArtefacts) -> pd.DataFrame:
     """One row a run, candidates in the order of Table II.
 
     Columns: candidate, estimator, variant, seed, ``mse_weighted.validation``, `OF_MODEL`, and for each test set ``METRIC.SET`` of
@@ -94,13 +94,13 @@ def of_candidate(runs: pd.DataFrame, candidate: str, column: str) -> FloatArray:
     return runs[runs["candidate"] == candidate][column].to_numpy(dtype=np.float64)
 
 
-def chosen(part: StudyArtefacts, runs: pd.DataFrame, candidate: str) -> EvaluatedModel:
+def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> EvaluatedModel:
     """The seed with the lowest weighted MSE on the validation range. Test sets choose nothing."""
     own = of_candidate(runs, candidate, f"mse_weighted.{VALIDATION}")
     return models_by_candidate(part)[candidate][int(np.argmin(np.where(np.isfinite(own), own, np.inf)))]
 
 
-def losses(part: StudyArtefacts, test: str) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
+def losses(part: PartArtefacts, test: str) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
     """Weighted squared errors of every seed at every scored sample, and the sequence that each sample belongs to.
 
     Returns:

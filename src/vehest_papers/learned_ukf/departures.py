@@ -9,7 +9,7 @@ import pandas as pd
 
 from vehest.estimators.model_files import load_model
 from vehest.report.style import listed
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import models_by_candidate
 
@@ -19,7 +19,7 @@ PAPER_BATCH = 256
 PAPER_DROPPED = 200
 
 
-def settings_table(parts: Mapping[str, StudyArtefacts]) -> pd.DataFrame:
+def settings_table(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
     """One row a part, candidate and setting of its training."""
     rows = [
         {"part": name, "candidate": candidate, "setting": key, "value": value}
@@ -30,7 +30,7 @@ def settings_table(parts: Mapping[str, StudyArtefacts]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["part", "candidate", "setting", "value"])
 
 
-def departures(parts: Mapping[str, StudyArtefacts]) -> list[str]:
+def departures(parts: Mapping[str, PartArtefacts]) -> list[str]:
     """Sentences, of what departs only."""
     filters = [model for part in parts.values() for model in part.models if model.estimator == "learned_ukf"]
     lines = [

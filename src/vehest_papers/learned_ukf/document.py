@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.report.document import Block, Column, Document, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Column, Document, Table, as_code, as_text
 from vehest.report.style import fixed, listed
-from vehest.studies.artefacts import EvaluatedModel, PartsArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.order import differences, order_in_words, pairs_table
 from vehest.studies.kit.reading import recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, prediction, slips, tables, traces
@@ -29,7 +29,7 @@ Runs = Mapping[str, pd.DataFrame]
 """Part -> its runs."""
 
 
-def build_parts(artefacts: PartsArtefacts) -> Document:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
@@ -50,10 +50,10 @@ def build_parts(artefacts: PartsArtefacts) -> Document:
     of_length = {name: part for name, part in artefacts.parts.items() if name.startswith(LENGTH)}
     if of_length:
         blocks += ["## Length of the training sequences", *figure_7(of_length)]
-    return Document(artefacts.title, blocks, data)
+    return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def overview(artefacts: PartsArtefacts, runs: Runs) -> Table:
+def overview(artefacts: StudyArtefacts, runs: Runs) -> Table:
     """What the terminal shows: weighted MSE on both tyres, beside the paper's."""
     rows = []
     for name, own in runs.items():
@@ -72,7 +72,7 @@ def overview(artefacts: PartsArtefacts, runs: Runs) -> Table:
     return Table("overview", "The short of it: MSE (weighted), ours as medians of seeds.", pd.DataFrame(rows), columns)
 
 
-def _headline(artefacts: PartsArtefacts, main: Mapping[str, StudyArtefacts], runs: Runs) -> list[Block]:
+def _headline(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts], runs: Runs) -> list[Block]:
     kinds = {name: words_of_kinds(part).upper() for name, part in main.items()}
     words = "; ".join(f"**{artefacts.titles[name]}: {kind} data**" for name, kind in kinds.items()) + ". The paper's are real."
     if artefacts.absent:
@@ -98,7 +98,7 @@ def _result(title: str, name: str, runs: pd.DataFrame) -> str:
     return f"{title}. {' '.join(sentences)} Medians of seeds."
 
 
-def _how_it_was_made(artefacts: PartsArtefacts, main: Mapping[str, StudyArtefacts], data: dict[str, pd.DataFrame]) -> list[Block]:
+def _how_it_was_made(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts], data: dict[str, pd.DataFrame]) -> list[Block]:
     first = next(iter(main.values()))
     protocol = first.protocol
     trained = {model.estimator for part in artefacts.parts.values() for model in part.models}
@@ -138,12 +138,12 @@ def _how_it_was_made(artefacts: PartsArtefacts, main: Mapping[str, StudyArtefact
     ]
 
 
-def _sequences(part: StudyArtefacts, test: str) -> str:
+def _sequences(part: PartArtefacts, test: str) -> str:
     counted = part.metrics[(part.metrics["test_set"] == test) & (part.metrics["metric"] == "n_sequences")]["value"]
     return f"; {int(counted.iloc[0])} sequences" if len(counted) else ""
 
 
-def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _part(title: str, name: str, part: PartArtefacts, runs: pd.DataFrame, data: dict[str, pd.DataFrame]) -> list[Block]:
     kind = words_of_kinds(part).upper()
     where = f"{kind}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
     blocks: list[Block] = [f"## {title}\n\nAll that follows in this section is {kind}.", *_slips(part, name, where, data)]
@@ -189,7 +189,7 @@ def _part(title: str, name: str, part: StudyArtefacts, runs: pd.DataFrame, data:
     return [*blocks, "### Budget", tables.budget(part, runs, f"budget_{name}", caption)]
 
 
-def _slips(part: StudyArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _slips(part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
     filters = [model for model in part.models if model.estimator == "learned_ukf"]
     if not filters:
         return []
@@ -217,7 +217,7 @@ def _errors_and_consistency(name: str, runs: pd.DataFrame, kind: str) -> list[Bl
     ]
 
 
-def _definiteness(part: StudyArtefacts, name: str, runs: pd.DataFrame, kind: str) -> list[Block]:
+def _definiteness(part: PartArtefacts, name: str, runs: pd.DataFrame, kind: str) -> list[Block]:
     groups = {name: own for name, own in models_by_candidate(part).items() if name in WITH_TYRE_NETWORK}
     if not groups:
         return []
@@ -248,7 +248,7 @@ def _definiteness(part: StudyArtefacts, name: str, runs: pd.DataFrame, kind: str
     ]
 
 
-def _figure_4(part: StudyArtefacts, name: str, runs: pd.DataFrame, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _figure_4(part: PartArtefacts, name: str, runs: pd.DataFrame, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
     groups = models_by_candidate(part)
     shown: dict[str, EvaluatedModel] = {candidate: chosen(part, runs, candidate) for candidate in SHOWN_IN_FIGURE_4 if candidate in groups}
     if not shown:
@@ -258,7 +258,7 @@ def _figure_4(part: StudyArtefacts, name: str, runs: pd.DataFrame, where: str, d
     return ["### A hard sequence", figure]
 
 
-def _figures_5_and_6(part: StudyArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
+def _figures_5_and_6(part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFrame]) -> list[Block]:
     groups = models_by_candidate(part)
     by_seed: Sequence[dict[int, EvaluatedModel]] = [
         {model.seed: model for model in groups.get(candidate, [])} for candidate in (prediction.BEFORE, prediction.AFTER)

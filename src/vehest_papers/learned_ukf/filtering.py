@@ -17,7 +17,7 @@ from vehest.evaluation.metrics import WEIGHTS, sequences
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.unscented_scan import Array, PointModel
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES
 
@@ -84,7 +84,7 @@ def loaded(model: EvaluatedModel) -> LearnedUkf:
     return estimator
 
 
-def drives_of(part: StudyArtefacts, estimator: LearnedUkf, test: str) -> Drive:
+def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
     """The sequences of a test set, as the filter takes them, side by side: (B, T, ...).
 
     Raises:

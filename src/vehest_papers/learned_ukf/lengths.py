@@ -11,14 +11,14 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import OTHER_COLOURS, SINGLE_COLUMN, legend_above, new_figure, paper_style
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import words_of_kinds
 from vehest_papers.learned_ukf.candidates import SETS, runs_of
 
 _SUBSCRIPT_U = re.compile(r"_uh?(_|$)")
 
 
-def lengths(parts: Mapping[str, StudyArtefacts]) -> pd.DataFrame:
+def lengths(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
     """One row a run of the parts, sorted by length: steps, batch, candidate, seed, epochs, ``mse.SET``.
 
     Raises:
@@ -38,7 +38,7 @@ def lengths(parts: Mapping[str, StudyArtefacts]) -> pd.DataFrame:
     return pd.DataFrame(rows).sort_values(["steps", "seed"], kind="stable").reset_index(drop=True)
 
 
-def figure_7(parts: Mapping[str, StudyArtefacts]) -> list[Block]:
+def figure_7(parts: Mapping[str, PartArtefacts]) -> list[Block]:
     """The figure and its table."""
     first = next(iter(parts.values()))
     frame, tests = lengths(parts), list(first.split.tests)

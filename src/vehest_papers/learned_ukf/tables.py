@@ -11,7 +11,7 @@ import pandas as pd
 from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import median_and_range
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
@@ -133,7 +133,7 @@ def definiteness(
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def budget(part: StudyArtefacts, runs: pd.DataFrame, name: str, caption: str) -> Table:
+def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> Table:
     """Seeds, epochs, parameters and skipped steps, by candidate."""
     rows = []
     for candidate, models in models_by_candidate(part).items():

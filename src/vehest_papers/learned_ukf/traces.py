@@ -27,7 +27,7 @@ from vehest.report.style import (
     new_figure,
     paper_style,
 )
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
 
 
 def hard_sequence(
-    part: StudyArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
+    part: PartArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
 ) -> tuple[Figure, pd.DataFrame]:
     """Reference and estimates over the sequence on which the shown models together err most.
 

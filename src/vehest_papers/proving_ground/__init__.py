@@ -5,4 +5,6 @@ Used by the pipeline ``proving_ground``. `documents` makes an index and a page a
 
 from vehest_papers.proving_ground.pages import documents
 
-__all__ = ["documents"]
+TAKES = "datasets"
+
+__all__ = ["TAKES", "documents"]

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import pandas as pd
 
 from vehest.report.document import Block, Column, Document, Table, as_code, as_text
-from vehest.studies.artefacts import SurveyArtefacts
+from vehest.studies.artefacts import StudyArtefacts
 from vehest_papers.proving_ground.papers import profile_of
 from vehest_papers.proving_ground.tables import COLUMNS, OVERVIEW, accidents, flagged_table, how_to_get, row_of
 from vehest_papers.proving_ground.tally import FINE, FLAGS, MOVING
 from vehest_papers.proving_ground.vehicles import VehiclePage
 
 
-def index_document(artefacts: SurveyArtefacts, pages: Mapping[str, VehiclePage]) -> Document:
+def index_document(artefacts: StudyArtefacts, pages: Mapping[str, VehiclePage]) -> Document:
     """What is here, how it was made, and what went wrong; with the table ``statistics`` of everything."""
     simulated = sum(page.merged("simulated").drives for page in pages.values())
     flagged = [drive for page in pages.values() for drive in page.flagged]
@@ -34,13 +34,15 @@ def index_document(artefacts: SurveyArtefacts, pages: Mapping[str, VehiclePage])
     return Document(artefacts.title, [block for block in blocks if block], {"statistics": _statistics(pages)})
 
 
-def _how(artefacts: SurveyArtefacts) -> list[str]:
+def _how(artefacts: StudyArtefacts) -> list[str]:
     lines = [f"Command: {as_code(artefacts.command)}"]
     for dataset in artefacts.datasets:
         seed = f", seed {dataset.config['seed']}" if "seed" in dataset.config else ""
         count = f"{len(dataset.files)} {'recordings' if len(dataset.files) != 1 else 'recording'}"
         lines.append(f"`{dataset.name}`: {as_text(dataset.title)} ({dataset.kind.upper()}{seed}), {count}")
-    lines += [f"`{own.name}`: {as_text(own.title)} (REAL): not here when this was made. {how_to_get(own)}" for own in artefacts.absent]
+    lines += [
+        f"`{own.name}`: {as_text(own.title)} (REAL): not here when this was made. {how_to_get(own)}" for own in artefacts.absent_datasets
+    ]
     lines.append(
         f"Distributions and quantiles are those of samples above {MOVING:g} m/s, from sensors with their errors; β is the reference's. "
         f"Quantiles are exact to {FINE['ay'].width / 2:g} (m/s, m/s², deg)."

@@ -9,7 +9,7 @@ import pandas as pd
 from vehest.report.document import Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import fixed, significant
 from vehest.simulation.sensors.noise_reading import NOISE_ABOVE
-from vehest.studies.artefacts import AbsentDataset, StoredDataset, SurveyArtefacts
+from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import drawing, noise
 from vehest_papers.proving_ground.index import index_document
 from vehest_papers.proving_ground.papers import Profile, profile_of
@@ -21,7 +21,7 @@ MOST_SETS = 10
 MOST_FLAGGED = 12
 
 
-def documents(artefacts: SurveyArtefacts) -> dict[str, Document]:
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Name of the file -> document; ``report`` is the index, its first table the ``overview``.
 
     Raises:
@@ -31,12 +31,12 @@ def documents(artefacts: SurveyArtefacts) -> dict[str, Document]:
     return {"report": index_document(artefacts, pages), **{name: _page(artefacts, page) for name, page in pages.items()}}
 
 
-def _page(artefacts: SurveyArtefacts, page: VehiclePage) -> Document:
+def _page(artefacts: StudyArtefacts, page: VehiclePage) -> Document:
     profile = profile_of(page.name)
     blocks: list[Block] = [_what_it_is(page), *_drives(page), *_traces(page), *_handling(page), *_distributions(page, profile)]
     blocks += _beside_paper(page, profile)
     if profile.counterpart is not None:
-        blocks += _beside_real(page, profile, [dataset for dataset in artefacts.absent if dataset.name == profile.counterpart])
+        blocks += _beside_real(page, profile, [dataset for dataset in artefacts.absent_datasets if dataset.name == profile.counterpart])
     blocks.append("[All vehicles](report.md)")
     return Document(profile.title, blocks)
 

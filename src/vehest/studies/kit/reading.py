@@ -13,17 +13,17 @@ from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 
 MOST_NAMED = 12
 
 
-def recordings_of(part: StudyArtefacts, spans: Iterable[Span]) -> list[Recording]:
+def recordings_of(part: PartArtefacts, spans: Iterable[Span]) -> list[Recording]:
     """Scored ranges at the evaluation rate, references included."""
     return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
 
 
-def words_of_kinds(part: StudyArtefacts) -> str:
+def words_of_kinds(part: PartArtefacts) -> str:
     """``real``, ``simulated`` or both, of all that a part draws on."""
     return " and ".join(sorted({part.kinds[name] for name in part.split.datasets}))
 
@@ -45,7 +45,7 @@ def _times(span: Span) -> str:
     return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
 
 
-def metric_values(part: StudyArtefacts) -> dict[tuple[str, str, int, str, str], float]:
+def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], float]:
     """(estimator, variant, seed, test set, metric) -> value, over all samples under nominal conditions."""
     metrics = part.metrics[(part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")]
     return {

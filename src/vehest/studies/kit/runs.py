@@ -10,7 +10,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
 Name = tuple[str, str]
 """Estimator and variant."""
@@ -19,7 +19,7 @@ Runs = dict[tuple[str, str, int, str], dict[str, float]]
 """(estimator, variant, seed, test set) -> metric -> value."""
 
 
-def runs_of(artefacts: StudyArtefacts, column: str = "value") -> Runs:
+def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     """The metrics of all samples under nominal conditions, by run and test set.
 
     Args:

@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.style import MISSING, fixed, listed
-from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import by_name
 
 BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
 
 
 def ranking_of(
-    artefacts: StudyArtefacts,
+    artefacts: PartArtefacts,
     test_set: str,
     models: Sequence[EvaluatedModel] | None = None,
     asked: Sequence[tuple[Name, Name]] = (),

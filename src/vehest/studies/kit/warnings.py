@@ -12,19 +12,19 @@ from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.report.document import as_text
 from vehest.report.style import listed
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name, of_model, runs_of
 
 LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
 DIFFERENT = 1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 
 
-def warnings_of(artefacts: StudyArtefacts) -> list[str]:
+def warnings_of(artefacts: PartArtefacts) -> list[str]:
     """Sentences, each about one test set or one estimator; none where there is nothing to warn of."""
     return [*_excitation(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
 
 
-def _excitation(artefacts: StudyArtefacts) -> list[str]:
+def _excitation(artefacts: PartArtefacts) -> list[str]:
     found = []
     for test_set, spans in artefacts.split.tests.items():
         sideslip = np.degrees(_reference(artefacts, spans)["sideslip"])
@@ -37,7 +37,7 @@ def _excitation(artefacts: StudyArtefacts) -> list[str]:
     return found
 
 
-def _kinds(artefacts: StudyArtefacts) -> list[str]:
+def _kinds(artefacts: PartArtefacts) -> list[str]:
     """Where a test goes beyond what was learnt from, in lateral acceleration, sideslip or speed."""
     if not artefacts.split.train:
         return []
@@ -66,7 +66,7 @@ def _kinds(artefacts: StudyArtefacts) -> list[str]:
     return found
 
 
-def _epoch_limits(artefacts: StudyArtefacts) -> list[str]:
+def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
     runs, found = runs_of(artefacts), []
     for name, models in by_name(artefacts.models).items():
         ended = 0
@@ -82,7 +82,7 @@ def _epoch_limits(artefacts: StudyArtefacts) -> list[str]:
     return found
 
 
-def _reference(artefacts: StudyArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
+def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
     """ay [m/s²], sideslip [rad] and vx [m/s] of ranges, end to end, samples without reference left out."""
     parts: dict[str, list[FloatArray]] = {"ay": [], "sideslip": [], "vx": []}
     for span in spans:
