@@ -160,7 +160,7 @@ def a_simulated_drive(case: Case) -> Command:
 def splits(case: Case) -> Command:
     case.copy("drives")
     kept = SPLIT | {"train": [{"recordings": "o*", "keep": {"magnitude": {"vx": {"at_least": 1.0}}, "at_least_seconds": 2.0}}]}
-    kept["tests"] = {"test": [{"recording": "three", "start": 1.0, "end": 29.0}]}
+    kept["tests"] = {"test": [{"recording": "three", "start": 1.0, "stop": 29.0}]}
     _spoilt_file(case, "conf/split/mine.yaml", case.rng.choice([SPLIT, kept]))
     return Command(("train", *KSNN, "--dry-run") if case.rng.random() < 0.6 and not case.honest else ("eval", *KSNN, "--dry-run"))
 

@@ -227,6 +227,7 @@ def _spoil_archive(case: Case, file: Path, bag: Path) -> None:
     if how == 0:
         file.write_bytes(spoil_bytes(file.read_bytes(), rng))
         return
+    whole = file.read_bytes()
     with zipfile.ZipFile(file, "w" if how in (1, 2) else "a", zipfile.ZIP_DEFLATED) as archive:
         if how == 1:
             archive.writestr("readme.txt", "nothing")
@@ -249,7 +250,7 @@ def _spoil_archive(case: Case, file: Path, bag: Path) -> None:
         elif how == 8:
             archive.writestr(rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "") or "x", "name")
         elif how == 9:
-            archive.write(file, "lap/inner.zip") if file.stat().st_size else None
+            archive.writestr("lap/inner.zip", whole)
         elif how == 10:
             entry = zipfile.ZipInfo("lap/fifo")
             entry.external_attr = (stat.S_IFIFO | 0o666) << 16
