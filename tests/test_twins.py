@@ -1,0 +1,152 @@
+"""Every filter and network that has a readable and a compiled form gives the same in both, through missing measurements, limits and gates.
+
+Each pair is tried on one stretch with gaps of one sensor, of all sensors, and of all for long. Gradients are compared where each form is
+tested by itself (`test_planar_car`, `test_dugoff`, `test_filters_unscented_scan`, `test_kernels`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from test_estimators_rational import rational
+from test_filters_extended_scan import compiled_pendulum, measured_pendulum, pendulum_with_radar
+from test_filters_kalman import arrays, example
+from test_kernels import STRUCTURES, _problem
+from test_planar_car import CARS, LOWER, a_car, driven
+from test_planar_car import STEP as CAR_STEP
+from torch import Tensor
+
+from dugoff_drive import dugoff_track
+from rational_drive import rational_drive
+from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
+from vehest.estimators.kernels.planar_car import CompiledPlanarCar
+from vehest.estimators.rational_ekf import KINDS
+from vehest.filters.extended_scan import extended_scan
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.kalman import kalman_filter
+from vehest.filters.kalman_scan import kalman_scan
+from vehest.filters.nonlinear import NonlinearModel, extended_filter, unscented_filter
+from vehest.filters.sigma_points import symmetric_rule
+from vehest.filters.unscented_scan import PointModel, unscented_scan
+
+STEPS = 60
+Forms = tuple[list[Tensor], list[Tensor]]
+"""What the readable form gives, and what the compiled one does."""
+
+
+def with_gaps(measurements: Tensor) -> Tensor:
+    y = measurements.clone()
+    y[..., 5:9, 0] = torch.nan
+    y[..., 12:15, :] = torch.nan
+    y[..., 20:40, :] = torch.nan
+    return y
+
+
+def of_the_same_numbers(values: object) -> list[Tensor]:
+    return [torch.as_tensor(value) for value in values]  # type: ignore[attr-defined]
+
+
+def kalman() -> Forms:
+    model, measurements, initial = example(STEPS, seed=1)
+    y = with_gaps(measurements)
+    return list(kalman_filter(model, y, initial).filtered), of_the_same_numbers(
+        kalman_scan(arrays(model), y.numpy(), arrays(initial)).filtered
+    )
+
+
+def extended() -> Forms:
+    measurements, inputs, initial = measured_pendulum(STEPS)
+    y = with_gaps(measurements[0])
+    readable = extended_filter(pendulum_with_radar(), y, inputs[0], initial).steps
+    compiled = extended_scan(compiled_pendulum(), y.numpy(), inputs[0].numpy(), Gaussian(*(part.numpy() for part in initial)))
+    return list(readable.filtered), of_the_same_numbers(compiled.filtered)
+
+
+def rational_with(**config: object) -> Callable[[], Forms]:
+    def forms() -> Forms:
+        estimator = rational(**config)
+        samples = rational_drive(STEPS / 20.0, seed=1).stack(estimator.channels)
+        samples[:, [0, 2]] = with_gaps(torch.as_tensor(samples[:, [0, 2]])).numpy()
+        first = Gaussian(*map(torch.as_tensor, estimator.start(samples[0])))
+        y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
+        readable = extended_filter(estimator.nonlinear_model(), y, u, first).steps.filtered
+        compiled = estimator.filter_samples(samples)
+        variances = readable.covariance.diagonal(dim1=-2, dim2=-1)
+        return [readable.mean, variances.clamp(min=0.0).sqrt()], of_the_same_numbers([compiled.mean, compiled.deviation])
+
+    return forms
+
+
+def unscented(readable: NonlinearModel, compiled: PointModel, y: Tensor, u: Tensor, first: Gaussian[Tensor], noises: list[Tensor]) -> Forms:
+    n = first.mean.shape[-1]
+    rule = symmetric_rule(n, 3.0 - n)
+    with torch.no_grad():
+        theirs = unscented_filter(readable, y, u, first, rule).steps.filtered
+        ours = unscented_scan(compiled, y, u, first, *noises, rule).steps.filtered
+    return list(theirs), list(ours)
+
+
+def constant(matrix: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda states, inputs: matrix.expand(*states.shape[:-1], *matrix.shape)
+
+
+def diagonal(*deviations: float) -> Tensor:
+    return torch.tensor(deviations, dtype=torch.float64).square().diag()
+
+
+def planar(kind: str) -> Callable[[], Forms]:
+    def forms() -> Forms:
+        car, lower = a_car(kind), torch.tensor(LOWER, dtype=torch.float64)
+        noises = [diagonal(0.03, 0.03, 0.1, 0.1, 0.01), diagonal(7.0, 7.0, 0.3, 0.3)]
+        limited = lambda states: torch.maximum(states, lower)  # noqa: E731
+        model = NonlinearModel(lambda x, u: car.transition(x, u, CAR_STEP), car.observation, *map(constant, noises), limited)
+        generator = torch.Generator().manual_seed(1)
+        y = torch.randn(1, STEPS, 4, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 1.0, 3.0])
+        first = Gaussian(torch.tensor([3.0, 0.2, 1.0, 3.0, 0.6]).double(), diagonal(0.03, 0.03, 0.03, 0.03, 0.01))
+        return unscented(model, CompiledPlanarCar(car, CAR_STEP, LOWER, torch.float64), with_gaps(y), driven(STEPS)[1][None], first, noises)
+
+    return forms
+
+
+def dugoff(tyres: str) -> Callable[[], Forms]:
+    def forms() -> Forms:
+        track = dugoff_track(tyres, sees_sideslip=True)
+        sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
+        noises = [diagonal(0.05, 0.02), diagonal(*sizes.tolist())]
+        model = NonlinearModel(track.transition, track.observation, *map(constant, noises))
+        generator = torch.Generator().manual_seed(2)
+        y = torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + sizes * torch.randn(1, STEPS, 5, generator=generator, dtype=torch.float64)
+        u = torch.tensor([20.0, 0.05, 0.0], dtype=torch.float64).expand(1, STEPS, 3).contiguous()
+        first = Gaussian(torch.tensor([0.0, 0.1], dtype=torch.float64), diagonal(0.3, 0.1))
+        return unscented(model, CompiledDugoffTrack(track), with_gaps(y), u, first, noises)
+
+    return forms
+
+
+def network(estimator: object) -> Callable[[], Forms]:
+    def forms() -> Forms:
+        value_and_gradient = _problem(estimator, torch.float64)
+        return list(value_and_gradient(compiled=False)), list(value_and_gradient(compiled=True))
+
+    return forms
+
+
+PAIRS: dict[str, Callable[[], Forms]] = {
+    "Kalman": kalman,
+    "extended": extended,
+    **{f"rational_ekf {tyres}": rational_with(tyres=tyres) for tyres in KINDS},
+    "rational_ekf held straight ahead": rational_with(adapt_above=2.0),
+    **{f"learned_ukf {kind}": planar(kind) for kind in CARS},
+    **{f"dugoff_ukf {tyres}": dugoff(tyres) for tyres in ("plain", "smooth")},
+    **{f"{estimator.name} {estimator.variant}": network(estimator) for estimator in STRUCTURES},
+}
+
+
+@pytest.mark.parametrize("pair", PAIRS)
+def test_readable_and_compiled_form_agree_through_gaps_limits_and_gates(pair: str) -> None:
+    readable, compiled = PAIRS[pair]()
+    for expected, found in zip(readable, compiled, strict=True):
+        assert torch.isfinite(found).all()
+        assert float((found.squeeze() - expected.squeeze()).abs().max()) < 1e-9 * max(1.0, float(expected.abs().max()))
