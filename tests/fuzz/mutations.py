@@ -6,6 +6,7 @@ import copy
 import json
 import math
 import random
+from collections.abc import Mapping
 from datetime import date
 from typing import Any
 
@@ -219,6 +220,18 @@ def nested(rng: random.Random, depth: int) -> Any:
     for _ in range(depth):
         value = [value] if rng.random() < 0.5 else {"a": value}
     return value
+
+
+def spoil_key(tree: Mapping[str, Any], key: str, rng: random.Random) -> Any:
+    """What becomes of one value of a tree, hurt as `spoil_tree` does, name included; none where it is gone."""
+    spoilt = spoil_tree({key: tree[key]}, rng)
+    return spoilt.get(key) if isinstance(spoilt, dict) else spoilt
+
+
+def spoil_items(tree: Mapping[str, Any], rng: random.Random) -> dict[Any, Any]:
+    """What becomes of a tree besides its defaults; nothing where it is a tree no more."""
+    spoilt = spoil_tree({key: value for key, value in tree.items() if key != "defaults"}, rng)
+    return spoilt if isinstance(spoilt, dict) else {}
 
 
 def spoil_tree(tree: Any, rng: random.Random, hurts: int | None = None, yaml_text: bool = False) -> Any:

@@ -615,6 +615,7 @@ def test_the_revs_data_sets_that_are_shipped_name_their_files_in_the_repository(
         ({**ENTRY, "md5": {}}, "must say url"),
         ({**ENTRY, "url": "file:///etc/passwd"}, "url must be an address"),
         ({**ENTRY, "url": "example.org"}, "url must be an address"),
+        ({**ENTRY, "url": "https://[example.org"}, "url must be an address"),
         ({**ENTRY, "files": "a.csv"}, "files must list"),
         ({**ENTRY, "files": []}, "files must list"),
         ({**ENTRY, "files": ["a.csv", "a.csv"]}, "names 'a.csv' twice"),

@@ -178,6 +178,14 @@ class Download:
             os.close(descriptor)
 
 
+def _is_web_address(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in ("http", "https") and bool(parts.hostname)
+    except ValueError:  # an open bracket, which only addresses of IPv6 have
+        return False
+
+
 def download_of(source: Source) -> Download:
     """What the configuration of a data set says about fetching its files.
 
@@ -189,7 +197,7 @@ def download_of(source: Source) -> Download:
     if not isinstance(entry, Mapping) or not {"url"} <= set(entry) <= {"url", "files", "sha256"}:
         raise ConfigurationError(f"{where} must say url and, if need be, files and sha256, not {entry}")
     url = str(entry["url"])
-    if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
+    if not _is_web_address(url):
         raise ConfigurationError(f"{where}: url must be an address such as https://example.org/folder, not '{url}'")
     files = source.file_names() if entry.get("files") is None else entry["files"]
     if not isinstance(files, list | tuple):

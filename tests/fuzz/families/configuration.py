@@ -10,7 +10,7 @@ import yaml
 
 from fuzz.case import Case, Command, generator, template
 from fuzz.honest import KALMAN, KSNN, LUENBERGER, PIPELINE, SPLIT, run, write_yaml
-from fuzz.mutations import NAMES, hostile, spoil_tree, spoil_yaml
+from fuzz.mutations import NAMES, hostile, spoil_items, spoil_key, spoil_tree, spoil_yaml
 from place import DATASET
 from vehest.stages.config_files import packaged_conf, packaged_pipelines
 
@@ -61,7 +61,7 @@ def channels_of_a_data_set(case: Case) -> Command:
     case.copy("drives")
     tree = DATASET | {"channels": DATASET["channels"] if case.honest else spoil_tree(DATASET["channels"], case.rng)}
     if not case.honest and case.rng.random() < 0.3:
-        tree |= {"time": spoil_tree({"t": DATASET["time"]}, case.rng).get("t")}
+        tree |= {"time": spoil_key(DATASET, "time", case.rng)}
     (case.place / "conf/dataset/mine.yaml").write_bytes(yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "replace"))
     return Command(case.rng.choice([("ingest", "mine"), ("data", "check", "mine")]))
 
@@ -74,7 +74,7 @@ def packaged_data_sets(case: Case) -> Command:
     )
     tree, head = _packaged("dataset", name)
     if "defaults" in tree and case.rng.random() < 0.7:
-        spoilt = tree | spoil_tree({key: value for key, value in tree.items() if key != "defaults"}, case.rng)
+        spoilt = tree | spoil_items(tree, case.rng)
         case.write(
             f"conf/dataset/{name}.yaml",
             head + yaml.safe_dump(tree if case.honest else spoilt, allow_unicode=True).encode("utf-8", "replace").decode(),
@@ -102,7 +102,7 @@ def simulations(case: Case) -> Command:
         _spoilt_file(case, f"conf/vehicle/{vehicle}.yaml", content, own)
     else:
         key = case.rng.choice([one for one in tree if one not in ("defaults", "name", "title", "licence", "citation")])
-        spoilt = tree if case.honest else tree | {key: spoil_tree({key: tree[key]}, case.rng).get(key)}
+        spoilt = tree if case.honest else tree | {key: spoil_key(tree, key, case.rng)}
         case.write(f"conf/dataset/{name}.yaml", head + yaml.safe_dump(spoilt, allow_unicode=True).encode("utf-8", "replace").decode())
     return Command(("simulate", name, "--dry-run") if case.rng.random() < 0.8 else ("config", "ingest", f"dataset={name}"))
 
@@ -173,7 +173,7 @@ def estimators(case: Case) -> Command:
     name = case.rng.choice(ESTIMATORS)
     tree, head = _packaged("estimator", name)
     if "defaults" in tree or case.rng.random() < 0.6:
-        spoilt = tree if case.honest else tree | spoil_tree({key: value for key, value in tree.items() if key != "defaults"}, case.rng)
+        spoilt = tree if case.honest else tree | spoil_items(tree, case.rng)
         case.write(f"conf/estimator/{name}.yaml", head + yaml.safe_dump(spoilt, allow_unicode=True).encode("utf-8", "replace").decode())
     else:
         _spoilt_file(case, f"conf/estimator/{name}.yaml", tree, head)

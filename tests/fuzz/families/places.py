@@ -36,7 +36,7 @@ NAMES: tuple[bytes, ...] = (
     b"$(touch EXECUTED).csv",
     b"a;touch EXECUTED.csv",
     b"<b>.csv",
-    b"[red]a[/red].csv",
+    b"[red]a[blue].csv",
     b"null.csv",
     b"${root}.csv",
 )
