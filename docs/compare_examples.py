@@ -1,0 +1,78 @@
+"""Train and compare the worked examples of docs/adding_an_estimator.md on the quickstart's drives, beside the baselines.
+
+The examples are installed into a scratch folder as a package of their own, found by their entry points. Writes
+results/examples/leaderboard.csv. SIMULATED data; three seeds of the Transformer, the others have nothing random.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pandas as pd
+import yaml
+
+EXAMPLES = Path(__file__).with_name("examples")
+RESULT = Path(__file__).parents[1] / "results" / "examples" / "leaderboard.csv"
+CLASSES = {"saturating_ekf": "SaturatingEkf", "sliding_mode": "SlidingMode", "window_transformer": "WindowTransformer"}
+CAR = {  # CommonRoad's vehicle 2, a BMW 320i; stiffness of an axle: 1.0489 · 20.89/rad · its load
+    "mass": 1093.3,
+    "yaw_inertia": 1791.6,
+    "cg_to_front_axle": 1.1562,
+    "cg_to_rear_axle": 1.4227,
+    "cornering_stiffness_front": 129650.0,
+    "cornering_stiffness_rear": 105360.0,
+}
+PIPELINE = {
+    "study": "examples",
+    "title": "Three estimators of another package on simulated drives",
+    "about": "The worked examples of the documentation beside the baselines. They show how an estimator is added, not which to trust.",
+    "report": "drive",
+    "split": "quickstart",
+    "sweeps": [
+        ["estimator=zero,static_map,kinematic"],
+        ["estimator=data_sheet", "estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423"],
+        ["estimator=sliding_mode"],
+        ["estimator=window_transformer", "seed=range(3)"],
+        ["estimator=saturating_ekf", *(f"+estimator.car.{name}={value}" for name, value in CAR.items())],
+    ],
+    "evaluation": {"rate_hz": 20},
+}
+SHOWN = ["title", "rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high", "beats_zero", "beats_static_map", "fvu", "n_seeds"]
+
+
+def install(site: Path, place: Path) -> None:
+    """Modules and entry points as pip would install them, and the configuration where the commands are given."""
+    about = site / "vehest_examples-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: vehest-examples\nVersion: 1.0\n")
+    points = "\n".join(f"{name} = {name}:{kind}" for name, kind in CLASSES.items())
+    (about / "entry_points.txt").write_text(f"[vehest.estimators]\n{points}\n")
+    (place / "conf" / "estimator").mkdir(parents=True)
+    (place / "pipelines").mkdir()
+    for name in CLASSES:
+        shutil.copy(EXAMPLES / f"{name}.py", site)
+        shutil.copy(EXAMPLES / f"{name}.yaml", place / "conf" / "estimator")
+    (place / "pipelines" / "examples.yaml").write_text(yaml.safe_dump(PIPELINE))
+
+
+def main() -> None:
+    """Run the comparison, print the leaderboard and write it."""
+    with tempfile.TemporaryDirectory(prefix="examples-") as scratch:
+        site, place = Path(scratch) / "site", Path(scratch) / "place"
+        install(site, place)
+        command = (sys.executable, "-c", "from vehest.cli import main; main()", "run", "examples", "tracking=none")
+        subprocess.run(command, cwd=place, env={**os.environ, "PYTHONPATH": str(site), "VEHEST_OUTPUT": "outputs"}, check=True)
+        (table,) = place.glob("outputs/report/examples-*/tables/leaderboard_test.csv")
+        board = pd.read_csv(table)
+        RESULT.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(table, RESULT)
+    print(board[[name for name in SHOWN if name in board]].to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()
