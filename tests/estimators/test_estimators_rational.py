@@ -13,6 +13,7 @@ import torch
 from rational_drive import CURVES, NOISE, changed, rational_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
+from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter, RationalSettings
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
@@ -70,6 +71,17 @@ def test_rational_tyre_peaks_where_it_should_and_is_linear_without_a_bend():
 
 
 # The compiled filter
+
+
+@pytest.mark.parametrize("tyres", KINDS)
+def test_every_kind_of_tyre_comes_back_from_its_file(tyres, drive, tmp_path):
+    estimator = rational(tyres)
+    (tmp_path / tyres).mkdir()
+    save_model(estimator, tmp_path / tyres)
+    back = load_model(tmp_path / tyres)
+    assert isinstance(back, RationalFilter)
+    assert np.array_equal(back.curves, estimator.curves)
+    assert np.array_equal(back.estimate([drive])[0]["vy"], estimator.estimate([drive])[0]["vy"])
 
 
 @pytest.mark.parametrize("tyres", KINDS)

@@ -552,16 +552,21 @@ class RationalFilter(SingleTrackEstimator):
         return RationalStepper(self)
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Curves c₁ and c₂ of the front, then of the rear axle, the covariance of their logarithms, and the levels of noise."""
+        """Curves c₁ and c₂ of the front, then of the rear axle, the covariance of their logarithms, and the levels of noise.
+
+        Linear tyres have no c₁: 0 stands for it in a file, whose numbers are finite.
+        """
         levels = np.array([self.levels[name] for name in LEVELS])
-        return {"curves": self.curves.copy(), "curve_covariance": self.curve_covariance.copy(), "levels": levels}
+        curves = np.where(np.isinf(self.curves), 0.0, self.curves)
+        return {"curves": curves, "curve_covariance": self.curve_covariance.copy(), "levels": levels}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take curves and levels back."""
         shapes = {name: values.shape for name, values in self.weights().items()}
         if {name: values.shape for name, values in weights.items()} != shapes:
             raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)}, not {', '.join(weights)}")
-        self.curves = np.array(weights["curves"], dtype=np.float64)
+        curves = np.array(weights["curves"], dtype=np.float64)
+        self.curves = np.where(curves == 0.0, math.inf, curves)
         self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)
         self.levels = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
 
