@@ -67,7 +67,7 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
-    runs, found = runs_of(artefacts), []
+    runs, found = runs_of(artefacts), list[str]()
     for name, models in by_name(artefacts.models).items():
         ended = 0
         for model in models:
@@ -75,11 +75,8 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             limit = model.training.get("max_epochs")
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
-            found.append(
-                f"Training of {as_text(models[0].title)} ended at its limit of {models[0].training['max_epochs']:g} epochs in {ended} of "
-                f"{len(models)} seeds: longer training may lower its error."
-            )
-    return found
+            found.append(f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)")
+    return [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."] if found else []
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
