@@ -782,24 +782,26 @@ def _run_pipeline(
         folder, published = _repeat(finished, dry_run=dry_run, quiet=quiet)
         _print_shown(finished.record.shown, as_json, folder, {"published": str(published) if published else None})
         return
-    from vehest.stages.pipeline import content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
+    from vehest.stages.pipeline import PipelineOutcome, content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
     from vehest.stages.shown import shown_of_pipeline
 
     pipeline = read_pipeline(name)
     configs = pipeline_configs(pipeline, overrides)
     first = next(iter(configs.values()))[0]
 
-    def whole_way(workshop: Workshop) -> tuple[Outcome, Path | None]:
+    def whole_way(workshop: Workshop) -> tuple[Outcome, PipelineOutcome]:
         raw = stamps_of(datasets_of(pipeline, configs, workshop))
         outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
         shown = shown_of_pipeline(pipeline.title, outcome)
         tracking = first.get("tracking", {})
-        return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome.published
+        return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome
 
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
     with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
-        outcome, published = whole_way(workshop)
-        _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(published) if published else None})
+        outcome, made = whole_way(workshop)
+        _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})
+        if made.failed is not None:
+            raise made.failed
         if not dry_run:
             remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
 
@@ -835,7 +837,7 @@ def _print_shown(shown: Shown, as_json: bool, folder: Path, further: dict[str, A
             _echo(table.title)
         _table([*table.header], [[*row] for row in table.rows])
     if shown.note:
-        _echo(shown.note)
+        _echo(shown.note, keep="\n")
     _echo(f"report: {page}")
     if further.get("published"):
         _echo(f"published: {further['published']}")

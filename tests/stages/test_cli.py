@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -73,13 +74,31 @@ def test_two_processes_give_the_same_numbers_as_one(place):
 def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
-    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
     assert code == 5
     assert "1 of 4 groups of jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
     assert "Traceback" not in err
     kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
     assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}
-    assert not list((place.folder / "outputs").glob("report/*"))
+    assert "GRU, 2 states" in out
+    assert "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss" in out
+    (report,) = (place.folder / "outputs").glob("report/*/report.md")
+    assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
+    assert not (place.folder / "results").exists()
+
+
+def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
+    code, _, err = place("run", "small", "tracking=none")
+    assert code == 0, err
+    shutil.rmtree(next((place.folder / "outputs" / "train").glob("gru-*")))
+    code, out, err = place("report", "small", "tracking=none", "--json")
+    assert code == 5
+    assert "run 'vehest run" in err
+    drawn = json.loads(out)
+    assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger", "ksnn"}
+    ((name, reason),) = drawn["failed"].items()
+    assert name.startswith("gru-states_2")
+    assert "has not been trained and evaluated" in reason
 
 
 def test_train_eval_estimate_report_one_by_one(place):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
@@ -59,36 +59,52 @@ def compare(configs: Sequence[Config], workshop: Workshop, command: str, *, only
             estimator = new_estimator(config["estimator"])
             workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
         raise
+    missing: list[tuple[str, Failure]] = []
+    wanted = groups
     if only_report:
-        for group in groups:
-            for member in existing(group):
-                if not is_finished(group, member):
-                    raise MissingError(f"{member.job.plan.label} has not been trained and evaluated; run '{command}' first")
-    members, failures = workshop.run_groups(groups)
+        wanted, missing = _finished(groups, command)
+    members, failures = workshop.run_groups(wanted)
     order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
     members.sort(key=lambda member: order[member.job.plan.key])
     evaluation = groups[0].evaluation
     assert evaluation is not None
     titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
     facts = [*training_facts(configs), resampling_fact(configs)]
-    return Compared(members, evaluation, titles, facts, len(groups), failures)
+    return Compared(members, evaluation, titles, facts, len(groups), [*failures, *missing])
 
 
-def raise_failures(compared: Iterable[Compared], workshop: Workshop) -> None:
-    """Say in full what failed, then end with one line.
+def _finished(groups: Sequence[Group], command: str) -> tuple[list[Group], list[tuple[str, Failure]]]:
+    """What of the groups is there, and what is missing, by name.
 
     Raises:
-        JobsFailedError: anything failed.
+        MissingError: nothing is there.
     """
+    found, missing = [], []
+    for group in groups:
+        there = [member for member in existing(group) if is_finished(group, member)]
+        if there:
+            found.append(replace(group, jobs=[member.job for member in there]))
+        for job in group.jobs:
+            if all(member.job is not job for member in there):
+                missing.append((job.plan.label, Failure(f"has not been trained and evaluated; run '{command}' first", exit_code=4)))
+    if not found:
+        raise MissingError(f"{missing[0][0]} {missing[0][1].message}")
+    return found, missing
+
+
+def failed_in(compared: Iterable[Compared], workshop: Workshop) -> JobsFailedError | None:
+    """Say in full what failed; returns what the command ends with, if anything did."""
     counted = list(compared)
     failures = [failure for own in counted for failure in own.failures]
     if not failures:
-        return
+        return None
     for name, failure in failures:
         if failure.detail:
             workshop.messages.warn(f"{name}:\n{failure.detail}")
     listed = "; ".join(f"{name}: {failure.message}" for name, failure in failures)
-    raise JobsFailedError(f"{len(failures)} of {sum(own.n_groups for own in counted)} groups of jobs failed, the others are kept; {listed}")
+    return JobsFailedError(
+        f"{len(failures)} of {sum(own.n_groups for own in counted)} groups of jobs failed, the others are kept; {listed}"
+    )
 
 
 def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:

@@ -9,19 +9,19 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
 from vehest.data.limits import use_limits
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import read_yaml
 from vehest.stages.artefacts import Artefact, find
-from vehest.stages.comparison import Compared, compare, raise_failures
+from vehest.stages.comparison import Compared, compare, failed_in
 from vehest.stages.config import Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
 from vehest.stages.ingest import STAGE as INGEST
@@ -135,6 +135,8 @@ class PipelineOutcome:
         published: folder in results/, if it was published.
         overview: table of a study in parts, or of recordings alone.
         publication: what is published of it where nothing stands against it.
+        left_out: name of what failed, or is not there -> why.
+        failed: what the command ends with then.
     """
 
     report: Artefact
@@ -142,6 +144,8 @@ class PipelineOutcome:
     published: Path | None
     overview: pd.DataFrame | None = None
     publication: Publication | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    failed: JobsFailedError | None = None
 
 
 def read_pipeline(name: str) -> Pipeline:
@@ -335,13 +339,14 @@ def run_pipeline(
         only_report: draw the report from what is there, train and evaluate nothing.
 
     Raises:
-        JobsFailedError: some jobs failed; the others are kept.
+        JobsFailedError: some jobs of a study in parts, or all of another, failed; what was done is kept.
         MissingError: ``only_report`` and something is missing.
         NotThereYet: in a dry run.
         Stopped: a signal came.
     """
     parts: dict[str, PartJob] = {}
     absent: list[AbsentPart] = []
+    failed: JobsFailedError | None = None
     datasets = ShownDatasets()
     if pipeline.datasets:
         datasets = _ingest_all(pipeline, configs[""], workshop, only_report=only_report)
@@ -350,7 +355,9 @@ def run_pipeline(
         workshop.tracker = Tracker(first["tracking"], workshop.output, workshop.messages.warn, workshop.stop.requested)
         workshop.tags = {"vehest.study": pipeline.study}
         compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
-        raise_failures(compared.values(), workshop)
+        failed = failed_in(compared.values(), workshop)
+        if failed is not None and (pipeline.in_parts or not any(own.members for own in compared.values())):
+            raise failed
         parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if part.name in compared}
     job = ReportJob(
         study=pipeline.study,
@@ -365,7 +372,7 @@ def run_pipeline(
     )
     report = workshop.ensure(plan_report(job, workshop.output), lambda folder: write_report(job, folder))
     left_out = {part.name: f"part '{part.name}'" for part in absent} | {own.name: f"data set '{own.name}'" for own in datasets.absent}
-    return _published(pipeline, configs, job, report, overrides, workshop, left_out)
+    return _published(pipeline, configs, job, report, overrides, workshop, left_out, failed)
 
 
 def _run_parts(
@@ -403,7 +410,8 @@ def datasets_of(pipeline: Pipeline, configs: Configs, workshop: Workshop) -> dic
 
 
 def _part_job(part: Part, compared: Compared) -> PartJob:
-    return PartJob(part.title, compared.members, compared.evaluation, compared.data_titles, compared.facts)
+    failed = {name: failure.message for name, failure in compared.failures}
+    return PartJob(part.title, compared.members, compared.evaluation, compared.data_titles, compared.facts, failed)
 
 
 def _ingest_all(pipeline: Pipeline, configs: Sequence[Config], workshop: Workshop, *, only_report: bool) -> ShownDatasets:
@@ -449,8 +457,9 @@ def _published(
     overrides: Sequence[str],
     workshop: Workshop,
     absent: Mapping[str, str],
+    failed: JobsFailedError | None,
 ) -> PipelineOutcome:
-    """What a pipeline made, published as it is written: not what overrides changed.
+    """What a pipeline made, published as it is written: not what overrides changed, and not where anything failed.
 
     Args:
         pipeline: the study.
@@ -460,14 +469,16 @@ def _published(
         overrides: what changed it.
         workshop: where stages ran.
         absent: name of what the study went on without -> what it is, for people.
+        failed: what the command ends with, where anything failed.
     """
     table, overview = shown_in_terminal(job, report)
     publication = None
-    if pipeline.publish and not overrides:
+    if pipeline.publish and not overrides and failed is None:
         publication = Publication(pipeline.study, absent, _keys(pipeline, configs, absent, workshop))
     with workshop.messages.off_record():
         folder = None if workshop.dry_run else publish_study(publication, report, workshop.messages)
-    return PipelineOutcome(report, pd.DataFrame() if table is None else table, folder, overview, publication)
+    left_out = {name: reason for part in job.parts.values() for name, reason in part.failed.items()}
+    return PipelineOutcome(report, pd.DataFrame() if table is None else table, folder, overview, publication, left_out, failed)
 
 
 def _keys(pipeline: Pipeline, configs: Configs, absent: Mapping[str, str], workshop: Workshop) -> Keys:

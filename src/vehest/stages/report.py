@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,7 @@ class PartJob:
         evaluation: split, references and protocol.
         data_titles: data set -> title.
         training: how recordings were prepared and what each training scheme was allowed, a line each.
+        failed: name of what is left out -> why.
     """
 
     title: str
@@ -57,6 +58,7 @@ class PartJob:
     evaluation: Evaluation
     data_titles: Mapping[str, str]
     training: Sequence[str]
+    failed: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -126,6 +128,7 @@ def plan_report(job: ReportJob, output: Path) -> StagePlan:
     config["parts"] = {
         name: {
             "training": part.training,
+            "failed": dict(part.failed),
             "data_titles": dict(part.data_titles),
             "protocol": asdict(part.evaluation.protocol),
         }
@@ -256,6 +259,7 @@ def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
         models=models,
         references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in (*e.split.train, *scored_spans(e.split))},
         facts=list(part.training),
+        failed=part.failed,
     )
 
 

@@ -74,7 +74,9 @@ def shown_of_pipeline(title: str, outcome: PipelineOutcome) -> Shown:
         given = " (estimates start at the reference state)" if (rows_of_set["start"] == "reference").any() else ""
         board = tuple(_board_row(row) for row in rows_of_set.to_dict("records"))
         boards.append(ShownTable(f"{title}: test set '{test_set}'{given}", BOARD_HEADER, board))
-    return Shown(tuple(boards), "", "report.html", json.dumps({"leaderboard": _records(outcome.leaderboard)}))
+    note = "\n".join(f"left out: {name}: {reason}" for name, reason in outcome.left_out.items())
+    figures = {"leaderboard": _records(outcome.leaderboard)} | ({"failed": dict(outcome.left_out)} if outcome.left_out else {})
+    return Shown(tuple(boards), note, "report.html", json.dumps(figures))
 
 
 def shown_of_sweep(outcome: SweepOutcome) -> Shown:

@@ -135,6 +135,7 @@ class PartArtefacts:
         models: evaluated models, in the order of the pipeline file.
         references: (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split.
         facts: further lines on how it was made: training budget, versions, machine.
+        failed: name of what is left out, since it failed or is not there -> why.
     """
 
     study: str
@@ -149,6 +150,7 @@ class PartArtefacts:
     models: Sequence[EvaluatedModel]
     references: Mapping[tuple[str, str], Path]
     facts: Sequence[str]
+    failed: Mapping[str, str] = field(default_factory=dict)
 
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
         """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""

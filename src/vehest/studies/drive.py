@@ -41,17 +41,17 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def comparison(artefacts: PartArtefacts) -> Document:
-    """The report of a comparison: headline, how it was made, then each test set, then the training.
+    """The report of a comparison: headline, then each test set, then the training; how it was made is the appendix.
 
     Raises:
         DataError: metrics are missing or ambiguous, or an estimate does not cover its range.
     """
     board = leaderboard(artefacts)
     lines = lines_of(dict.fromkeys((model.estimator, model.variant) for model in artefacts.models))
-    blocks: list[Block] = [*_headline(artefacts), *_how_it_was_made(artefacts, board)]
+    blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines)
-    blocks += _training(artefacts, board, lines)
+    blocks += [*_training(artefacts, board, lines), *_how_it_was_made(artefacts, board)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
     return Document(artefacts.title, blocks)
@@ -202,7 +202,7 @@ def _how_it_was_made(artefacts: PartArtefacts, board: pd.DataFrame) -> list[Bloc
             "seconds": Column("length [s]", decimals=0),
         },
     )
-    return ["## How it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges]
+    return ["## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges]
 
 
 def _ranges(artefacts: PartArtefacts) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from typing import Literal
 import pandas as pd
 
 from vehest.evaluation.ranking import Name, Ranking
-from vehest.report.document import Column, Table, as_text
+from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 
 Verdict = Literal["reproduced", "not reproduced", "undecided", "not testable on this data"]
@@ -40,7 +40,7 @@ class Claim:
 
 def claims_table(claims: Sequence[Claim], note: str = "") -> Table:
     """Table ``claims``: claim, paper, ours with interval, data, verdict."""
-    rows = pd.DataFrame([asdict(own) for own in claims], columns=list(_COLUMNS)).map(as_text)
+    rows = pd.DataFrame([asdict(own) for own in claims], columns=list(_COLUMNS))
     number = {verdict: sum(own.verdict == verdict for own in claims) for verdict in _VERDICTS}
     counts = ", ".join(f"{n} {verdict}" for verdict, n in number.items() if n) or "nothing to compare"
     caption = f"What the paper claims and what came out here: {counts}. {_RULE} {note}".strip()

@@ -91,7 +91,7 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) 
 def _reasons(ranking: Ranking, titles: Mapping[Name, str]) -> str:
     best, reasons = ranking.order[0], []
     if best[0] in BASELINES:
-        reasons.append("a baseline")
+        reasons.append("which is a baseline")
     level = [titles[name] for name in ranking.not_told_apart]
     if level:
         reasons.append(f"which is not told apart from {listed(level) if len(level) <= 6 else f'{len(level)} others'}")

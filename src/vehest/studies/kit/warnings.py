@@ -10,7 +10,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
-from vehest.report.document import as_text
+from vehest.report.document import as_code, as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name, of_model, runs_of
@@ -20,8 +20,9 @@ DIFFERENT = 1.5  # ratio of the 99th percentiles of test and training, from whic
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
-    """Sentences, each about one test set or one estimator; none where there is nothing to warn of."""
-    return [*_excitation(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
+    """Sentences, each about one test set or one estimator, those first that are left out; none where there is nothing to warn of."""
+    left_out = [f"{as_code(name)} is left out: {as_text(reason)}" for name, reason in artefacts.failed.items()]
+    return [*left_out, *_excitation(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
@@ -67,7 +68,7 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
 
 
 def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
-    runs, found = runs_of(artefacts), []
+    runs, found = runs_of(artefacts), list[str]()
     for name, models in by_name(artefacts.models).items():
         ended = 0
         for model in models:
@@ -75,11 +76,8 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
             limit = model.training.get("max_epochs")
             ended += bool(isinstance(limit, int | float) and epochs > 0 and epochs >= limit)
         if ended:
-            found.append(
-                f"Training of {as_text(models[0].title)} ended at its limit of {models[0].training['max_epochs']:g} epochs in {ended} of "
-                f"{len(models)} seeds: longer training may lower its error."
-            )
-    return found
+            found.append(f"{as_text(models[0].title)} ({models[0].training['max_epochs']:g} epochs, {ended} of {len(models)} seeds)")
+    return [f"Training ended at its limit, and longer training may lower the error: {listed(found)}."] if found else []
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
