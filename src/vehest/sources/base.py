@@ -21,6 +21,16 @@ from vehest.data.splits import check_name
 COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
 
 
+TEMPLATES = {
+    ".vbo": "vbo",
+    ".mf4": "mdf",
+    ".mdf": "mdf",
+    ".dat": "mdf",
+    ".bag": "f1tenth_bag",
+    ".db3": "f1tenth_bag",
+    ".mcap": "f1tenth_bag",
+}
+"""Ending of a file that is no table -> data set that shows how such files are declared."""
 SIMULATED = "simulated"
 """Name of the source whose recordings never are real, whatever a configuration says."""
 
@@ -107,6 +117,16 @@ class Source(ABC):
             DataError: its files cannot be used as they are.
         """
 
+    def read_file(self, file: Path) -> Recording:
+        """Make a recording of a file wherever it is, or of what else one recording is made of.
+
+        Raises:
+            ConfigurationError: this source's recordings are none of a file.
+            MissingError: it is not there.
+            DataError: it cannot be used as it is.
+        """
+        raise ConfigurationError(f"data set '{self.name}': source '{self.dataset.get('source')}' reads no single files")
+
     def file_names(self) -> list[str]:
         """Files that the recordings are made of, as far as the configuration alone tells: what ``download`` fetches if it lists none."""
         return []
@@ -125,6 +145,21 @@ def open_source(dataset: Mapping[str, Any]) -> Source:
     """
     found: Source = importlib.import_module(source_module(dataset)).SOURCE(dataset)
     return found
+
+
+def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
+    """A recording of a file wherever it is, read as a data set describes.
+
+    Raises:
+        ConfigurationError: the file is of another format than the data set's, or its source reads no single files.
+        MissingError: it is not there.
+        DataError: it cannot be used as it is.
+    """
+    template = TEMPLATES.get(file.suffix.lower())
+    if dataset.get("source") == "tabular" and template is not None:
+        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, say there what the columns are, and add dataset=NAME"
+        raise ConfigurationError(f"'{file}' is no table; {what}")
+    return open_source(dataset).read_file(file)
 
 
 def source_module(dataset: Mapping[str, Any]) -> str:

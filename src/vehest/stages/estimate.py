@@ -20,7 +20,7 @@ from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
-from vehest.sources.tabular import TabularSource
+from vehest.sources.base import read_single
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
 
@@ -67,7 +67,7 @@ def find_model(name: str, output: Path) -> Path:
 
 
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
-    """Read a CSV or Parquet recording, as conf/estimate.yaml and overrides describe its columns and limits.
+    """Read a recording from its file, a table unless the data set says otherwise, as conf/estimate.yaml and overrides describe it.
 
     Args:
         path: the file.
@@ -77,7 +77,7 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
     Raises:
         MissingError: there is no such file.
         DataError: it cannot be used as it is.
-        ConfigurationError: the data set named by the overrides is not a table.
+        ConfigurationError: the file is of another format than the data set's.
     """
     config = compose_config("estimate", overrides)
     with use_limits(limits_from_config(config["limits"])):
@@ -85,12 +85,10 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 
 
 def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Recording:
-    if dataset.get("source") != "tabular":
-        raise ConfigurationError(f"data set '{dataset.get('name')}' does not describe tables; use one with source: tabular")
-    if dataset.get("channels") and not references:  # a new drive needs no reference channels, whatever the data set declares
-        measured = {name: entry for name, entry in dataset["channels"].items() if not name.endswith(REFERENCE_SUFFIX)}
-        dataset = {**dataset, "channels": measured}
-    recording = TabularSource(dataset).read_file(path)
+    if not references:  # a new drive needs no reference channels, whatever the data set declares
+        channels = {name: entry for name, entry in (dataset.get("channels") or {}).items() if not name.endswith(REFERENCE_SUFFIX)}
+        dataset = {key: value for key, value in dataset.items() if key != "pose"} | ({"channels": channels} if channels else {})
+    recording = read_single(dataset, path)
     accepted = set(dataset.get("accept") or [])
     for finding in checks_of_recording(recording):
         if finding.level == "error" and finding.check not in accepted:

@@ -15,8 +15,7 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
-from vehest.sources.base import kind_of, open_source
-from vehest.sources.tabular import TabularSource
+from vehest.sources.base import kind_of, open_source, read_single
 from vehest.stages.artefacts import find
 from vehest.stages.config import Config, compose_config
 from vehest.stages.config_files import choices
@@ -121,7 +120,7 @@ def _recordings(source: str, config: Config) -> Iterator[Recording | tuple[str, 
     if source not in choices("dataset"):
         file = Path(source)
         try:
-            yield TabularSource(config["dataset"]).read_file(file)
+            yield read_single(config["dataset"], file)
         except DataError as error:
             yield file.name, error
         return

@@ -119,10 +119,16 @@ class MdfSource(Source):
         """
         for file in matching_files(self.dataset, "*.mf4"):
             if file.stem == recording_id:
-                return self._read_file(file)
+                return self.read_file(file)
         raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {', '.join(self.ids())})")
 
-    def _read_file(self, file: Path) -> Recording:
+    def read_file(self, file: Path) -> Recording:
+        """Read a measurement wherever it is.
+
+        Raises:
+            MissingError: it is not there or empty.
+            DataError: as `read`.
+        """
         require_files([file], self.name)
         wanted = {name: Wanted(declared.column.column, declared.group) for name, declared in self.channels.items()}
         measurement = read_measurement(file, wanted)

@@ -96,7 +96,13 @@ class RosbagSource(Source):
         bags = self._bags()
         if recording_id not in bags:
             raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(bags)})")
-        path = bags[recording_id]
+        return self._read(recording_id, bags[recording_id])
+
+    def read_file(self, file: Path) -> Recording:
+        """Read a bag, a file or a folder, wherever it is; as `read`."""
+        return self._read(file.stem, file)
+
+    def _read(self, recording_id: str, path: Path) -> Recording:
         bag = read_bag(path, self._wanted(), self.layouts, self.most_bytes)
         series = {name: self._series(topic, bag, path) for name, topic in self.topics.items() if topic.topic in bag.topics}
         first, n_samples = self._grid(series, path)

@@ -1,0 +1,137 @@
+"""Logs of a VBOX: what is read, in which units and on which clock; what is left out, found and refused."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
+
+from place import Place
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Recording
+from vehest.sources.base import open_source
+from vehest.sources.vbo import read_log
+
+REAL = Path(os.environ.get("VEHEST_DATA", "")) / "vbox" / "standstill.VBO"
+
+
+def read(folder: Path, **more: object) -> Recording:
+    return next(open_source(dataset(folder, **more)).recordings())
+
+
+def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.vbo")
+    recording, true = read(tmp_path), drive()
+    assert (recording.id, recording.rate_hz, len(recording)) == ("lap", 100.0, 1000)
+    assert recording.start_time == pytest.approx(38_870.45)
+    for name, own in (("vx", "vx"), ("yaw_rate", "yaw_rate"), ("ax", "ax"), ("ay", "ay"), ("vy_ref", "vy")):
+        assert np.allclose(recording[name], true[own], rtol=0, atol=1e-4 if name == "vx" else 1e-7), name
+    about = recording.provenance
+    assert about["slip_offsets_lateral_longitudinal_m"] == {"FL": [0.031, 1.79], "RL": [0.031, -1.06]}
+    assert (about["created"], about["rows_dropped_at_the_end"]) == ("File created on 12/09/2018 @ 12:47", 0)
+
+
+def test_time_goes_on_past_midnight(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.VBO", 86_395.0)
+    recording = read(tmp_path)
+    assert (recording.start_time, recording.rate_hz, len(recording)) == (86_395.0, 100.0, 1000)
+
+
+@pytest.mark.parametrize("end", ["053 104", "053 104900.000" + " +0.0" * 16])
+def test_a_last_row_that_is_cut_off_or_late_is_left_out_and_counted(tmp_path: Path, end: str) -> None:
+    write_log(tmp_path / "lap.vbo", end=end)
+    recording = read(tmp_path)
+    assert (len(recording), recording.provenance["rows_dropped_at_the_end"]) == (1000, 1)
+
+
+def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.vbo")
+    units = read_log(tmp_path / "lap.vbo").units
+    assert units == {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"} | dict(
+        zip(COLUMNS.split()[-7:], UNITS, strict=True)
+    )
+    write_log(tmp_path / "lap.vbo", units=("rad", "km/h", "rad/s", "g", "g", "°", "°"))
+    with pytest.raises(DataError, match=r"column 'YawRate', for channel 'yaw_rate', is in 'rad/s' by the file and in 'deg/s'"):
+        read(tmp_path)
+
+
+def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.vbo", swapped=True)
+    with pytest.raises(DataError, match=r"slip at the front and the rear left wheel differs by .* changed places") as refused:
+        read(tmp_path)
+    assert "accept: [slip_offsets]" in str(refused.value)
+    assert "vy_ref" in read(tmp_path, accept=["slip_offsets"])
+    without = {name: entry for name, entry in dataset(tmp_path)["channels"].items() if name != "vy_ref"}  # type: ignore[attr-defined]
+    assert "vx" in read(tmp_path, channels=without)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"[data]", b"[rows]", r"has no section \[data\]"),
+        (b"[column names]", b"[names]", "names no column 'time'"),
+        (b" Y_Accel ", b" X_Accel ", "has 2 columns called 'X_Accel'"),
+        (b" Y_Accel ", b" Other ", "has no column 'Y_Accel'"),
+        (b"053 104751.450", b"053 109951.450", "is no clock time hhmmss"),
+        (b"053 104751.450", b"053 x", "cannot be read as rows of 18 numbers"),
+        (b"053 104751.450", b"053 999999.450", "is no clock time hhmmss"),
+        (b"053 104751.450 ", b"053 ", "cannot be read as rows of 18 numbers"),
+    ],
+)
+def test_a_damaged_log_is_one_clear_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    write_log(tmp_path / "lap.vbo")
+    content = (tmp_path / "lap.vbo").read_bytes()
+    assert old in content
+    (tmp_path / "lap.vbo").write_bytes(content.replace(old, new, 1))
+    with pytest.raises(DataError, match=r"lap\.vbo") as refused:
+        read(tmp_path)
+    assert "\n" not in str(refused.value)
+    assert refused.match(message)
+
+
+def test_what_makes_no_sense_is_refused(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.vbo")
+    for more, message in (
+        ({"channels": {}}, "channels must map"),
+        ({"gappy": ["steer"]}, "gappy names 'steer'"),
+        ({"files": "/etc/*"}, "files must be a pattern inside path"),
+        ({"rows": 1}, "has no option 'rows'"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            read(tmp_path, **more)
+    with pytest.raises(MissingError, match="has no recording 'other'"):
+        open_source(dataset(tmp_path)).read("other")
+
+
+def test_a_log_is_checked_and_estimated_from_its_file(place: Place) -> None:
+    write_log(place.folder / "lap.vbo")
+    described = dataset(place.folder / "raw") | {"title": "Logs", "kind": "real"}
+    (place.folder / "conf" / "dataset" / "logs.yaml").write_text(yaml.safe_dump(described))
+    code, _, err = place("estimate", "lap.vbo", "dataset=logs", "-o", "out.csv")
+    assert code == 0, err
+    assert (place.folder / "out.csv").is_file()
+    assert place("data", "check", "lap.vbo", "dataset=logs")[0] == 0
+    code, line = place.refused("estimate", "lap.vbo")
+    assert code == 2
+    assert "copy the data set 'vbo' to conf/dataset/NAME.yaml" in line
+
+
+@pytest.mark.skipif(not REAL.is_file(), reason="needs VEHEST_DATA with vbox/standstill.VBO")
+def test_the_log_of_a_real_logger_is_read() -> None:
+    log = read_log(REAL)
+    assert len(log.columns) == 75
+    assert log.offsets["CoG"] == (0.84, 0.30)
+    assert {name: log.units[name] for name in ("SWA", "VehSpdLgt", "YawRate", "Lat._Vel.", "Head_imu2")} == {
+        "SWA": "rad",
+        "VehSpdLgt": "m/s",
+        "YawRate": "°/s",
+        "Lat._Vel.": "km/h",
+        "Head_imu2": "°",
+    }
+    assert log.n_dropped == 1
+    assert np.allclose(np.diff(log.seconds), 0.01, atol=1e-6)
+    assert np.abs(log.columns["velocity"]).max() < 1.0

@@ -1,0 +1,84 @@
+"""Logs as a VBOX writes them, of a car that turns; for tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+RATE = 100.0
+AXLES = {"FL": (0.031, 1.790), "RL": (0.031, -1.060)}
+COLUMNS = "sats time lat long velocity heading height vert-vel Longacc Latacc event-1 SWA Lat._Vel. YawRate X_Accel Y_Accel Slip_FL Slip_RL"
+UNITS = ("rad", "km/h", "°/s", "g", "g", "°", "°")
+
+
+def drive(seconds: float = 10.0) -> dict[str, np.ndarray]:
+    """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²], in ISO 8855 axes, (T,) each."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    vx, yaw_rate, vy = 20.0 + np.sin(t / 3.0), 0.3 * np.sin(t), 0.2 * np.sin(t + 0.3)
+    return {"vx": vx, "yaw_rate": yaw_rate, "vy": vy, "ax": np.cos(t / 3.0) / 3.0, "ay": vx * yaw_rate}
+
+
+def clock(seconds: np.ndarray) -> list[str]:
+    """Clock times, hhmmss.sss."""
+    ms = np.rint(seconds * 1000.0).astype(int) % 86_400_000
+    return [f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in ms]
+
+
+def write_log(file: Path, first: float = 38_870.45, *, swapped: bool = False, units: tuple[str, ...] = UNITS, end: str = "") -> None:
+    """Write a log.
+
+    Args:
+        file: where to.
+        first: clock time of the first row [s].
+        swapped: whether slip is computed with offsets whose lateral and longitudinal part have changed places.
+        units: under [channel units].
+        end: what stands after the last row.
+    """
+    d = drive()
+    n = len(d["vx"])
+    slip = []
+    for lateral, longitudinal in AXLES.values():
+        ahead = lateral if swapped else longitudinal
+        slip.append(np.degrees(np.arctan2(d["vy"] + ahead * d["yaw_rate"], d["vx"])))
+    numbers = [d["vx"] * 3.6, np.degrees(-d["yaw_rate"]), d["ax"] / 9.80665, d["ay"] / 9.80665, d["vy"] * 3.6]
+    rows = []
+    for k, stamp in enumerate(clock(first + np.arange(n) / RATE)):
+        velocity, turn, ax, ay, vy = (values[k] for values in numbers)
+        begin = f"053 {stamp} +3608.25426832 -1087.02882814 {velocity:07.4f} 195.27 +0040.11 -0000.01 +0000.00 +0000.00 0.000000"
+        rest = f"{0.02:+.6E} {vy:+.9E} {turn:+.9E} {ax:+.9E} {ay:+.9E} {slip[0][k]:+.9E} {slip[1][k]:+.9E} "
+        rows.append(f"{begin} {rest}")
+    offsets = "\n".join(
+        f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}" for point, (lateral, longitudinal) in AXLES.items()
+    )
+    text = "\r\n".join(
+        [
+            "File created on 12/09/2018 @ 12:47   \r\n",
+            "[header]\r\nsatellites\r\ntime\r\n",
+            "[channel units]",
+            *units,
+            "",
+            "[comments]",
+            *offsets.splitlines(),
+            "",
+            "[module Information]\r\n026524 - VB3i - 2 5 79\r\n",
+            "[column names]",
+            COLUMNS,
+            "",
+            "[data]",
+            *rows,
+        ]
+    )
+    file.write_bytes((text + "\r\n" + end).encode("latin-1", "replace"))
+
+
+def dataset(folder: Path, **more: object) -> dict[str, object]:
+    """The configuration of a data set of such logs."""
+    channels = {
+        "vx": {"column": "velocity", "unit": "km/h"},
+        "yaw_rate": {"column": "YawRate", "unit": "deg/s", "sign": -1},
+        "ax": {"column": "X_Accel", "unit": "g"},
+        "ay": {"column": "Y_Accel", "unit": "g"},
+        "vy_ref": {"column": "Lat._Vel.", "unit": "km/h"},
+    }
+    return {"name": "logs", "source": "vbo", "path": str(folder), "channels": channels, **more}
