@@ -100,7 +100,12 @@ def test_imports_for_type_checkers_do_not_count(package):
 
 @pytest.mark.parametrize(
     ("kernel", "users"),
-    [("lstm", {"lstm"}), ("ksnn", {"ksnn"}), ("lanes", {"gru", "lstm"}), ("dugoff_track", {"dugoff_ukf", "cnn_ukf", "ensemble_ukf"})],
+    [
+        ("lstm", {"lstm"}),
+        ("ksnn", {"ksnn"}),
+        ("lanes", {"gru", "lstm", "learned_ukf"}),
+        ("dugoff_track", {"dugoff_ukf", "cnn_ukf", "ensemble_ukf"}),
+    ],
 )
 def test_a_changed_recursion_retrains_its_users_and_nobody_else(package, kernel, users):
     text = package.file(f"estimators.kernels.{kernel}").read_text()
