@@ -123,7 +123,7 @@ def test_compiled_filter_is_the_extended_filter_of_the_same_model(config, drive)
 
 @pytest.mark.parametrize("unstable", [False, True])
 def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
-    """Half a minute of a bend without measurements: with a rear axle too soft for its load the model spins, of which no filter may be sure."""
+    """Half a minute of a bend without measurements: with too soft a rear axle the model spins, of which no filter may be sure."""
     curves = {**CURVES, "c2_rear": (0.5 if unstable else 1.0) * CURVES["c2_rear"]}
     estimator = rational("rational", curves=curves)
     count = round(30.0 * estimator.settings.rate_hz)
