@@ -485,6 +485,8 @@ def conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("text", "message"),
     [
         (BOMB, "holds more than 500000 values"),
+        ("'7'", "holds the text '7' where a mapping belongs"),
+        ("a: !!timestamp soon", "a value is not what its tag"),
         ("a: " + "[" * 200 + "]" * 200, "nests deeper than 60 levels"),
         (b"a: \xff", "is not UTF-8 text"),
         ("a: &a {b: *a}", "inside itself"),

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-from vehest.data.errors import ConfigurationError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError, printable
 from vehest.data.limits import Limits, check_limit, current_limits
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import check_yaml, read_text
@@ -62,8 +62,14 @@ def _check_file(file: Path, state: tuple[int, int, int], limits: Limits) -> None
     try:
         check_yaml(text, f"'{file}'")
         content = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        if isinstance(content, str):  # which Hydra reads once more
+            check_yaml(content, f"'{file}'")
+            if not isinstance(yaml.safe_load(content), str):
+                raise DataError(f"'{file}' holds the text '{printable(content[:40])}' where a mapping belongs")
     except (yaml.YAMLError, ValueError, TypeError, RecursionError):
         return
+    except (AttributeError, LookupError):  # PyYAML's own, of `!!timestamp soon` and `!!bool perhaps`
+        raise DataError(f"'{file}' cannot be read as YAML (a value is not what its tag, such as !!timestamp, says)") from None
     if not isinstance(content, dict):
         return
     defaults = content.get("defaults")

@@ -148,7 +148,7 @@ def magnitudes(case: Case) -> Command:
 
 @generator()
 def encodings(case: Case) -> Command:
-    text = _text(lap(case.visit, 10.0))
+    text = _text(lap(case.visit, 20.0))
     written = "utf-8" if case.honest else case.rng.choice(ENCODINGS)
     told = [] if case.honest else case.rng.choice([[], [f"dataset.encoding={case.rng.choice(ENCODINGS)}"], ["dataset.encoding=idna"]])
     case.write("lap.csv", text.encode(written))
