@@ -182,6 +182,20 @@ def table(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     return by_source(source="tabular", time={"column": "time", "unit": "s"}, channels={"vx": {"column": "v", "unit": "m/s"}})
 
 
+def vbo(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+    from vbo_log import dataset, write_log
+
+    write_log(honest / "a.vbo")
+    content = (honest / "a.vbo").read_text(encoding="latin-1")
+    for number, text in enumerate([PAYLOAD, f'=cmd|" /C touch {MARK}"!A0', "$(touch MARK)"]):
+        (hostile / f"comment{number}.vbo").write_text(content.replace("[comments]", f"[comments]\n{text}"), encoding="latin-1")
+        (hostile / f"cell{number}.vbo").write_text(content.replace("+0.000000E+00", text.replace(" ", ""), 1), encoding="latin-1")
+        (hostile / f"column{number}.vbo").write_text(content.replace(" SWA ", f" {text.replace(' ', '')} "), encoding="latin-1")
+    (hostile / "cell3.vbo").write_text(content.replace(" +2.000000E-02 ", f" {PAYLOAD} ", 1), encoding="latin-1")
+    (hostile / "pickle.vbo").write_bytes(b"[column names]\ntime\n[data]\ncos\nsystem\n(S'touch MARK'\ntR.")
+    return by_source(**{key: value for key, value in dataset(honest).items() if key not in ("name", "path")})
+
+
 def model_folder(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     import shutil
 
@@ -216,6 +230,7 @@ CASES = {
     "rosbag": Case(
         rosbag, needs="rosbags", refused=frozenset({"view_load_extension", "view_writefile", "view_zeroblob", "trigger", "endless"})
     ),
+    "vbo": Case(vbo, refused=frozenset({"cell3.vbo", "pickle.vbo"})),
     "table": Case(table, refused=frozenset({"cell0.csv", "pickle.csv"})),
     "model": Case(model_folder, refused=frozenset({"tag0", "tag1", "tag2", "name0", "name1", "name2", "name3", "name4", "pickle"})),
 }
