@@ -159,9 +159,11 @@ def _yaw_rate_unit(recording: Recording) -> list[Finding]:
     expected = recording["vx"] * recording["yaw_rate"]
     measured = recording["ay"]
     known = np.isfinite(expected) & np.isfinite(measured)
+    if known.sum() < 100:
+        return []
     expected, measured = expected[known] - expected[known].mean(), measured[known] - measured[known].mean()
     scatter = expected.std() * measured.std()
-    if known.sum() < 100 or scatter == 0.0 or measured.std() < 0.2:
+    if scatter == 0.0 or measured.std() < 0.2:
         return []
     correlation = float((expected * measured).mean() / scatter)
     slope = float((expected * measured).sum() / (expected**2).sum())

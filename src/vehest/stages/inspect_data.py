@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
@@ -72,6 +74,13 @@ def config_of(source: str, overrides: Sequence[str]) -> Config:
     return compose_config("estimate", overrides)
 
 
+def _spread(samples: FloatArray) -> dict[str, float]:
+    """Smallest, mean and largest value and standard deviation of what was measured; NaN where nothing was."""
+    functions = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
+    with np.errstate(over="ignore", invalid="ignore"):
+        return {name: float(function(samples)) if len(samples) else math.nan for name, function in functions.items()}
+
+
 def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]:
     if isinstance(recording, tuple):
         raise recording[1]
@@ -79,10 +88,7 @@ def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]
         {
             "name": name,
             "unit": CHANNELS[name].unit,
-            "min": float(np.nanmin(samples)),
-            "mean": float(np.nanmean(samples)),
-            "max": float(np.nanmax(samples)),
-            "std": float(np.nanstd(samples)),
+            **_spread(samples[~np.isnan(samples)]),
         }
         for name, samples in recording.channels.items()
     ]

@@ -210,5 +210,5 @@ def environments(case: Case) -> Command:
     return Command(
         command,
         environment={} if case.honest else {variable: value},
-        targets=() if case.honest or variable != "VEHEST_OUTPUT" else (os.path.normpath(value).strip("/") or ".",),
+        targets=() if case.honest or variable != "VEHEST_OUTPUT" else ("file:" if value.startswith("file:") else value.strip("/") or ".",),
     )

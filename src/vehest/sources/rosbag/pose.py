@@ -79,7 +79,8 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
     Raises:
         DataError: a quaternion is not of unit length.
     """
-    length = np.linalg.norm(orientations, axis=1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(orientations, axis=1)
     off = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
     if len(off):
         raise DataError(
