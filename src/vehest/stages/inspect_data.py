@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,7 @@ def config_of(source: str, overrides: Sequence[str]) -> Config:
 
 def _spread(samples: FloatArray) -> dict[str, float]:
     """Smallest, mean and largest value and standard deviation of what was measured; NaN where nothing was."""
-    functions = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
+    functions: dict[str, Callable[[FloatArray], Any]] = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
     with np.errstate(over="ignore", invalid="ignore"):
         return {name: float(function(samples)) if len(samples) else math.nan for name, function in functions.items()}
 
