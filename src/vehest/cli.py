@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -40,6 +41,7 @@ data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
+EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
@@ -572,15 +574,25 @@ def data_show(
     for recording in shown["recordings"]:
         _echo(
             f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
-            f"{recording['start']:.6g} s to {recording['end']:.6g} s, {recording['samples']} samples"
+            f"{_stretch(recording['start'], recording['end'])}, {recording['samples']} samples"
         )
         rows = [[c["name"], c["unit"], *(f"{c[key]:.4g}" for key in ("min", "mean", "max", "std"))] for c in recording["channels"]]
         _table(["channel", "unit", "min", "mean", "max", "std"], rows)
 
 
+def _stretch(start: float, end: float) -> str:
+    """When a recording begins and ends [s]; of unix time the date, and seconds from it on."""
+    if not EARLIEST_UNIX < start < LATEST_UNIX:
+        return f"{start:.6g} s to {end:.6g} s"
+    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
+
+
 @data_app.command("check")
 def data_check(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
+    source: Annotated[
+        str,
+        typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
+    ],
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -57,6 +57,22 @@ def test_tum_files_hold_125_rows_a_second_in_si_units(data_root: Path, file: str
     np.testing.assert_allclose(recording["vy_ref"], table["vy_mps"], rtol=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("dataset", "rate", "seconds"), [("ferrari_250lm_unlabelled", 20.0, [406.3, 208.0, 310.7, 387.9]), ("av21", 25.0, [671.6, 475.9])]
+)
+def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(
+    data_root: Path, dataset: str, rate: float, seconds: list[float]
+) -> None:
+    recordings = list(source_of(dataset, data_root).recordings())
+    assert {recording.rate_hz for recording in recordings} == {rate}
+    assert [recording.duration for recording in recordings] == pytest.approx(seconds, abs=0.1)
+    assert not [f for recording in recordings for f in checks_of_recording(recording) if f.level == "error"]
+    for recording in recordings:
+        moving, angle = recording["vx"] > 8.0, "handwheel" if "handwheel" in recording else "steer"
+        assert np.corrcoef(recording[angle][moving], recording["yaw_rate"][moving])[0, 1] > 0.5
+        assert ("vy_ref" in recording) == ("ay" not in recording) == (dataset == "av21")
+
+
 def follows(recording: Recording) -> str:
     return next((f.level for f in checks_of_recording(recording) if f.channel == "vy_ref" and "follows" in f.message), "none")
 

@@ -181,6 +181,9 @@ def test_data_commands_list_show_and_check(place):
     assert "follows ay - vx·yaw_rate" in out
     assert "yaw_rate" in place("data", "channels")[1]
     assert "one: simulated" in place("data", "show", "mine")[1]
+    frame = pd.DataFrame({"time": 1672875115.4 + np.arange(100) / 100.0, "vx": np.linspace(20.0, 21.0, 100)})
+    frame.to_csv(place.folder / "unix.csv", index=False)
+    assert "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples" in place("data", "show", "unix.csv")[1]
 
 
 def test_check_reports_a_reference_that_points_the_wrong_way(place):
