@@ -280,7 +280,7 @@ def estimate(
         str | None,
         typer.Argument(
             metavar="FILE",
-            help="The recording after a model: a CSV or Parquet file, which needs no reference channels.",
+            help="The recording after a model: a table, or with dataset=NAME what that one reads; it needs no reference channels.",
             show_default=False,
         ),
     ] = None,
