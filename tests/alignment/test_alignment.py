@@ -21,10 +21,11 @@ from vehest.alignment.align import Alignment, align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.cli import main
+from vehest.data.derived import SteeringRatio
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
-from vehest.data.transforms import DelayCorrection, OffsetCorrection, SteeringRatio, transform_from_config
+from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_from_config
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration

@@ -12,6 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vehest.data import transforms
+from vehest.data.derived import (
+    AccelerationFromSpeed,
+    ScaleToWheelbase,
+    SideslipFromVelocity,
+    SpeedFromWheels,
+    VelocityFromSideslip,
+)
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.transforms import (
@@ -21,7 +28,6 @@ from vehest.data.transforms import (
     ReferenceLever,
     RemoveOutliers,
     Resample,
-    SpeedFromWheels,
     transform_from_config,
 )
 from vehest.data.windows import windows_of
@@ -297,7 +303,8 @@ def test_transforms_are_built_from_plain_values() -> None:
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
     others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
-    assert set(TRANSFORMS) == others | of_an_alignment
+    deriving = {"acceleration_from_speed", "velocity_from_sideslip", "sideslip_from_velocity", "scale_to_wheelbase"}
+    assert set(TRANSFORMS) == others | of_an_alignment | deriving
 
 
 @pytest.mark.parametrize(
@@ -379,6 +386,67 @@ def test_wheels_that_were_never_measured_are_refused() -> None:
     missing = np.full(2000, math.nan)
     with pytest.raises(DataError, match="no wheel speed was measured"):
         WHEELS(rolling(yaw_rate=missing)[0])
+
+
+def test_rear_wheels_alone_give_the_speed_without_tracks() -> None:
+    whole, u = rolling()
+    rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
+    np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12)  # left and right make up for the track
+    one = whole.select(["wheel_speed_rl"])
+    np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12)
+    with pytest.raises(DataError, match="has no wheel speed to make vx of"):
+        SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
+
+
+def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all() -> None:
+    frequency, rate = 0.5, 100.0
+    time = np.arange(3000) / rate
+    drive = Recording("lap", "car", rate, 0.0, {"vx": 20.0 + 3.0 * np.sin(2 * np.pi * frequency * time)})
+    amplitude = 3.0 * 2 * np.pi * frequency
+    late = math.sqrt(2.0) / (2.0 * np.pi * 5.0) + 0.5 / rate
+    for direction, delay in (("zero_phase", 0.0), ("causal", late)):
+        made = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)  # type: ignore[arg-type]
+        expected = amplitude * np.cos(2 * np.pi * frequency * (time - delay))
+        np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
+    causal = AccelerationFromSpeed()
+    np.testing.assert_array_equal(causal(drive.cut(0.0, 9.0))["ax"], causal(drive)["ax"][:900])
+    with pytest.raises(DataError, match="cutoff_hz must lie below half of 100 Hz"):
+        AccelerationFromSpeed(cutoff_hz=50.0)(drive)
+
+
+def test_velocity_and_sideslip_follow_from_each_other() -> None:
+    angle = np.deg2rad(np.array([-58.0, -3.0, 0.0, 12.0]))
+    drive = recorded(vx=np.array([5.0, 20.0, 30.0, 10.0]), sideslip_ref=angle)
+    there = VelocityFromSideslip()(drive)
+    np.testing.assert_allclose(there["vy_ref"], drive["vx"] * np.tan(angle))
+    back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
+    np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
+    with pytest.raises(DataError, match="less than 90 degrees"):
+        VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
+
+
+def test_an_angle_with_gaps_makes_a_velocity_with_gaps() -> None:
+    channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
+    drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
+    made = VelocityFromSideslip()(drive)
+    assert "vy_ref" in made.gappy
+    np.testing.assert_array_equal(np.isnan(made["vy_ref"]), [False, True, False])
+
+
+def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations() -> None:
+    """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of smooth signals."""
+    time = np.arange(4000) / 100.0
+    vx, vy, yaw_rate = 3.0 + 0.5 * np.sin(time), 0.4 * np.sin(1.3 * time), 2.0 * np.sin(0.8 * time)
+    ay = 0.4 * 1.3 * np.cos(1.3 * time) + vx * yaw_rate
+    small = Recording("lap", "car", 100.0, 2.0, {"vx": vx, "vy_ref": vy, "yaw_rate": yaw_rate, "ay": ay, "motor_current": ay})
+    large = ScaleToWheelbase(0.25, 2.25)(small)
+    assert large.rate_hz == pytest.approx(100.0 / 3.0)
+    assert large.start_time == pytest.approx(6.0)
+    assert "motor_current" not in large
+    np.testing.assert_array_equal(large["ay"], ay)
+    np.testing.assert_allclose(np.arctan2(large["vy_ref"], large["vx"]), np.arctan2(vy, vx), atol=1e-12)
+    derived = np.gradient(large["vy_ref"]) * large.rate_hz + large["vx"] * large["yaw_rate"]
+    np.testing.assert_allclose(derived[1:-1], ay[1:-1], atol=1e-3)
 
 
 def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:

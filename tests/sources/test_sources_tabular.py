@@ -75,6 +75,73 @@ def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
         np.testing.assert_array_equal(samples, frame[name].to_numpy())
 
 
+# --- what a data set derives -------------------------------------------------------------------------------------------------------
+
+
+def test_a_log_with_wheel_speeds_and_a_sideslip_angle_gets_the_channels_that_it_lacks(tmp_path: Path) -> None:
+    """A steady left turn: the angle was measured 2 m ahead of the centre of gravity, where v is larger by 2·r."""
+    speed, yaw_rate, vy, ahead = 20.0, 0.4, -0.5, 2.0
+    shown = np.degrees(np.arctan2(vy + ahead * yaw_rate, speed))
+    frame = pd.DataFrame({"time": np.arange(N) / 100.0, "RL": np.full(N, speed / 0.3), "RR": np.full(N, speed / 0.3)})
+    frame["yaw"], frame["slip"], frame["wheel"] = yaw_rate, shown, 32.0
+    frame.to_csv(tmp_path / "lap.csv", index=False)
+    columns = {
+        "wheel_speed_rl": {"column": "RL", "unit": "rad/s"},
+        "wheel_speed_rr": {"column": "RR", "unit": "rad/s"},
+        "yaw_rate": {"column": "yaw", "unit": "rad/s"},
+        "handwheel": {"column": "wheel", "unit": "deg"},
+        "sideslip_ref": {"column": "slip", "unit": "deg"},
+    }
+    transforms = [
+        {"name": "speed_from_wheels", "wheel_radius": 0.3},
+        {"name": "acceleration_from_speed"},
+        {"name": "steering_ratio", "ratio": 16},
+        {"name": "velocity_from_sideslip"},
+    ]
+    point = {"x": ahead, "y": 0.0}
+    recording = read(tmp_path / "lap.csv", channels=columns, transforms=transforms, reference_point=point, imu_point="unknown")
+    np.testing.assert_allclose(recording["vx"], speed)
+    np.testing.assert_allclose(recording["ax"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(recording["steer"], np.deg2rad(2.0))
+    np.testing.assert_allclose(recording["vy_ref"], vy)
+    np.testing.assert_allclose(recording["sideslip_ref"], np.arctan2(vy, speed))
+    told = recording.provenance["derived"]
+    assert (told["reference_point"], told["imu_point"], told["moved_to_centre_of_gravity"]) == (point, "unknown", True)
+    assert [entry["name"] for entry in told["transforms"]] == [entry["name"] for entry in transforms]
+
+
+def test_a_stored_recording_is_not_derived_twice(tmp_path: Path) -> None:
+    table().assign(vy_ref=0.1).to_csv(tmp_path / "lap.csv", index=False)
+    once = read(tmp_path / "lap.csv", reference_point={"x": 1.0})
+    write_recording(once, tmp_path / "stored.parquet")
+    again = source(tmp_path, reference_point={"x": 1.0}).read_file(tmp_path / "stored.parquet")
+    np.testing.assert_array_equal(again["vy_ref"], once["vy_ref"])
+    np.testing.assert_allclose(once["vy_ref"], 0.1 - table()["yaw_rate"])
+
+
+def test_a_new_drive_needs_no_reference_to_be_read_as_its_data_set_says(tmp_path: Path) -> None:
+    table().to_csv(tmp_path / "lap.csv", index=False)
+    options = ["+dataset.reference_point={x: 2.0}", "+dataset.transforms=[{name: velocity_from_sideslip}, {name: acceleration_from_speed}]"]
+    recording = api.read_recording(tmp_path / "lap.csv", options)
+    assert "ax" in recording
+    assert "vy_ref" not in recording
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"transforms": [{"name": "spam"}]}, "data set 'mine': transform 'spam' is not one of"),
+        ({"transforms": {"name": "steering_ratio"}}, "dataset.transforms"),
+        ({"reference_point": {"x": "far"}}, "dataset.reference_point"),
+        ({"reference_point": "somewhere"}, "dataset.reference_point"),
+        ({"imu_point": {"z": 1}}, "dataset.imu_point"),
+    ],
+    ids=str,
+)
+def test_a_wrong_declaration_is_one_line_that_names_the_option(tmp_path: Path, options: dict[str, object], what: str) -> None:
+    assert what in refusal(lambda: source(tmp_path, **options), ConfigurationError)
+
+
 # --- what can be read --------------------------------------------------------------------------------------------------------------
 
 

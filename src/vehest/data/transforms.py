@@ -9,17 +9,23 @@ from fractions import Fraction
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import (
+    AccelerationFromSpeed,
+    Mode,
+    ScaleToWheelbase,
+    SideslipFromVelocity,
+    SpeedFromWheels,
+    SteeringRatio,
+    VelocityFromSideslip,
+)
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
-
-Mode = Literal["causal", "offline"]
 
 LONGEST_DIRECT = 8192
 """Taps up to which a filter is summed sample by sample; longer ones through their spectra."""
@@ -368,17 +374,21 @@ class ReferenceLever:
             raise ConfigurationError(f"the lever of a reference must be numbers [m], not {self.lever_x} and {self.lever_y}")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct vx_ref and vy_ref, and sideslip_ref where there is one, by yaw_rate_ref or, without one, yaw_rate.
+        """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate.
 
         Raises:
-            DataError: vx_ref, vy_ref or the yaw rate is missing or has gaps.
+            DataError: vy_ref or the yaw rate is missing.
         """
         turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
-        _require_no_gaps(recording, ("vx_ref", "vy_ref", turning))
-        vx = recording["vx_ref"] + recording[turning] * self.lever_y
-        vy = recording["vy_ref"] - recording[turning] * self.lever_x
-        sideslip = {"sideslip_ref": np.arctan2(vy, vx)} if "sideslip_ref" in recording else {}
-        return replace(recording, channels={**recording.channels, "vx_ref": vx, "vy_ref": vy, **sideslip})
+        forward = {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y} if "vx_ref" in recording else {}
+        moved = {**forward, "vy_ref": recording["vy_ref"] - recording[turning] * self.lever_x}
+        sources = {turning, *moved}
+        if "sideslip_ref" in recording:
+            speed = "vx_ref" if forward else "vx"
+            sources.add(speed)
+            moved["sideslip_ref"] = np.arctan2(moved["vy_ref"], forward.get("vx_ref", recording[speed]))
+        gappy = recording.gappy | set(moved) if sources & recording.gappy else recording.gappy
+        return replace(recording, channels={**recording.channels, **moved}, gappy=gappy)
 
 
 @dataclass(frozen=True)
@@ -477,139 +487,6 @@ class OffsetCorrection:
         return replace(recording, channels={**recording.channels, **changed})
 
 
-@dataclass(frozen=True)
-class SteeringRatio:
-    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio.
-
-    Args:
-        ratio: how far the angle turns for a unit of ``steer``; negative if it counts the other way.
-        offset: what it shows going straight ahead [rad].
-        channel: the angle; ``steer`` itself may be it.
-    """
-
-    ratio: float
-    offset: float = 0.0
-    channel: str = "handwheel"
-    mode: ClassVar[Mode] = "causal"
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.ratio) and self.ratio != 0.0 and math.isfinite(self.offset)):
-            raise ConfigurationError(
-                f"a steering ratio must be a number other than zero and its offset a number, not {self.ratio} and {self.offset}"
-            )
-        if self.channel not in CHANNELS:
-            raise ConfigurationError(f"steering ratio of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
-
-    def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the angle has them.
-
-        Raises:
-            DataError: the channel is missing.
-        """
-        steer = (recording[self.channel] - self.offset) / self.ratio
-        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
-        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
-
-
-@dataclass(frozen=True)
-class SpeedFromWheels:
-    """Make the forward speed ``vx`` from four wheel speeds, each brought to the centre of gravity, without those that slip or dropped out.
-
-        u_FL = ω_FL R cos δ + r t_F/2,   u_FR = ω_FR R cos δ - r t_F/2,   u_RL = ω_RL R + r t_R/2,   u_RR = ω_RR R - r t_R/2
-
-    A wheel counts while it is within ``tolerance`` of the median of the four, and ``vx`` is the mean of those that count, which moves by
-    no more than ``most_acceleration`` allows. Where fewer than two count, ``ax`` carries the speed on (or nothing, where there is no
-    ``ax``), for ``hold_seconds``; after them the median counts, since something must.
-
-    Args:
-        wheel_radius: rolling radius R [m].
-        track_front: t_F [m].
-        track_rear: t_R [m].
-        tolerance: absolute part of it [m/s]; 5 % of the median come on top.
-        most_acceleration: of the car, forwards or backwards [m/s²].
-        hold_seconds: for how long ``vx`` goes on without two wheels [s].
-
-    Source:
-        Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
-    """
-
-    wheel_radius: float
-    track_front: float
-    track_rear: float
-    tolerance: float = 0.3
-    most_acceleration: float = 12.0
-    hold_seconds: float = 2.0
-    mode: ClassVar[Mode] = "causal"
-    relative_tolerance: ClassVar[float] = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("wheel_radius", "track_front", "track_rear", "tolerance", "most_acceleration", "hold_seconds"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0):
-                raise ConfigurationError(f"speed from wheels: {name} must be a positive number, not {value!r}")
-
-    def corrected(self, recording: Recording) -> FloatArray:
-        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right.
-
-        Raises:
-            DataError: a wheel speed, ``yaw_rate`` or ``steer`` is missing.
-        """
-        wheels = self.wheel_radius * recording.stack([f"wheel_speed_{wheel}" for wheel in ("fl", "fr", "rl", "rr")]).T
-        wheels[:2] *= np.cos(recording["steer"])
-        sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
-        return wheels + sides[:, None] * recording["yaw_rate"]
-
-    def plausible(self, recording: Recording) -> NDArray[np.bool_]:
-        """Which wheels count, (4, T).
-
-        Raises:
-            DataError: a channel is missing.
-        """
-        speeds = self.corrected(recording)
-        median = _known_median(speeds)
-        return np.abs(speeds - median) <= self.tolerance + self.relative_tolerance * np.abs(median)
-
-    def __call__(self, recording: Recording) -> Recording:
-        """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
-
-        Raises:
-            DataError: a channel is missing, or no wheel was ever measured.
-        """
-        speeds, counts = self.corrected(recording), self.plausible(recording)
-        if not np.isfinite(speeds).any():
-            raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
-        step = 1.0 / recording.rate_hz
-        most, patience = self.most_acceleration * step, round(min(self.hold_seconds * recording.rate_hz, len(recording)))
-        number = counts.sum(0)
-        mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
-        ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
-        vx, held, now = np.empty(len(recording)), 0, math.nan
-        rows = zip(mean.tolist(), number.tolist(), _known_median(speeds).tolist(), ahead.tolist(), strict=True)
-        for k, (wheels, agreeing, median, gain) in enumerate(rows):
-            held = 0 if agreeing >= 2 else held + 1
-            wanted = wheels if agreeing >= 2 else median
-            if math.isnan(now):
-                now = wanted
-            elif (held and held <= patience) or math.isnan(wanted):
-                now += gain
-            else:
-                now += min(max(wanted - now, -most), most)
-            vx[k] = now
-        if not np.isfinite(vx).any():
-            raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
-        vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
-        return replace(recording, channels={**recording.channels, "vx": vx}, gappy=recording.gappy - {"vx"})
-
-
-def _known_median(speeds: FloatArray) -> FloatArray:
-    """Median of the wheels that were measured, (4, T) -> (T,); NaN where none was."""
-    ranked = np.sort(speeds, axis=0)  # NaN last
-    number = np.isfinite(speeds).sum(0)
-    column = np.arange(speeds.shape[1])
-    middle: FloatArray = 0.5 * (ranked[np.maximum(number - 1, 0) // 2, column] + ranked[np.minimum(number // 2, 3), column])
-    return np.where(number > 0, middle, np.nan)
-
-
 TRANSFORMS: dict[str, type] = {
     "resample": Resample,
     "low_pass": LowPass,
@@ -620,7 +497,15 @@ TRANSFORMS: dict[str, type] = {
     "offset_correction": OffsetCorrection,
     "steering_ratio": SteeringRatio,
     "speed_from_wheels": SpeedFromWheels,
+    "acceleration_from_speed": AccelerationFromSpeed,
+    "velocity_from_sideslip": VelocityFromSideslip,
+    "sideslip_from_velocity": SideslipFromVelocity,
+    "scale_to_wheelbase": ScaleToWheelbase,
 }
+
+
+OF_REFERENCES = frozenset({"reference_lever", "velocity_from_sideslip", "sideslip_from_velocity"})
+"""Transforms that read and change reference channels alone: a drive without a reference goes without them."""
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import vehest.sources as package
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -17,8 +17,14 @@ from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
+from vehest.data.transforms import ReferenceLever, Transform, transform_from_config
 
-COMMON_KEYS = frozenset({"name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"})
+COMMON_KEYS = frozenset(
+    {
+        *("name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"),
+        *("transforms", "reference_point", "imu_point"),
+    }
+)
 
 
 TEMPLATES = {
@@ -31,6 +37,8 @@ TEMPLATES = {
     ".mcap": "f1tenth_bag",
 }
 """Ending of a file that is no table -> data set that shows how such files are declared."""
+DERIVED = "derived"
+"""Key of a recording's provenance: how its data set made channels of others, and where they were measured."""
 SIMULATED = "simulated"
 """Name of the source whose recordings never are real, whatever a configuration says."""
 
@@ -38,6 +46,18 @@ SIMULATED = "simulated"
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
     """Whether a data set's recordings are ``real`` or ``simulated``."""
     return "simulated" if SIMULATED in (dataset.get("source"), dataset.get("kind")) else "real"
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where something was measured, from the centre of gravity [m]: ``x`` ahead of it, ``y`` to its left."""
+
+    x: float = 0.0
+    y: float = 0.0
+
+
+UNKNOWN = "unknown"
+"""What a data set says of a point that nobody knows."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +73,9 @@ class CommonOptions:
     citation: str = ""
     accept: Annotated[tuple[str, ...], "a list of checks"] | None = None
     download: Annotated[dict[str, Any], "a mapping of url and, if need be, files and sha256"] | None = None
+    transforms: Annotated[tuple[dict[str, Any], ...], "a list of transforms"] | None = None
+    reference_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
+    imu_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
 
 
 class Source(ABC):
@@ -85,7 +108,9 @@ class Source(ABC):
             )
 
         told = {key: value for key, value in dataset.items() if key in COMMON_KEYS}
-        validated(CommonOptions, told, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
+        common = validated(CommonOptions, told, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
+        self.reference_point, self.imu_point = common.reference_point, common.imu_point
+        self.transforms = self._transforms(common.transforms or ())
         if dataset.get("source") == SIMULATED and dataset.get("kind", "simulated") != "simulated":
             raise ConfigurationError(f"data set '{self.name}': what source '{SIMULATED}' makes is simulated; leave kind out")
         if self.options_type is not None:
@@ -109,16 +134,58 @@ class Source(ABC):
     def ids(self) -> list[str]:
         """Names of the recordings, in order."""
 
-    @abstractmethod
     def read(self, recording_id: str) -> Recording:
-        """Make one recording.
+        """Make one recording, with the channels that the data set derives and its reference at the centre of gravity.
 
         Raises:
             DataError: its files cannot be used as they are.
         """
+        return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
-        """Make a recording of a file wherever it is, or of what else one recording is made of.
+        """Make a recording of a file wherever it is, or of what else one recording is made of, as `read` does.
+
+        Raises:
+            ConfigurationError: this source's recordings are none of a file.
+            MissingError: it is not there.
+            DataError: it cannot be used as it is.
+        """
+        return self._prepared(self.read_raw_file(file))
+
+    def _prepared(self, recording: Recording) -> Recording:
+        """What the data set's transforms and its reference point make of a recording, unless it has been through them; they are noted."""
+        if DERIVED in recording.provenance:
+            return recording
+        for transform in self.transforms:
+            recording = transform(recording)
+        point, moved = self.reference_point, False
+        if isinstance(point, Point) and (point.x or point.y) and "vy_ref" in recording:
+            recording, moved = ReferenceLever(point.x, point.y)(recording), True
+        told = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
+        if not told:
+            return recording
+        noted = {DERIVED: {**told, "moved_to_centre_of_gravity": moved}}
+        return replace(recording, provenance={**recording.provenance, **noted})
+
+    def _transforms(self, entries: Sequence[Mapping[str, Any]]) -> list[Transform]:
+        made = []
+        for entry in entries:
+            try:
+                made.append(transform_from_config(entry))
+            except ConfigurationError as error:
+                raise ConfigurationError(f"data set '{self.name}': {error}") from None
+        return made
+
+    @abstractmethod
+    def read_raw(self, recording_id: str) -> Recording:
+        """Make one recording of what its files hold.
+
+        Raises:
+            DataError: they cannot be used as they are.
+        """
+
+    def read_raw_file(self, file: Path) -> Recording:
+        """Make a recording of what a file holds.
 
         Raises:
             ConfigurationError: this source's recordings are none of a file.

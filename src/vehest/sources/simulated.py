@@ -121,7 +121,7 @@ class SimulatedSource(Source):
         """Names of the drives."""
         return list(self.drives)
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Simulate one drive."""
         from vehest.simulation.road.surface import surface_from_config
 

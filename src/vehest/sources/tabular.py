@@ -97,14 +97,14 @@ class TabularSource(Source):
         """The tables."""
         return {file.name: file for file in matching_files(self.dataset, "*.csv")}
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
         found = self._found()
         if recording_id not in found:
             raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {_listed(list(found))})")
         return self._read(*found[recording_id])
 
-    def read_file(self, file: Path) -> Recording:
+    def read_raw_file(self, file: Path) -> Recording:
         """Read a table wherever it is.
 
         Raises:

@@ -102,7 +102,7 @@ class VboSource(Source):
         """The logs."""
         return {file.name: file for file in self._files()}
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Read one log by its stem.
 
         Raises:
@@ -111,10 +111,10 @@ class VboSource(Source):
         """
         for file in self._files():
             if file.stem == recording_id:
-                return self.read_file(file)
+                return self.read_raw_file(file)
         raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(self.ids())})")
 
-    def read_file(self, file: Path) -> Recording:
+    def read_raw_file(self, file: Path) -> Recording:
         """Read a log wherever it is.
 
         Raises:

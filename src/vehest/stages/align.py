@@ -18,8 +18,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
-from vehest.sources.base import open_source
-from vehest.sources.tabular import TabularSource
+from vehest.sources.base import open_source, read_single
 from vehest.stages.config import Config
 from vehest.stages.config_files import choices
 from vehest.stages.inspect_data import config_of
@@ -157,7 +156,7 @@ def _one_recording(source: str, config: Config, recording_id: str | None) -> Rec
             raise ConfigurationError(f"data set '{source}' has {len(known)} recordings ({shown}); say which: --recording ID")
         recording = origin.read(recording_id if recording_id is not None else known[0])
     else:
-        recording = TabularSource(dataset).read_file(Path(source))
+        recording = read_single(dataset, Path(source))
         if recording_id not in (None, recording.id):
             raise ConfigurationError(f"'{source}' holds the recording '{recording.id}', not '{recording_id}'")
     accepted = set(dataset.get("accept") or [])

@@ -18,6 +18,7 @@ from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
+from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import read_single
@@ -87,7 +88,9 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Recording:
     if not references:  # a new drive needs no reference channels, whatever the data set declares
         channels = {name: entry for name, entry in (dataset.get("channels") or {}).items() if not name.endswith(REFERENCE_SUFFIX)}
-        dataset = {key: value for key, value in dataset.items() if key != "pose"} | ({"channels": channels} if channels else {})
+        transforms = [entry for entry in dataset.get("transforms") or [] if entry.get("name") not in OF_REFERENCES]
+        changed = {"channels": channels or None, "transforms": transforms or None, "reference_point": None, "pose": None}
+        dataset = {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
     recording = read_single(dataset, path)
     accepted = set(dataset.get("accept") or [])
     for finding in checks_of_recording(recording):

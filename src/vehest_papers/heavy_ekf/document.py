@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import pandas as pd
 
+from vehest.data.derived import SpeedFromWheels
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.transforms import SpeedFromWheels
 from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.derived import SpeedFromWheels
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.transforms import SpeedFromWheels
 from vehest.report.document import Figure
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style

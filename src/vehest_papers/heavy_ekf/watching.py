@@ -10,8 +10,8 @@ import pandas as pd
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.constants import FloatArray
+from vehest.data.derived import SpeedFromWheels
 from vehest.data.recording import Recording
-from vehest.data.transforms import SpeedFromWheels
 from vehest.estimators.rational_ekf import RationalFilter
 from vehest.evaluation.observability import Observability, observability_along
 from vehest.report.document import Block, Column, Figure, Table

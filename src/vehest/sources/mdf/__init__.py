@@ -110,7 +110,7 @@ class MdfSource(Source):
         """The measurements."""
         return {file.name: file for file in matching_files(self.dataset, "*.mf4")}
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Read one measurement by its stem.
 
         Raises:
@@ -119,10 +119,10 @@ class MdfSource(Source):
         """
         for file in matching_files(self.dataset, "*.mf4"):
             if file.stem == recording_id:
-                return self.read_file(file)
+                return self.read_raw_file(file)
         raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {', '.join(self.ids())})")
 
-    def read_file(self, file: Path) -> Recording:
+    def read_raw_file(self, file: Path) -> Recording:
         """Read a measurement wherever it is.
 
         Raises:

@@ -105,7 +105,7 @@ class RevsSource(Source):
         parameters = self.dataset.get("vehicle_parameters")
         return [f"{name}{suffix}" for name in self.ids()] + ([str(parameters)] if parameters else [])
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
         self._files(recording_id)
         reading = {"csv": self._read_csv, "mat": self._read_mat, "text": self._read_text}

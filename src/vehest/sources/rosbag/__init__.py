@@ -85,7 +85,7 @@ class RosbagSource(Source):
                 inputs[file.name if file == bag else f"{bag.name}/{file.name}"] = file
         return inputs
 
-    def read(self, recording_id: str) -> Recording:
+    def read_raw(self, recording_id: str) -> Recording:
         """Read one bag.
 
         Raises:
@@ -98,7 +98,7 @@ class RosbagSource(Source):
             raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(bags)})")
         return self._read(recording_id, bags[recording_id])
 
-    def read_file(self, file: Path) -> Recording:
+    def read_raw_file(self, file: Path) -> Recording:
         """Read a bag, a file or a folder, wherever it is; as `read`."""
         return self._read(file.stem, file)
 

@@ -1,0 +1,306 @@
+"""Channels that are made of others, where a log lacks them: each transform says from what, and whether it is causal or offline."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+
+Mode = Literal["causal", "offline"]
+WHEELS = ("fl", "fr", "rl", "rr")
+
+
+@dataclass(frozen=True)
+class SteeringRatio:
+    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio.
+
+    Args:
+        ratio: how far the angle turns for a unit of ``steer``; negative if it counts the other way.
+        offset: what it shows going straight ahead [rad].
+        channel: the angle; ``steer`` itself may be it.
+    """
+
+    ratio: float
+    offset: float = 0.0
+    channel: str = "handwheel"
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.ratio) and self.ratio != 0.0 and math.isfinite(self.offset)):
+            raise ConfigurationError(
+                f"a steering ratio must be a number other than zero and its offset a number, not {self.ratio} and {self.offset}"
+            )
+        if self.channel not in CHANNELS:
+            raise ConfigurationError(f"steering ratio of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``steer``; it has gaps where the angle has them.
+
+        Raises:
+            DataError: the channel is missing.
+        """
+        steer = (recording[self.channel] - self.offset) / self.ratio
+        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
+        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
+
+
+@dataclass(frozen=True)
+class SpeedFromWheels:
+    """Make the forward speed ``vx`` from wheel speeds, each brought to the centre of gravity, without those that slip or dropped out.
+
+        u_FL = ω_FL R cos δ + r t_F/2,   u_FR = ω_FR R cos δ - r t_F/2,   u_RL = ω_RL R + r t_R/2,   u_RR = ω_RR R - r t_R/2
+
+    A wheel counts while it is within ``tolerance`` of their median, and ``vx`` is the mean of those that count, which moves by no more than
+    ``most_acceleration`` allows. Where fewer than two count, ``ax`` carries the speed on (or nothing, where there is no ``ax``), for
+    ``hold_seconds``; after them the median counts, since something must. Wheels that the recording does not have do not count; one
+    alone counts as it is. Without ``steer`` the front wheels point straight ahead.
+
+    Args:
+        wheel_radius: rolling radius R [m].
+        track_front: t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up.
+        track_rear: t_R [m]; the same.
+        tolerance: absolute part of it [m/s]; 5 % of the median come on top.
+        most_acceleration: of the car, forwards or backwards [m/s²].
+        hold_seconds: for how long ``vx`` goes on without two wheels [s].
+
+    Source:
+        Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
+    """
+
+    wheel_radius: float
+    track_front: float = 0.0
+    track_rear: float = 0.0
+    tolerance: float = 0.3
+    most_acceleration: float = 12.0
+    hold_seconds: float = 2.0
+    mode: ClassVar[Mode] = "causal"
+    relative_tolerance: ClassVar[float] = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_radius", "track_front", "track_rear", "tolerance", "most_acceleration", "hold_seconds"):
+            value = getattr(self, name)
+            may_be_zero = name.startswith("track")
+            if not (isinstance(value, int | float) and math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
+                what = "zero or a positive number" if may_be_zero else "a positive number"
+                raise ConfigurationError(f"speed from wheels: {name} must be {what}, not {value!r}")
+
+    def corrected(self, recording: Recording) -> FloatArray:
+        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
+
+        Raises:
+            DataError: there is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
+        """
+        names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
+        if not set(names) & set(recording.channels):
+            raise DataError(f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}")
+        missing = np.full(len(recording), np.nan)
+        wheels = self.wheel_radius * np.stack([recording.channels.get(name, missing) for name in names])
+        if "steer" in recording:
+            wheels[:2] *= np.cos(recording["steer"])
+        if not (self.track_front or self.track_rear):
+            return wheels
+        sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
+        return wheels + sides[:, None] * recording["yaw_rate"]
+
+    def plausible(self, recording: Recording) -> NDArray[np.bool_]:
+        """Which wheels count, (4, T).
+
+        Raises:
+            DataError: a channel is missing.
+        """
+        speeds = self.corrected(recording)
+        median = _known_median(speeds)
+        return np.abs(speeds - median) <= self.tolerance + self.relative_tolerance * np.abs(median)
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
+
+        Raises:
+            DataError: a channel is missing, or no wheel was ever measured.
+        """
+        speeds, counts = self.corrected(recording), self.plausible(recording)
+        if not np.isfinite(speeds).any():
+            raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
+        enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
+        step = 1.0 / recording.rate_hz
+        most, patience = self.most_acceleration * step, round(min(self.hold_seconds * recording.rate_hz, len(recording)))
+        number = counts.sum(0)
+        mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
+        ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
+        vx, held, now = np.empty(len(recording)), 0, math.nan
+        rows = zip(mean.tolist(), number.tolist(), _known_median(speeds).tolist(), ahead.tolist(), strict=True)
+        for k, (wheels, agreeing, median, gain) in enumerate(rows):
+            held = 0 if agreeing >= enough else held + 1
+            wanted = wheels if agreeing >= enough else median
+            if math.isnan(now):
+                now = wanted
+            elif (held and held <= patience) or math.isnan(wanted):
+                now += gain
+            else:
+                now += min(max(wanted - now, -most), most)
+            vx[k] = now
+        if not np.isfinite(vx).any():
+            raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
+        vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
+        return replace(recording, channels={**recording.channels, "vx": vx}, gappy=recording.gappy - {"vx"})
+
+
+def _known_median(speeds: FloatArray) -> FloatArray:
+    """Median of the wheels that were measured, (4, T) -> (T,); NaN where none was."""
+    ranked = np.sort(speeds, axis=0)  # NaN last
+    number = np.isfinite(speeds).sum(0)
+    column = np.arange(speeds.shape[1])
+    middle: FloatArray = 0.5 * (ranked[np.maximum(number - 1, 0) // 2, column] + ranked[np.minimum(number // 2, 3), column])
+    return np.where(number > 0, middle, np.nan)
+
+
+@dataclass(frozen=True)
+class AccelerationFromSpeed:
+    """Make the longitudinal acceleration ``ax`` from a speed: ax ≈ dvx/dt, low-passed.
+
+    An accelerometer shows du/dt - v·r; the second term, v being what is looked for, is left out. It is small where sideslip is: 0.2 m/s²
+    for v = 0.5 m/s and r = 0.4 rad/s.
+
+    Args:
+        channel: the speed; ``vx`` or ``vx_ref``.
+        cutoff_hz: of a Butterworth filter of second order [Hz].
+        direction: ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``.
+
+    Source:
+        Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
+    """
+
+    channel: Literal["vx", "vx_ref"] = "vx"
+    cutoff_hz: float = 5.0
+    direction: Literal["causal", "zero_phase"] = "causal"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cutoff_hz) and self.cutoff_hz > 0):
+            raise ConfigurationError(f"acceleration from speed: cutoff_hz must be a positive number, not {self.cutoff_hz}")
+
+    @property
+    def mode(self) -> Mode:
+        """As the direction says."""
+        return "causal" if self.direction == "causal" else "offline"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``ax``.
+
+        Raises:
+            DataError: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate.
+        """
+        speed, rate = recording[self.channel], recording.rate_hz
+        if np.isnan(speed).any():
+            raise DataError(f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it")
+        if not self.cutoff_hz < rate / 2:
+            raise DataError(f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at {self.cutoff_hz:g}")
+        sections = signal.butter(2, self.cutoff_hz, fs=rate, output="sos")
+        if self.direction == "causal":
+            steps = np.diff(speed, prepend=speed[0]) * rate
+            ax = signal.sosfilt(sections, steps)
+        else:
+            steps = np.gradient(speed) * rate if len(speed) > 1 else np.zeros(1)
+            ax = signal.sosfiltfilt(sections, steps, padlen=min(9, len(steps) - 1))
+        return replace(recording, channels={**recording.channels, "ax": np.asarray(ax)}, gappy=recording.gappy - {"ax"})
+
+
+@dataclass(frozen=True)
+class VelocityFromSideslip:
+    """Make the reference ``vy_ref`` from ``sideslip_ref``, as an optical sensor gives it: v = u·tan β.
+
+    It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set, moves it from there.
+    """
+
+    mode: ClassVar[Mode] = "causal"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
+
+        Raises:
+            DataError: the angle or the speed is missing, or the angle reaches 90 degrees, where it says nothing.
+        """
+        angle, speed = recording["sideslip_ref"], _speed_of_reference(recording)
+        if np.nanmax(np.abs(angle), initial=0.0) >= 0.5 * np.pi:
+            worst = int(np.nanargmax(np.abs(angle)))
+            what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
+            raise DataError(f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only")
+        sources = {"sideslip_ref", _name_of_speed(recording)}
+        gappy = recording.gappy | {"vy_ref"} if sources & recording.gappy else recording.gappy - {"vy_ref"}
+        return replace(recording, channels={**recording.channels, "vy_ref": speed * np.tan(angle)}, gappy=gappy)
+
+
+@dataclass(frozen=True)
+class SideslipFromVelocity:
+    """Make the reference ``sideslip_ref`` from ``vy_ref``: β = atan2(v, u)."""
+
+    mode: ClassVar[Mode] = "causal"
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``sideslip_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where they have them.
+
+        Raises:
+            DataError: the velocity or the speed is missing.
+        """
+        angle = np.arctan2(recording["vy_ref"], _speed_of_reference(recording))
+        sources = {"vy_ref", _name_of_speed(recording)}
+        gappy = recording.gappy | {"sideslip_ref"} if sources & recording.gappy else recording.gappy - {"sideslip_ref"}
+        return replace(recording, channels={**recording.channels, "sideslip_ref": angle}, gappy=gappy)
+
+
+def _name_of_speed(recording: Recording) -> str:
+    return "vx_ref" if "vx_ref" in recording else "vx"
+
+
+def _speed_of_reference(recording: Recording) -> FloatArray:
+    return recording[_name_of_speed(recording)]
+
+
+@dataclass(frozen=True)
+class ScaleToWheelbase:
+    """See a car as one of another wheelbase: times and lengths in units that leave accelerations and angles as they are.
+
+    With λ = to/wheelbase, lengths grow by λ and times by √λ: velocities by √λ, yaw rates by 1/√λ. A 1:10 car and a full-size one
+    that are geometrically similar on similar tyres then drive the same manoeuvre. Channels that are no lengths, times or angles
+    (forces, torques, currents, pressures) are left out.
+
+    Args:
+        wheelbase: of the car [m].
+        to: of the car that it is seen as [m].
+
+    Source:
+        Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
+        testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
+    """
+
+    wheelbase: float
+    to: float
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        for name in ("wheelbase", "to"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigurationError(f"scale to wheelbase: {name} must be a positive number of metres, not {value}")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Scale rate, start time and channels."""
+        stretch = math.sqrt(self.to / self.wheelbase)
+        factors = {"m/s": stretch, "rad/s": 1.0 / stretch, "m/s²": 1.0, "rad": 1.0}
+        channels = {
+            name: samples * factors[unit] for name, samples in recording.channels.items() if (unit := CHANNELS[name].unit) in factors
+        }
+        return replace(
+            recording,
+            rate_hz=recording.rate_hz / stretch,
+            start_time=recording.start_time * stretch,
+            channels=channels,
+        )
