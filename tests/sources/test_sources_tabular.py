@@ -121,7 +121,11 @@ def test_a_stored_recording_is_not_derived_twice(tmp_path: Path) -> None:
 
 def test_a_new_drive_needs_no_reference_to_be_read_as_its_data_set_says(tmp_path: Path) -> None:
     table().to_csv(tmp_path / "lap.csv", index=False)
-    options = ["+dataset.reference_point={x: 2.0}", "+dataset.transforms=[{name: velocity_from_sideslip}, {name: acceleration_from_speed}]"]
+    options = [
+        "dataset.accept=[impossible]",
+        "+dataset.reference_point={x: 2.0}",
+        "+dataset.transforms=[{name: velocity_from_sideslip}, {name: acceleration_from_speed}]",
+    ]
     recording = api.read_recording(tmp_path / "lap.csv", options)
     assert "ax" in recording
     assert "vy_ref" not in recording
