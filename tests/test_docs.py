@@ -22,7 +22,7 @@ from fuzz import case
 from vehest.alignment import checks
 from vehest.cli import app
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
-from vehest.data.splits import split_from_config
+from vehest.data.split_files import split_from_config
 from vehest.data.transforms import TRANSFORMS, Resample
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class, estimator_names
