@@ -19,10 +19,10 @@ from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
-from vehest.report.style import MISSING, REFERENCE, Line, decimals_for, fixed, lines_of
+from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
-from vehest.studies.kit.standing import ranking_of, standing_columns, verdict_sentences
+from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
@@ -51,7 +51,7 @@ def comparison(artefacts: PartArtefacts) -> Document:
     blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines)
-    blocks += [*_training(artefacts, board, lines), *_how_it_was_made(artefacts, board)]
+    blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
     return Document(artefacts.title, blocks)
@@ -140,7 +140,7 @@ def _headline(artefacts: PartArtefacts) -> list[Block]:
     verdicts = [
         verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
     ]
-    headline = "\n\n".join([_data_sentence(artefacts), *verdicts, _budget_sentence(artefacts)])
+    headline = "\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)])
     warned = warnings_of(artefacts)
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
     blocks.append(headline)
@@ -155,7 +155,8 @@ def _where(artefacts: PartArtefacts, test_set: str) -> str:
     return f"test set `{test_set}` ({kind}; {_spans_in_words(spans)})"
 
 
-def _data_sentence(artefacts: PartArtefacts) -> str:
+def data_sentence(artefacts: PartArtefacts) -> str:
+    """Which data sets the numbers come from, and which of them are real."""
     kinds = {dataset: artefacts.kinds[dataset] for dataset in artefacts.split.datasets}
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
@@ -165,7 +166,8 @@ def _data_sentence(artefacts: PartArtefacts) -> str:
     return f"**Real and simulated data:** {parts}."
 
 
-def _budget_sentence(artefacts: PartArtefacts) -> str:
+def budget_sentence(artefacts: PartArtefacts) -> str:
+    """How many estimators, seeds and epochs stand behind the numbers."""
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = f"{counts[0]} {_plural('seed', counts[0])} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
@@ -178,7 +180,8 @@ def _budget_sentence(artefacts: PartArtefacts) -> str:
     return words + "."
 
 
-def _how_it_was_made(artefacts: PartArtefacts, board: pd.DataFrame) -> list[Block]:
+def how_it_was_made(artefacts: PartArtefacts) -> list[Block]:
+    """The appendix: command, protocol, budgets, and the table ``ranges``."""
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
@@ -266,10 +269,7 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
     decimals = decimals_for(frame["rmse_sideslip"].tolist())
-    frame["interval"] = [
-        f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
-        for low, high in zip(frame["rmse_sideslip_low"], frame["rmse_sideslip_high"], strict=True)
-    ]
+    frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     standing = Table(
         name,
         f"Estimators on test set `{test_set}`, of each the seed chosen on validation. Interval: 95 % of RMSE(β) over all seeds, for "
