@@ -33,6 +33,8 @@ from vehest.stages.config_files import GROUPS, choices
 from vehest.stages.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
 from vehest.studies.artefacts import METRIC_COLUMNS
 
+pytestmark = pytest.mark.apart
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…")

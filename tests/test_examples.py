@@ -25,6 +25,8 @@ from vehest.training.context import FitContext
 from vehest.training.nothing import NoTraining
 from vehest.training.supervised import SupervisedSettings
 
+pytestmark = pytest.mark.apart
+
 PAGE = EXAMPLES.parent / "adding_an_estimator.md"
 SPLITS = {"sliding_mode": "mine", "window_transformer": "mine", "saturating_ekf": "steered"}
 QUICK = {
