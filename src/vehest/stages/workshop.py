@@ -305,9 +305,9 @@ class Workshop:
 
 
 def test_figures(evaluation: Artefact) -> dict[str, float]:
-    """Figures of an evaluation, ``<metric>.<test set>`` -> value."""
+    """Figures of an evaluation over all samples, ``<metric>.<test set>`` -> value."""
     table = read_metrics(evaluation.folder)
-    tested = table[~table["test_set"].isin((VALIDATION, TRAINING))]
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all")]
     return {
         f"{metric}.{name}": float(value) for metric, name, value in zip(tested["metric"], tested["test_set"], tested["value"], strict=True)
     }
