@@ -73,6 +73,23 @@ def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(
         assert ("vy_ref" in recording) == ("ay" not in recording) == (dataset == "av21")
 
 
+def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -> None:
+    recordings = {recording.id: recording for recording in source_of("roboracer", data_root).recordings()}
+    assert [len(recording) for recording in recordings.values()] == [698, 940, 443, 448, 492, 297, 226, 180]
+    assert {recording.rate_hz for recording in recordings.values()} == {20.0}
+    table = pd.read_csv(data_root / "roboracer" / "ftg_stanley_total_training.csv").iloc[1639:2082]
+    run = recordings["ftg_stanley_total_training_run_2"]
+    np.testing.assert_allclose(run["yaw_rate"], np.radians(table["yaw_rate"]), rtol=1e-12)
+    np.testing.assert_allclose(run["ay"], 9.80665 * table["accy"], rtol=1e-12)
+    moving = run["vx_ref"] > 0.5
+    assert np.std((run["vx"] - run["vx_ref"])[moving]) < 0.1
+    excess = table["velocity_vehicle_y"].to_numpy()[2:] - run["vy_ref"][1:-1]  # a row later, of the 40 ms
+    turning = (run["vx_ref"] * run["yaw_rate_ref"])[1:-1]
+    chosen = moving[1:-1]
+    assert np.polyfit(turning[chosen], excess[chosen], 1)[0] == pytest.approx(0.025, abs=0.003)
+    assert not [f for recording in recordings.values() for f in checks_of_recording(recording) if f.level == "error"]
+
+
 def follows(recording: Recording) -> str:
     return next((f.level for f in checks_of_recording(recording) if f.channel == "vy_ref" and "follows" in f.message), "none")
 
