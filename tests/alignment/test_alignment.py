@@ -21,7 +21,7 @@ from vehest.alignment.align import Alignment, align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.cli import main
-from vehest.data.derived import SteeringRatio
+from vehest.data.derived import SteeringCurve, SteeringRatio
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
@@ -520,6 +520,15 @@ def test_steering_ratio_makes_steer_of_any_channel() -> None:
     np.testing.assert_array_equal(SteeringRatio(-1.0, 0.1, "steer")(recording)["steer"], [0.1, 0.1])
     with pytest.raises(DataError, match="no channel 'roll'"):
         SteeringRatio(15.0, channel="roll")(recording)
+
+
+def test_a_steering_curve_runs_straight_between_its_corners_and_flat_beyond() -> None:
+    recording = Recording("a", "car", 100.0, 0.0, {"steer": np.array([-2.0, -0.5, 0.0, 0.5, 2.0])})
+    curve = SteeringCurve((-1.0, 0.0, 1.0), (-0.4, 0.0, 0.3))
+    np.testing.assert_allclose(curve(recording)["steer"], [-0.4, -0.2, 0.0, 0.15, 0.3])
+    for inputs, angles in (((0.0, 0.0), (0.0, 1.0)), ((0.0, 1.0), (0.0,)), ((0.0,), (0.0,))):
+        with pytest.raises(ConfigurationError, match="inputs that increase, and as many angles"):
+            SteeringCurve(inputs, angles)
 
 
 def test_transforms_of_an_alignment_are_built_from_plain_values() -> None:

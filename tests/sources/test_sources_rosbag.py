@@ -27,11 +27,11 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
+from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag import RosbagSource
-from vehest.sources.rosbag.pose import ground_plane, planar_motion
-from vehest.sources.rosbag.stamps import uniform_times
 from vehest.sources.rosbag.topics import known_types
 from vehest.sources.rosbag.unpacking import DamagedBagError, Unpacked
+from vehest.sources.stamps import uniform_times
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 

@@ -54,6 +54,38 @@ class SteeringRatio:
 
 
 @dataclass(frozen=True)
+class SteeringCurve:
+    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear.
+
+    Args:
+        inputs: values of the channel at the corners, increasing.
+        angles: road-wheel angle at each [rad]; beyond the first and last corner the curve is flat.
+        channel: what the curve is applied to; ``steer`` itself may be it.
+    """
+
+    inputs: tuple[float, ...]
+    angles: tuple[float, ...]
+    channel: str = "steer"
+    mode: ClassVar[Mode] = "causal"
+
+    def __post_init__(self) -> None:
+        if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
+            raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
+        if self.channel not in CHANNELS:
+            raise ConfigurationError(f"steering curve of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Set ``steer``; it has gaps where the channel has them.
+
+        Raises:
+            DataError: the channel is missing.
+        """
+        steer = np.interp(recording[self.channel], self.inputs, self.angles)
+        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
+        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
+
+
+@dataclass(frozen=True)
 class SpeedFromWheels:
     """Make the forward speed ``vx`` from wheel speeds, each brought to the centre of gravity, without those that slip or dropped out.
 

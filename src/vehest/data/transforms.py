@@ -19,6 +19,7 @@ from vehest.data.derived import (
     ScaleToWheelbase,
     SideslipFromVelocity,
     SpeedFromWheels,
+    SteeringCurve,
     SteeringRatio,
     VelocityFromSideslip,
 )
@@ -496,6 +497,7 @@ TRANSFORMS: dict[str, type] = {
     "delay_correction": DelayCorrection,
     "offset_correction": OffsetCorrection,
     "steering_ratio": SteeringRatio,
+    "steering_curve": SteeringCurve,
     "speed_from_wheels": SpeedFromWheels,
     "acceleration_from_speed": AccelerationFromSpeed,
     "velocity_from_sideslip": VelocityFromSideslip,

@@ -16,11 +16,13 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
+from vehest.sources.stamps import uniform_times
 
-ClockPolicy = Literal["strict", "interpolate"]
+ClockPolicy = Literal["strict", "interpolate", "uniform"]
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
 
+MOST_STRETCH = 0.1  # of an interval, over a whole recording, by which a plain rate may differ from the one found
 MOST_DRIFT = 0.01  # of an interval, over a whole recording, that may come from the resolution of the stamps
 SHORTEST_INTERVAL = 1e-9  # s
 LONGEST_INTERVAL = 86_400.0  # s
@@ -125,6 +127,14 @@ class Clock:
     n_samples: int
     stamps: FloatArray | None = None
 
+    def times_of_rows(self) -> FloatArray:
+        """When the file's rows were taken [s]."""
+        return self.start_time + np.arange(self.n_samples) / self.rate_hz if self.stamps is None else self.stamps
+
+    def ticks(self) -> FloatArray:
+        """Times of the uniform clock [s]."""
+        return self.start_time + np.arange(self.n_samples) / self.rate_hz
+
     def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
         """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
 
@@ -147,13 +157,16 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     Args:
         stamps: time stamps [s], shape (T,).
         where: file, for messages.
-        policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them.
+        policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the rows
+            as evenly sampled and only their stamps as late, and refuses missing rows.
         n_channels: how many are to be brought onto the clock.
 
     Raises:
         DataError: stamps repeat or go backwards, are not uniform and ``policy`` is strict, lie less than a nanosecond or more than a day
             apart, or a clock without their gaps would hold more samples than the limits allow.
     """
+    if policy == "uniform" and len(stamps) > 1:
+        return _clock_behind(stamps, where)
     for finding in checks_of_clock(stamps):
         if finding.level == "error" and (finding.check == "clock" or policy == "strict"):
             fix = "cut the range out or set clock: interpolate" if finding.check == "gap" else "repair, remove or sort the rows"
@@ -170,6 +183,15 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     intervals = len(stamps) - 1
     rate = plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4))
     return Clock(float(stamps[0]), rate, len(stamps))
+
+
+def _clock_behind(stamps: FloatArray, where: str) -> Clock:
+    """The even clock behind stamps that say when software got round to the samples."""
+    _require_interval(stamps, where)
+    nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
+    sampled = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+    intervals = len(stamps) - 1
+    return Clock(float(sampled.times[0]), plain_rate(float(sampled.rate_hz or 0.0), min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
 
 
 def _require_interval(stamps: FloatArray, where: str) -> None:

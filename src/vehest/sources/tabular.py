@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pyarrow as pa
@@ -33,6 +33,9 @@ from vehest.sources.columns import (
     time_column_from_config,
     uniform_clock,
 )
+from vehest.sources.held import Held, between_samples, held_from_config, new_samples
+from vehest.sources.table_pose import TablePose, table_pose_from_config
+from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
 from vehest.sources.text_tables import check_header, check_size, table_stream
 
 MOST_SKIPPED_ROWS = 10_000
@@ -44,12 +47,17 @@ class TabularOptions:
 
     path: str | None = None
     files: str = "*.csv"
+    exclude: Annotated[tuple[str, ...], "a list of patterns over the files' stems"] | None = None
+    drop_rows: Annotated[dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"] | None = None
     runs: str | int | None = None
+    time_restarts: bool = False
     time: dict[str, Any] | None = None
     rate_hz: float | None = None
     clock: ClockPolicy = "strict"
     channels: ChannelMap | None = None
     gappy: ChannelNames | None = None
+    held: dict[str, Any] | None = None
+    pose: dict[str, Any] | None = None
     delimiter: str = ","
     decimal: str = "."
     encoding: str = "utf8"
@@ -59,13 +67,16 @@ class TabularOptions:
 class TabularSource(Source):
     """Tables, a recording each, or one for each uninterrupted run that a column of them counts.
 
-    Options: ``path`` and ``files`` (glob), ``runs`` (column), ``time`` or ``rate_hz``, ``clock``, ``channels``, ``gappy``, and for CSV
-    ``delimiter``, ``decimal``, ``encoding``, ``skip_rows``.
+    Options: ``path``, ``files`` (glob) and ``exclude``, ``drop_rows``, ``runs`` (column) or ``time_restarts``, ``time`` or ``rate_hz``,
+    ``clock``, ``channels``, ``gappy``, ``held``, ``pose``, and for CSV ``delimiter``, ``decimal``, ``encoding``, ``skip_rows``.
     """
 
     options_type = TabularOptions
     keys = frozenset(
-        {"path", "files", "runs", "time", "rate_hz", "clock", "channels", "gappy", "delimiter", "decimal", "encoding", "skip_rows"}
+        {
+            *("path", "files", "exclude", "drop_rows", "runs", "time_restarts", "time", "rate_hz", "clock", "channels", "gappy", "held"),
+            *("pose", "delimiter", "decimal", "encoding", "skip_rows"),
+        }
     )
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -80,7 +91,13 @@ class TabularSource(Source):
         if rate is not None and not rate > 0:
             raise ConfigurationError(f"data set '{self.name}': rate_hz must be a positive number, not {rate}")
         self.runs = None if dataset.get("runs") is None else str(dataset["runs"])
+        self.restarts = bool(dataset.get("time_restarts", False))
+        if self.restarts and (self.runs is not None or self.time is None):
+            what = "a column counts its runs" if self.runs is not None else "it has no time column"
+            raise ConfigurationError(f"data set '{self.name}': time_restarts cannot begin runs where {what}; leave one out")
+        self.dropped = dropped_rows_from_config(dataset.get("drop_rows") or {}, f"data set '{self.name}'")
         self.gappy = self._gappy_channels(dataset.get("gappy") or [])
+        self.held, self.pose = self._held(dataset.get("held")), self._pose(dataset.get("pose"))
         self._known_runs: dict[Path, dict[int, slice]] = {}
         _require_options(dataset, self.name)
 
@@ -95,7 +112,7 @@ class TabularSource(Source):
 
     def inputs(self) -> dict[str, str | Path]:
         """The tables."""
-        return {file.name: file for file in matching_files(self.dataset, "*.csv")}
+        return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
@@ -112,7 +129,7 @@ class TabularSource(Source):
             DataError: it cannot be read, lacks a column, holds text where numbers belong, or holds several runs.
         """
         require_files([file], self.name)
-        runs = list(self._runs_of(file)) if self.runs is not None and not is_stored_recording(file) else [None]
+        runs = list(self._runs_of(file)) if self._has_runs and not is_stored_recording(file) else [None]
         if len(runs) > 1:
             raise DataError(f"'{file}' holds {len(runs)} runs ({_listed([str(run) for run in runs])}); keep the rows of one")
         return self._read(file, runs[0])
@@ -127,9 +144,7 @@ class TabularSource(Source):
             raise DataError(
                 f"'{file}' has no column that is named like a channel (it has {_listed(names)}); declare the columns in conf/dataset"
             )
-        wanted = [column.column for column in columns.values()] + ([self.time.column] if self.time else [])
-        if run is not None:
-            wanted.append(str(self.runs))
+        wanted = self._wanted(columns)
         for name in wanted:
             if names.count(name) > 1:
                 raise DataError(f"'{file}' has {names.count(name)} columns called '{name}'; rename or remove all but one")
@@ -137,26 +152,56 @@ class TabularSource(Source):
                 raise DataError(
                     f"'{file}' has no column '{name}' (it has {_listed(names)}); correct the map in conf/dataset/{self.name}.yaml"
                 )
-        values = _read_columns(file, list(dict.fromkeys(wanted)), self.dataset)
+        values = self._values(file, wanted)
         if run is not None:
             rows = self._runs_of(file)[run]
             values = {name: samples[rows] for name, samples in values.items()}
         return self._recording(file, run, columns, values)
 
+    def _wanted(self, columns: Mapping[str, Column]) -> list[str]:
+        """Columns that something is made of."""
+        wanted = [column.column for column in columns.values()] + ([self.time.column] if self.time else [])
+        if self.runs is not None:
+            wanted.append(self.runs)
+        if self.held is not None and self.held.updated is not None:
+            wanted.append(self.held.updated)
+        if self.pose is not None:
+            wanted += [column.column for column in self.pose.columns.values()]
+        return list(dict.fromkeys(wanted))
+
+    def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
+        """Columns without the rows that the data set leaves out."""
+        values = _read_columns(file, wanted, self.dataset)
+        dropped = self.dropped.get(file.stem)
+        if dropped is None:
+            return values
+        kept = kept_rows(len(next(iter(values.values()))), dropped, file)
+        return {name: samples[kept] for name, samples in values.items()}
+
     def _recording(self, file: Path, run: int | None, columns: Mapping[str, Column], values: Mapping[str, FloatArray]) -> Recording:
         n_rows = len(next(iter(values.values())))
+        where = f"'{file}'" if run is None else f"'{file}', run {run}"
         if n_rows == 0:
             raise DataError(f"'{file}' has a header and no rows")
         if self.time is not None:
-            where = f"'{file}'" if run is None else f"'{file}', run {run}"
             stamps = self.time.to_si(values[self.time.column], "s")
             clock = uniform_clock(stamps, where, self.dataset.get("clock", "strict"), n_channels=len(columns))
         else:
             clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
+        held = () if self.held is None else self.held.channels
         channels = {
             name: clock.align(column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy)
             for name, column in columns.items()
+            if name not in held
         }
+        provenance: dict[str, Any] = {"dataset": self.name, "source": "tabular", "file": file.name} | ({} if run is None else {"run": run})
+        if file.stem in self.dropped:
+            provenance["dropped_rows"] = list(self.dataset["drop_rows"][file.stem])
+        if self.pose is not None:
+            channels |= self.pose.made_of(values, clock, where)
+        if self.held is not None:
+            channels, clock, rate = self._with_held(self.held, channels, columns, values, clock, where)
+            provenance["held"] = self.held.description(rate)
         try:
             return Recording(
                 id=_name_of(file, run),
@@ -166,10 +211,54 @@ class TabularSource(Source):
                 channels=channels,
                 kind=self.kind,
                 gappy=self.gappy,
-                provenance={"dataset": self.name, "source": "tabular", "file": file.name} | ({} if run is None else {"run": run}),
+                provenance=provenance,
             )
         except DataError as error:
             raise DataError(f"'{file}': {error}") from None
+
+    def _with_held(
+        self,
+        held: Held,
+        channels: Mapping[str, FloatArray],
+        columns: Mapping[str, Column],
+        values: Mapping[str, FloatArray],
+        clock: Clock,
+        where: str,
+    ) -> tuple[dict[str, FloatArray], Clock, float]:
+        """All channels where each held one lies between two samples, the clock of that range, and the held channels' rate [Hz]."""
+        declared = {name: columns[name] for name in held.channels if name in columns}
+        markers = [held.updated] if held.updated is not None else list(dict.fromkeys(column.column for column in declared.values()))
+        rows = new_samples([values[name] for name in markers], where)
+        times, ticks = clock.times_of_rows()[rows], clock.ticks()
+        found = {
+            name: between_samples(column.to_si(values[column.column], channel(name).unit)[rows], times, held.delay[name], ticks)
+            for name, column in declared.items()
+        }
+        begin, end = (times[edge] - np.array([held.delay[name] for name in declared]) for edge in (0, -1))
+        inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
+        if not len(inside):
+            raise DataError(f"{where}: no row lies between two samples of every held channel; are their delays in seconds?")
+        kept = slice(int(inside[0]), int(inside[-1]) + 1)
+        cut = replace(clock, start_time=float(ticks[kept.start]), n_samples=kept.stop - kept.start, stamps=None)
+        return {name: samples[kept] for name, samples in {**channels, **found}.items()}, cut, (len(rows) - 1) / float(times[-1] - times[0])
+
+    def _held(self, entry: Any) -> Held | None:
+        if entry is None:
+            return None
+        if self.columns is None:
+            raise ConfigurationError(f"data set '{self.name}': held needs channels that are declared")
+        return held_from_config(entry, list(self.columns), f"data set '{self.name}': held")
+
+    def _pose(self, entry: Any) -> TablePose | None:
+        if entry is None:
+            return None
+        pose = table_pose_from_config(entry, f"data set '{self.name}': pose")
+        doubled = sorted(set(self.columns or ()) & set(pose.channels))
+        if doubled:
+            raise ConfigurationError(
+                f"data set '{self.name}': channel '{doubled[0]}' comes both from channels and from pose; leave one out"
+            )
+        return pose
 
     def _gappy_channels(self, names: Any) -> frozenset[str]:
         for name in names:
@@ -177,40 +266,52 @@ class TabularSource(Source):
                 raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
         return frozenset(names)
 
+    @property
+    def _has_runs(self) -> bool:
+        return self.runs is not None or self.restarts
+
+    def _files(self) -> list[Path]:
+        """Tables of the data set, without those that it excludes."""
+        found = matching_files(self.dataset, "*.csv")
+        stems = {file.stem for file in found}
+        patterns = [str(pattern) for pattern in self.dataset.get("exclude") or ()]
+        for pattern in patterns:
+            if not any(fnmatchcase(stem, pattern) for stem in stems):
+                raise MissingError(f"data set '{self.name}': exclude names '{pattern}', which no file is called")
+        for stem in self.dropped:
+            if stem not in stems:
+                raise MissingError(f"data set '{self.name}': drop_rows names '{stem}', which no file is called")
+        kept = [file for file in found if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)]
+        if not kept:
+            raise MissingError(f"data set '{self.name}': exclude leaves none of its files")
+        return kept
+
     def _found(self) -> dict[str, tuple[Path, int | None]]:
         """Names of the recordings: where each stands."""
-        if self.runs is None:
-            return {_name_of(file, None): (file, None) for file in matching_files(self.dataset, "*.csv")}
-        require_files(matching_files(self.dataset, "*.csv"), self.name)
-        return {_name_of(file, run): (file, run) for file in matching_files(self.dataset, "*.csv") for run in self._runs_of(file)}
+        files = self._files()
+        if not self._has_runs:
+            return {_name_of(file, None): (file, None) for file in files}
+        require_files(files, self.name)
+        return {_name_of(file, run): (file, run) for file in files for run in self._runs_of(file)}
 
     def _runs_of(self, file: Path) -> dict[int, slice]:
-        """Number of each run in a table: its rows."""
+        """Number of each run in a table: its rows, counted without those that are left out."""
         if file not in self._known_runs:
-            self._known_runs[file] = self._read_runs(file, str(self.runs))
+            self._known_runs[file] = self._read_runs(file)
         return self._known_runs[file]
 
-    def _read_runs(self, file: Path, column: str) -> dict[int, slice]:
+    def _read_runs(self, file: Path) -> dict[int, slice]:
+        column = self.runs if self.runs is not None or self.time is None else self.time.column
         names = _column_names(file, self.dataset)
-        if names.count(column) != 1:
+        if names.count(str(column)) != 1:
+            what = "counts" if self.runs is not None else "begins"
             raise DataError(
-                f"'{file}' has no column '{column}' that counts its runs (it has {_listed(names)}); correct runs in the data set"
+                f"'{file}' has no column '{column}' that {what} its runs (it has {_listed(names)}); correct runs in the data set"
             )
-        numbers = _read_columns(file, [column], self.dataset)[column]
+        numbers = self._values(file, [str(column)])[str(column)]
         if not len(numbers):
             raise DataError(f"'{file}' has a header and no rows")
-        odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
-        if len(odd):
-            where = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"
-            raise DataError(f"'{file}': {where}; runs are counted in whole numbers")
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(numbers)) + 1, [len(numbers)]]).tolist()
-        runs: dict[int, slice] = {}
-        for start, stop in pairwise(edges):
-            run = int(numbers[start])
-            if run in runs:
-                raise DataError(f"'{file}': run {run} begins again in data row {start + 1}; a run is uninterrupted, sort the rows")
-            runs[run] = slice(start, stop)
-        return runs
+        return restarted_runs(numbers) if self.runs is None else counted_runs(numbers, self.runs, file)
 
 
 def _require_options(dataset: Mapping[str, Any], name: str) -> None:

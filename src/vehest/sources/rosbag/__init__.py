@@ -19,10 +19,10 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.archive import MOST_BYTES
 from vehest.sources.base import Source, existing_folder
+from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag.declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
-from vehest.sources.rosbag.pose import ground_plane, planar_motion
-from vehest.sources.rosbag.stamps import SampleTimes, stamped_times, uniform_times
 from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
+from vehest.sources.stamps import SampleTimes, stamped_times, uniform_times
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval
@@ -224,9 +224,7 @@ class RosbagSource(Source):
         motion = planar_motion(
             plane, yaw, interval, window=pose.window, order=pose.order, mounting_yaw=pose.yaw, lever=(pose.lever_x, pose.lever_y)
         )
-        vx, vy, yaw_rate = (np.interp(grid, times, samples) for samples in (motion.vx, motion.vy, motion.yaw_rate))
-        made = {"vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate, "sideslip_ref": np.arctan2(vy, vx)}
-        return {name: made[name] for name in pose.channels}
+        return motion.at(times, grid).channels(pose.channels)
 
     def _provenance(self, path: Path, bag: Bag, series: Mapping[str, Series]) -> dict[str, Any]:
         return {

@@ -12,9 +12,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column, column_from_config
-from vehest.sources.rosbag.pose import UpAxis
-
-POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
+from vehest.sources.pose import POSE_CHANNELS, UpAxis, require_filter, require_pose_channels
 
 
 @dataclass(frozen=True)
@@ -69,7 +67,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Pose:
-    """How the reference is made of poses; see `vehest.sources.rosbag.pose.planar_motion`.
+    """How the reference is made of poses; see `vehest.sources.pose.planar_motion`.
 
     Args:
         topic: the topic's name in the data set.
@@ -143,13 +141,8 @@ def pose_from_config(entry: Any, topics: Mapping[str, Topic], where: str) -> Pos
     _require_choice(entry, "up", ("z", "y"), where)
     if topics[str(entry["topic"])].average:
         raise ConfigurationError(f"{where}: orientations cannot be averaged; leave average out of topic '{entry['topic']}'")
-    window, order = entry.get("window", Pose.window), entry.get("order", Pose.order)
-    if not isinstance(window, int) or not isinstance(order, int) or not 1 <= order < window or window % 2 == 0:
-        raise ConfigurationError(f"{where}: window must be an odd number of samples above an order of 1 or more, not {window} and {order}")
-    channels = entry.get("channels", list(POSE_CHANNELS))
-    unknown = [name for name in channels if name not in POSE_CHANNELS] if isinstance(channels, list | tuple) else [channels]
-    if unknown:
-        raise ConfigurationError(f"{where}: channels must be a list of {', '.join(POSE_CHANNELS)}, not '{unknown[0]}'")
+    window, order = require_filter(entry.get("window", Pose.window), entry.get("order", Pose.order), where)
+    channels = require_pose_channels(entry.get("channels", POSE_CHANNELS), where)
     lengths = {key: number(entry.get(key, 0.0), f"{where}: {key}", above=-math.inf) for key in ("yaw", "lever_x", "lever_y")}
     return Pose(
         str(entry["topic"]),
@@ -160,7 +153,7 @@ def pose_from_config(entry: Any, topics: Mapping[str, Topic], where: str) -> Pos
         lengths["yaw"],
         lengths["lever_x"],
         lengths["lever_y"],
-        tuple(channels),
+        channels,
     )
 
 

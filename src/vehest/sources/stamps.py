@@ -15,6 +15,7 @@ BLOCK_SECONDS = 1.0
 REJECTED = 3.0  # standard deviations, taken from the median absolute residual
 MOST_WANDERING = 0.4  # of an interval; a lost sample in the middle makes 0.5
 RATE_TOLERANCE = 5e-3
+OTHER_CLOCK = "cut the range out or set clock: stamps"
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def stamped_times(stamps: FloatArray, where: str) -> SampleTimes:
     return SampleTimes(stamps, None, float(np.diff(stamps).std()))
 
 
-def uniform_times(stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0) -> SampleTimes:
+def uniform_times(stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = OTHER_CLOCK) -> SampleTimes:
     """Times of a sensor that samples evenly while its samples are stamped when software got round to them.
 
     A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled
@@ -59,6 +60,7 @@ def uniform_times(stamps: FloatArray, rate_hz: float, where: str, tolerated: flo
         rate_hz: the sensor's nominal rate [Hz].
         where: file and topic, for messages.
         tolerated: wandering of the stamps about the line that does not matter [s].
+        fix: what messages say to do where samples are missing.
 
     Raises:
         DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
@@ -74,9 +76,11 @@ def uniform_times(stamps: FloatArray, rate_hz: float, where: str, tolerated: flo
         raise DataError(
             f"{where}: samples come at {found:.6g} Hz, not at the declared {rate_hz:g} Hz; "
             f"correct rate_hz, or cut out where samples are missing"
+            if fix == OTHER_CLOCK
+            else f"{where}: {len(stamps)} rows of {rate_hz:g} Hz come at {found:.6g} Hz on average: samples are missing; {fix}"
         )
     times = first + interval * number
-    _refuse_missing(stamps, stamps - times, interval, rate_hz, where, tolerated)
+    _refuse_missing(stamps, stamps - times, interval, rate_hz, where, tolerated, fix)
     return SampleTimes(times, 1.0 / interval, float(np.sqrt(np.mean(np.square(stamps - times)))))
 
 
@@ -96,7 +100,7 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
 
 
 def _refuse_missing(
-    residual_stamps: FloatArray, residual: FloatArray, interval: float, rate_hz: float, where: str, tolerated: float
+    residual_stamps: FloatArray, residual: FloatArray, interval: float, rate_hz: float, where: str, tolerated: float, fix: str
 ) -> None:
     """A lost sample shifts all later stamps by an interval; so does a clock that drifts, little by little."""
     block = max(round(BLOCK_SECONDS * rate_hz), FEWEST // 2)
@@ -107,7 +111,7 @@ def _refuse_missing(
     if abs(shifts[worst]) > limit:
         raise DataError(
             f"{where}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of {1.0 / interval:.6g} Hz about "
-            f"{residual_stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; cut the range out or set clock: stamps"
+            f"{residual_stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
         )
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import signal
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 
 UpAxis = Literal["y", "z"]
+POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
+"""What can be made of poses."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,15 @@ class PlanarMotion:
     vx: FloatArray
     vy: FloatArray
     yaw_rate: FloatArray
+
+    def at(self, times: FloatArray, grid: FloatArray) -> PlanarMotion:
+        """The same on another clock, along straight lines."""
+        return PlanarMotion(*(np.interp(grid, times, samples) for samples in (self.vx, self.vy, self.yaw_rate)))
+
+    def channels(self, names: Sequence[str]) -> dict[str, FloatArray]:
+        """Reference channels of these names."""
+        made = {"vx_ref": self.vx, "vy_ref": self.vy, "yaw_rate_ref": self.yaw_rate, "sideslip_ref": np.arctan2(self.vy, self.vx)}
+        return {name: made[name] for name in names}
 
 
 def planar_motion(
@@ -93,3 +105,26 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
         plane = np.stack([positions[:, 0], -positions[:, 2]], axis=1)
         y, z = -z, y
     return plane, np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def require_filter(window: Any, order: Any, where: str) -> tuple[int, int]:
+    """Window and order of a Savitzky-Golay filter as a data set declares them.
+
+    Raises:
+        ConfigurationError: they are none.
+    """
+    if not isinstance(window, int) or not isinstance(order, int) or not 1 <= order < window or window % 2 == 0:
+        raise ConfigurationError(f"{where}: window must be an odd number of samples above an order of 1 or more, not {window} and {order}")
+    return window, order
+
+
+def require_pose_channels(names: Any, where: str) -> tuple[str, ...]:
+    """Channels to make of poses as a data set declares them.
+
+    Raises:
+        ConfigurationError: something else stands among them.
+    """
+    unknown = [name for name in names if name not in POSE_CHANNELS] if isinstance(names, list | tuple) else [names]
+    if unknown:
+        raise ConfigurationError(f"{where}: channels must be a list of {', '.join(POSE_CHANNELS)}, not '{unknown[0]}'")
+    return tuple(names)

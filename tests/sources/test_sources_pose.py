@@ -1,0 +1,202 @@
+"""Tables with poses, held channels, rows that do not count and time that restarts, written with a motion in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Recording
+from vehest.sources.tabular import TabularSource
+
+RATE = 100.0
+SPEED = 2.0  # m/s
+RADIUS = 1.5  # m
+SLIP = 0.2  # rad, by which the car points out of the circle's tangent
+POSE = {"x": {"column": "px", "unit": "m"}, "y": {"column": "py", "unit": "m"}, "yaw": {"column": "yaw", "unit": "rad"}, "window": 5}
+TIME = {"column": "t", "unit": "s"}
+
+
+def circle(seconds: float = 10.0, lever: tuple[float, float] = (0.0, 0.0), turned: float = 0.0) -> pd.DataFrame:
+    """A car on a circle to the left; poses are those of a body ``lever`` ahead and to the left of it, turned by ``turned``."""
+    time = np.arange(round(seconds * RATE)) / RATE
+    course = SPEED / RADIUS * time
+    yaw = course + np.pi / 2 - SLIP
+    x = RADIUS * np.cos(course) + np.cos(yaw) * lever[0] - np.sin(yaw) * lever[1]
+    y = RADIUS * np.sin(course) + np.sin(yaw) * lever[0] + np.cos(yaw) * lever[1]
+    wrapped = np.angle(np.exp(1j * (yaw + turned)))
+    return pd.DataFrame({"t": time, "px": x, "py": y, "yaw": wrapped, "vx": SPEED * np.cos(SLIP)})
+
+
+def source(folder: Path, **options: Any) -> TabularSource:
+    channels = {"vx": {"column": "vx", "unit": "m/s"}}
+    declared = {"name": "mine", "source": "tabular", "path": str(folder), "files": "*.csv", "time": TIME, "channels": channels}
+    return TabularSource({**declared, **options})
+
+
+def read(table: pd.DataFrame, folder: Path, **options: Any) -> Recording:
+    table.to_csv(folder / "lap.csv", index=False)
+    return source(folder, **options).read("lap")
+
+
+def test_a_pose_on_a_circle_gives_the_velocities_of_its_closed_form(tmp_path: Path) -> None:
+    recording = read(circle(), tmp_path, pose=POSE)
+    inner = slice(5, -5)
+    assert recording["vx_ref"][inner] == pytest.approx(SPEED * np.cos(SLIP), abs=1e-3)
+    assert recording["vy_ref"][inner] == pytest.approx(SPEED * np.sin(SLIP), abs=1e-3)
+    assert recording["sideslip_ref"][inner] == pytest.approx(SLIP, abs=1e-3)
+    assert recording["yaw_rate_ref"] == pytest.approx(SPEED / RADIUS, abs=1e-9)
+
+
+def test_lever_and_turn_of_the_body_are_taken_off(tmp_path: Path) -> None:
+    table = circle(lever=(0.115, -0.01), turned=0.05)
+    pose = POSE | {"yaw_offset": -0.05, "lever_x": -0.115, "lever_y": 0.01, "channels": ["vx_ref", "vy_ref"]}
+    recording = read(table, tmp_path, pose=pose)
+    assert recording["vy_ref"][5:-5] == pytest.approx(SPEED * np.sin(SLIP), abs=1e-3)
+    assert recording["vx_ref"][5:-5] == pytest.approx(SPEED * np.cos(SLIP), abs=1e-3)
+    assert set(recording.channels) == {"vx", "vx_ref", "vy_ref"}
+    away = read(table, tmp_path, pose=POSE | {"yaw_offset": -0.05})
+    assert (away["vy_ref"] - recording["vy_ref"])[5:-5] == pytest.approx(0.115 * SPEED / RADIUS, abs=1e-3)
+
+
+def test_late_stamps_of_even_rows_do_no_harm(tmp_path: Path) -> None:
+    table = circle()
+    table["t"] = 1.7e9 + table["t"] + np.random.default_rng(0).exponential(1e-3, len(table))
+    even = read(table, tmp_path, pose=POSE, clock="uniform")
+    stamped = read(table, tmp_path, pose=POSE, clock="interpolate")
+    errors = [np.abs(one["vy_ref"][5:-5] - SPEED * np.sin(SLIP)).max() for one in (even, stamped)]
+    assert errors[0] < 1e-3
+    assert errors[1] > 20 * errors[0]
+    assert even.rate_hz == RATE
+    for lost in (3, 20):
+        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set clock: interpolate"):
+            read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"),
+    [
+        ({"window": 4}, "window must be an odd number"),
+        ({"channels": ["vx"]}, "channels must be a list of vx_ref"),
+        ({"x": {"column": "px", "unit": "rad"}}, "x: "),
+        ({"field": "pose"}, "field"),
+    ],
+)
+def test_a_misspelt_pose_is_refused(tmp_path: Path, pose: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        source(tmp_path, pose=POSE | pose)
+
+
+def test_a_channel_comes_from_a_column_or_from_the_pose(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="channel 'vx_ref' comes both from channels and from pose"):
+        source(tmp_path, channels={"vx_ref": {"column": "vx", "unit": "m/s"}}, pose=POSE)
+
+
+def test_a_missing_pose_names_its_row(tmp_path: Path) -> None:
+    table = circle()
+    table.loc[[40, 41], "px"] = np.nan
+    with pytest.raises(DataError, match=r"pose column 'px' holds 2 values that are no numbers, the first in row 41"):
+        read(table, tmp_path, pose=POSE)
+
+
+# Channels that are held between their samples
+
+
+def held_table(delay_rows: int, every: int = 10, n: int = 1000) -> tuple[pd.DataFrame, np.ndarray]:
+    """A yaw rate that its sensor samples in every tenth row and that arrives later, with the sensor's own clock beside it."""
+    time = np.arange(n) / RATE
+    truth = np.sin(2 * np.pi * 0.5 * time)
+    taken = (np.arange(n) - delay_rows) // every * every
+    values, stamps = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0), np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
+    return pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps}), truth
+
+
+HELD_CHANNELS = {"vx": {"column": "vx", "unit": "m/s"}, "yaw_rate": {"column": "r", "unit": "rad/s"}}
+
+
+@pytest.mark.parametrize("updated", ["sensor", None])
+def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path, updated: str | None) -> None:
+    table, truth = held_table(delay_rows=4)
+    held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
+    recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
+    at = np.rint(recording.time * RATE).astype(int)
+    np.testing.assert_allclose(recording["yaw_rate"][at % 10 == 0], truth[at][at % 10 == 0], atol=1e-9)
+    bound = (np.pi**2 * 0.1**2) / 8  # of a straight line over 0.1 s, by the largest curvature
+    assert np.abs(recording["yaw_rate"] - truth[at]).max() < 1.001 * bound
+    np.testing.assert_allclose(recording["vx"], 3.0 + recording.time, atol=1e-9)
+    assert recording.time[0] == pytest.approx(0.0 if updated else 0.1, abs=0.011)
+    assert recording.provenance["held"] == {"channels": ["yaw_rate"], "rate_hz": pytest.approx(10.0), "delay": {"yaw_rate": 0.04}}
+    plain = read(table, tmp_path, channels=HELD_CHANNELS)
+    steps = plain["yaw_rate"][at] - truth[at]
+    assert np.abs(steps).max() > 10 * bound
+
+
+def test_held_channels_that_never_change_are_refused(tmp_path: Path) -> None:
+    table, _ = held_table(delay_rows=4)
+    with pytest.raises(DataError, match="change in 0 rows; was their sensor connected"):
+        read(table.assign(r=0.0, sensor=0.0), tmp_path, channels=HELD_CHANNELS, held={"channels": ["yaw_rate"], "updated": "sensor"})
+
+
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [
+        ({"channels": ["ay"]}, "names 'ay', which is not one of the data set's channels"),
+        ({"channels": ["vx"], "delay": {"yaw_rate": 0.1}}, "delay names 'yaw_rate'"),
+        ({"channels": ["vx"], "delay": "late"}, "delay"),
+        ({}, "channels"),
+    ],
+)
+def test_a_misspelt_held_channel_is_refused(tmp_path: Path, held: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        source(tmp_path, channels=HELD_CHANNELS, held=held)
+
+
+# Rows and runs
+
+
+def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path: Path) -> None:
+    table = pd.concat([circle(2.0), circle(3.0), circle(1.0)], ignore_index=True)
+    table.loc[[200, 500], "vx"] = 5596.0
+    table.to_csv(tmp_path / "laps.csv", index=False)
+    made = source(tmp_path, time_restarts=True, drop_rows={"laps": [201, "501-"]})
+    recordings = list(made.recordings())
+    assert [recording.id for recording in recordings] == ["laps_run_0", "laps_run_1"]
+    assert [len(recording) for recording in recordings] == [200, 299]
+    assert recordings[1].start_time == pytest.approx(0.01)
+    assert max(recording["vx"].max() for recording in recordings) < SPEED
+    assert recordings[1].provenance["dropped_rows"] == [201, "501-"]
+    with pytest.raises(DataError, match="holds 2 runs"):
+        made.read_file(tmp_path / "laps.csv")
+
+
+def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="has 1000 data rows, and drop_rows names row 1001"):
+        read(circle(), tmp_path, drop_rows={"lap": [1001]})
+    with pytest.raises(MissingError, match="drop_rows names 'lap2', which no file is called"):
+        source(tmp_path, drop_rows={"lap2": [1]}).ids()
+
+
+@pytest.mark.parametrize("row", [0, "b", "9-3", "0-3", "-3"])
+def test_what_is_no_row_is_refused(tmp_path: Path, row: object) -> None:
+    with pytest.raises(ConfigurationError, match="data row"):
+        source(tmp_path, drop_rows={"lap": [row]})
+
+
+def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
+    for name in ("lap_1", "lap_2", "still"):
+        circle(1.0).to_csv(tmp_path / f"{name}.csv", index=False)
+    assert source(tmp_path, exclude=["still"]).ids() == ["lap_1", "lap_2"]
+    assert list(source(tmp_path, exclude=["lap_*"]).inputs()) == ["still.csv"]
+    with pytest.raises(MissingError, match="exclude names 'lap', which no file is called"):
+        source(tmp_path, exclude=["lap"]).ids()
+    with pytest.raises(MissingError, match="exclude leaves none"):
+        source(tmp_path, exclude=["*"]).ids()
+
+
+def test_runs_are_told_by_a_column_or_by_time_not_both(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="time_restarts cannot begin runs where a column counts its runs"):
+        source(tmp_path, runs="run", time_restarts=True)
