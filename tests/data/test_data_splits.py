@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -158,16 +159,23 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_every_split_that_is_shipped_is_one(file: Path) -> None:
-    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has one of some name."""
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
 
     def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
-        names = open_source(about).ids() if about["source"] == "simulated" else ["some"]
-        speed = np.full(200, 20.0)
-        ten_seconds = {"ay": np.full(200, 3.0), "vx": speed, "vx_ref": speed, "yaw_rate": np.full(200, 0.15), "sideslip_ref": np.zeros(200)}
-        return {name: Recording(name, "car", 20.0, 0.0, ten_seconds).select for name in names}
+        names = open_source(about).ids() if about["source"] == "simulated" else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
+        speed = np.full(20_000, 20.0)
+        long = {
+            "ay": np.full(20_000, 3.0),
+            "vx": speed,
+            "vx_ref": speed,
+            "yaw_rate": np.full(20_000, 0.15),
+            "sideslip_ref": np.zeros(20_000),
+        }
+        return {name: Recording(name, "car", 20.0, 0.0, long).select for name in names}
 
-    config = yaml.safe_load(file.read_text(encoding="utf-8"))
+    text = file.read_text(encoding="utf-8")
+    config = yaml.safe_load(text)
     split = split_from_config(config, cruising)
     assert split.name == file.stem
     assert set(dataset_names(config)) == set(split.datasets)
