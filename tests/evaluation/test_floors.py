@@ -265,6 +265,18 @@ def test_gaps_and_standstill_leave_the_bound_finite():
     assert 0 < floor.sideslip < 104
 
 
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1.0])
+def test_drives_without_noise_or_without_motion_leave_every_bound_finite(scale):
+    drive = planar_drive(60.0)
+    for vx in (drive["vx"], np.zeros(len(drive))):
+        channels = {name: scale * samples for name, samples in drive.channels.items()} | {"vx": vx}
+        drives = [drive_of(Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), PROTOCOL)]
+        spread = reference_spread(drives)
+        for inputs in SETS[:3]:
+            for car in (False, True):
+                assert 0 <= cramer_rao_floor(drives, inputs, car=car).vy <= spread.vy + 1e-8
+
+
 # Which bound is whose
 
 

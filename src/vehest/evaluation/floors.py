@@ -63,6 +63,7 @@ STIFFNESS_DEVIATION = math.log(15.0 / 6.0) / 4.0  # 0.23: 6 to 15 per rad as fou
 BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white noise
 SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
 LEAST_SAMPLES = 20
+LEAST_WHITE = 0.01  # of an axle's slow error, so that no measurement is exact
 CHUNK = 20_000  # samples that are held at once
 UNIFORM = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
 TINY = 1e-9
@@ -433,7 +434,8 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
             error = blocks.state(*_in_steps(axle.error, step), axle.error.deviation**2)
             stiffness = blocks.state(1.0, 0.0, STIFFNESS_DEVIATION**2)
             slip = _axle_columns(drive, inputs, front)[:, 1:4] @ axle.coefficients[1:4]
-            blocks.measure({v: 1.0, error: -1.0, stiffness: -slip}, axle.error.density / step + levels.reference**2)
+            white = axle.error.density / step + levels.reference**2 + (LEAST_WHITE * axle.error.deviation) ** 2
+            blocks.measure({v: 1.0, error: -1.0, stiffness: -slip}, white)
     return blocks.model()
 
 
