@@ -6,7 +6,6 @@ wheels and the speed. A delay is reported where its whole 95 % interval lies bey
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,19 +13,16 @@ import numpy as np
 
 from vehest.alignment.findings import Finding
 from vehest.alignment.imu import TILT_LAG_GAIN
+from vehest.alignment.lateral import lateral_lateness
 from vehest.alignment.motion import WHEELS, Motion
-from vehest.alignment.spectra import LARGEST_LAG, ComplexArray, CrossSpectra, Measured, cross_spectra, jackknife, lag_of, smoothed
+from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
 from vehest.constants import FloatArray
+from vehest.data.channels import REFERENCE_SUFFIX
 
 LONGEST_UNREPORTED = 0.015  # s
 LEAST_FIT = 0.97  # share of the phase that a delay must explain
-LARGEST_GAIN = 2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
-LEAST_SLIDING_SHARE = 0.1  # of what vx·yaw_rate leaves of ay, that d(vy)/dt must explain
 SLIPPING = frozenset({"vx", "motor_speed", "wheel speeds"})
 """Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead and never lag."""
-N_STEPS = 8
-N_WEIGHTINGS = 3
-LARGEST_STEP = 0.1  # s
 LARGEST_HALF_WIDTH = 0.05  # s; a delay that is known no better is not known
 DELAYED = {"wheel speeds": WHEELS}
 
@@ -53,6 +49,11 @@ class Delay:
         return abs(self.delay.value) - self.delay.half_width > LONGEST_UNREPORTED
 
     @property
+    def on_time(self) -> bool:
+        """Whether the whole interval lies within it."""
+        return abs(self.delay.value) + self.delay.half_width < LONGEST_UNREPORTED
+
+    @property
     def turned(self) -> Delay:
         """The same seen from the other channel."""
         return Delay(self.against, self.channel, self.signals, Measured(-self.delay.value, self.delay.half_width))
@@ -62,7 +63,7 @@ def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
     """All signals that delays and low-passes are found from, under names of their own."""
     signals: dict[str, FloatArray] = {}
     if motion.speed and {"ay", "yaw_rate"} <= set(motion.channels):
-        signals |= {"ay": motion["ay"], "turning": motion.turning, "arm": motion.derivative(motion["yaw_rate"])}
+        signals |= {"ay": motion["ay"], "turning": motion.turning}
         if motion.velocity:
             signals["sliding"] = motion.sliding
             steady = motion.vx / (np.square(motion.vx) + np.square(0.3 * np.sqrt(np.mean(np.square(motion.vx)))) + np.finfo(float).tiny)
@@ -101,8 +102,8 @@ def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = froz
         slow: channels that are low-passed; a delay says nothing of those.
     """
     found: list[Delay] = []
-    if {"ay", "turning", "sliding", "arm"} <= set(spectra.names) and not slow & {"ay", "yaw_rate"}:
-        found += lateral_delays(spectra, motion.velocity)
+    if not slow & {"ay", "yaw_rate"}:
+        found += _lateral(motion)
     found += _pair(spectra, "forward", "ax", (motion.speed, "ax"), f"ax and d({motion.speed})/dt", tilted=True)
     found += _pair(spectra, "yaw_rate_ref", "yaw_rate", ("yaw_rate_ref", "yaw_rate"), "both")
     found += _pair(spectra, "d(vx_ref)", "d(vx)", ("vx_ref", "vx"), "both")
@@ -110,6 +111,20 @@ def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = froz
         found += _pair(spectra, f"d({motion.speed})", f"d({name})", (motion.speed, name), "both")
     found += _pair(spectra, "slip of vy_ref", "sideslip_ref", ("vy_ref", "sideslip_ref"), f"sideslip_ref and atan2(vy_ref, {motion.speed})")
     return [delay for delay in found if not {delay.channel, delay.against} & slow]
+
+
+def _lateral(motion: Motion) -> list[Delay]:
+    """Between ay, yaw rate and lateral velocity."""
+    lateness = lateral_lateness(motion)
+    if lateness is None or not all(_sound(measured) for measured in lateness):
+        return []
+    turning, sliding, difference = lateness
+    signals = f"ay, vx·yaw_rate and d({motion.velocity})/dt"
+    return [
+        Delay("yaw_rate", "ay", signals, turning.widened(TILT_LAG_GAIN)),
+        Delay(motion.velocity, "ay", signals, sliding.widened(TILT_LAG_GAIN)),
+        Delay("yaw_rate", motion.velocity, signals, difference),
+    ]
 
 
 def _pair(
@@ -128,101 +143,15 @@ def _sound(delay: Measured) -> bool:
     return delay.half_width <= LARGEST_HALF_WIDTH and abs(delay.value) < LARGEST_LAG
 
 
-def lateral_delays(spectra: CrossSpectra, velocity: str) -> list[Delay]:
-    """Lateness of yaw rate and lateral velocity against ay and each other, from ay = g·(vx·yaw_rate + d(vy)/dt) + x·d(yaw_rate)/dt.
-
-    Both delays, the gain g that roll lets in and the lever arm x are fitted together: at one speed a lever arm looks as a delay of the yaw
-    rate does, and varying speed tells them apart. One gain serves both terms, so that noise of the differentiated velocity shrinks
-    neither. Bins have the weight that the residual leaves them.
-
-    Args:
-        spectra: with ay, turning, sliding and arm.
-        velocity: the channel that d(vy)/dt comes from.
-    """
-    chosen = CrossSpectra(("ay", "turning", "sliding", "arm"), spectra.frequency, _chosen(spectra, ("ay", "turning", "sliding", "arm")))
-    whole, omega = chosen.whole, chosen.omega
-    weight = 1.0 / np.maximum(whole[:, 0, 0].real.mean(), np.finfo(float).tiny) * np.ones(len(omega))
-    start = (0.0, 0.0)
-    for _ in range(N_WEIGHTINGS):
-        fitted = _lateral_fit(whole, omega, weight, start)
-        if fitted is None:
-            return []
-        start, residual, explained = fitted
-        floor = 1e-6 * float(whole[:, 0, 0].real.max())
-        weight = 1.0 / np.maximum(smoothed(residual), floor) if floor > 0.0 else weight
-
-    if explained < LEAST_SLIDING_SHARE or not 1.0 / LARGEST_GAIN < _sliding_gain(whole, omega, weight, start) < LARGEST_GAIN:
-        return []
-
-    def lateness(spectrum: ComplexArray) -> FloatArray:
-        again = _lateral_fit(spectrum, omega, weight, start)
-        turning, sliding = again[0] if again is not None else (math.nan, math.nan)
-        return np.array([turning, sliding, turning - sliding])
-
-    turning, sliding, difference = jackknife(chosen, lateness)
-    if not all(_sound(measured) for measured in (turning, sliding, difference)):
-        return []
-    signals = f"ay, vx·yaw_rate and d({velocity})/dt"
-    return [
-        Delay("yaw_rate", "ay", signals, turning.widened(TILT_LAG_GAIN)),
-        Delay(velocity, "ay", signals, sliding.widened(TILT_LAG_GAIN)),
-        Delay("yaw_rate", velocity, signals, difference),
-    ]
-
-
-def _chosen(spectra: CrossSpectra, names: Sequence[str]) -> ComplexArray:
-    places = [spectra.names.index(name) for name in names]
-    return np.asarray(spectra.groups[:, :, places][:, :, :, places], dtype=np.complex128)
-
-
-def _lateral_fit(
-    spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, start: tuple[float, float]
-) -> tuple[tuple[float, float], FloatArray, float] | None:
-    """Gauss-Newton: both delays, the power of the residual (F,), and the share of it that d(vy)/dt took away."""
-    turning, sliding = start
-    for _ in range(N_STEPS):
-        p, d = np.exp(1j * omega * turning), np.exp(1j * omega * sliding)
-        columns = np.zeros((len(omega), 4, 4), dtype=np.complex128)  # (F, signals, parameters): g, x, g·delay, g·delay
-        columns[:, 1, 0], columns[:, 2, 0], columns[:, 3, 1] = p, d, p
-        columns[:, 1, 2], columns[:, 2, 3] = 1j * omega * p, 1j * omega * d
-        left = columns.conj().transpose(0, 2, 1)
-        normal = np.einsum("fpq,f->pq", (left @ spectrum @ columns).real, weight)
-        right = np.einsum("fp,f->p", (left @ spectrum[:, :, :1])[:, :, 0].real, weight)
-        scale = np.sqrt(np.diag(normal))
-        if not (np.isfinite(scale).all() and (scale > 0.0).all()):
-            return None
-        try:
-            values = np.linalg.solve(normal / scale / scale[:, None] + 1e-9 * np.eye(4), right / scale) / scale
-        except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(values).all() or values[0] == 0.0:
-            return None
-        turning += float(np.clip(values[2] / values[0], -LARGEST_STEP, LARGEST_STEP))
-        sliding += float(np.clip(values[3] / values[0], -LARGEST_STEP, LARGEST_STEP))
-        turning, sliding = (min(max(delay, -LARGEST_LAG), LARGEST_LAG) for delay in (turning, sliding))
-    mix = -np.einsum("fsp,p->fs", columns, values)
-    mix[:, 0] += 1.0
-    residual = np.einsum("fs,fst,ft->f", mix.conj(), spectrum, mix).real
-    without = mix.copy()
-    without[:, 2] = 0.0
-    before = np.einsum("fs,fst,ft->f", without.conj(), spectrum, without).real
-    total = float(weight @ before)
-    return (turning, sliding), residual, 1.0 - float(weight @ residual) / total if total > 0.0 else 0.0
-
-
-def _sliding_gain(spectrum: ComplexArray, omega: FloatArray, weight: FloatArray, delays: tuple[float, float]) -> float:
-    """The gain that d(vy)/dt would have, were it fitted apart from that of vx·yaw_rate."""
-    advance = np.ones((len(omega), 4), dtype=np.complex128)
-    advance[:, 1], advance[:, 2] = (np.exp(1j * omega * delay) for delay in delays)
-    own = np.einsum("fst,fs,ft,f->st", spectrum, advance.conj(), advance, weight).real
-    gains = np.linalg.lstsq(own[1:, 1:], own[1:, 0], rcond=None)[0]
-    return float(gains[1] / gains[0]) if gains[0] != 0.0 else 0.0
-
-
 def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
-    """A warning for every channel that is later than another; what lags is taken to be late, not the other early."""
+    """A warning for every channel that is later than another; what lags is taken to be late, not the other early.
+
+    The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
+    """
     late = [delay if delay.delay.value > 0.0 else delay.turned for delay in delays if delay.established]
     late = [delay for delay in late if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")]
+    punctual = {delay.channel for delay in delays if delay.on_time and delay.against.endswith(REFERENCE_SUFFIX)}
+    late = [delay for delay in late if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))]
     findings = []
     for channel in dict.fromkeys(delay.channel for delay in late):
         own = [delay for delay in late if delay.channel == channel]

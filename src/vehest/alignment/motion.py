@@ -85,6 +85,15 @@ class Motion:
         """By time, with central differences, which delay nothing."""
         return np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64) if len(samples) > 1 else np.zeros(len(samples))
 
+    def slower(self, factor: int) -> Motion:
+        """Means of so many samples each, at a rate that is so many times slower."""
+        if factor == 1:
+            return self
+        count = len(self) // factor
+        channels = {name: samples[: count * factor].reshape(count, factor).mean(axis=1) for name, samples in self.channels.items()}
+        moving = np.asarray(self.moving[: count * factor].reshape(count, factor).all(axis=1), dtype=bool)
+        return replace(self, rate_hz=self.rate_hz / factor, channels=channels, moving=moving)
+
     def corrected(self, factors: dict[str, float]) -> Motion:
         """The same with some channels multiplied by factors."""
         return replace(self, channels={name: samples * factors.get(name, 1.0) for name, samples in self.channels.items()})

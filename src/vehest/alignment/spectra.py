@@ -28,6 +28,7 @@ RATE_KEPT = 30.0  # Hz; a faster recording is averaged down to at least this
 MOST_GROUPS = 12
 SMOOTHED_BINS = 5
 LARGEST_COHERENCE = 0.99
+LEAST_POWER = 1e-6  # of the strongest bin; below a window leaks more than that
 LEAST_COHERENCE = 0.25  # mean over the band; below nothing is said of a lag
 LARGEST_LAG = 0.5  # s
 LONGEST_TIME_CONSTANT = 10.0  # s
@@ -202,6 +203,7 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     if not (power > 0.0).all() or not np.isfinite(power).all():
         return None
     coherence = np.minimum(np.square(np.abs(across)) / power, LARGEST_COHERENCE)
+    coherence[power < LEAST_POWER**2 * power.max()] = 0.0
     if coherence.mean() < LEAST_COHERENCE:
         return None
     weight = coherence / (1.0 - coherence) / np.maximum(np.abs(across), np.finfo(float).tiny)
