@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -95,6 +95,12 @@ cnn_ukf: $(INSTALLED) ## the tables and figures of the UKF-informed network's pa
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)
 	$(BIN)/vehest run pipelines/proving_ground.yaml
+
+real_cars: $(INSTALLED) ## what the real recordings hold, and which can rank estimators; needs VEHEST_DATA
+	$(BIN)/vehest run pipelines/real_cars.yaml
+
+leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that learnt on others; needs VEHEST_DATA, and an hour
+	$(BIN)/vehest run pipelines/leave_one_out.yaml
 
 sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/sim_to_real.yaml

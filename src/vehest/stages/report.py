@@ -211,6 +211,8 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
             kind=kind_of(config["dataset"]),
             config=artefact.config,
             files={Path(name).stem: artefact.folder / name for name in artefact.outputs},
+            licence=prose_of(config["dataset"], "licence"),
+            citation=prose_of(config["dataset"], "citation"),
         )
         for config, artefact in zip(job.datasets.configs, job.datasets.ingested, strict=True)
     ]

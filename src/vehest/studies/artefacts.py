@@ -179,6 +179,8 @@ class StoredDataset:
         kind: ``real`` or ``simulated``.
         config: what its ingest was told, prose aside.
         files: recording -> Parquet file at the native rate.
+        licence: whose recordings they are.
+        citation: what to cite.
     """
 
     name: str
@@ -186,6 +188,8 @@ class StoredDataset:
     kind: str
     config: Mapping[str, Any]
     files: Mapping[str, Path]
+    licence: str = ""
+    citation: str = ""
 
     def recordings(self, channels: Iterable[str] | None = None) -> Iterator[Recording]:
         """All recordings, one at a time, with all or some of their channels.

@@ -1,0 +1,50 @@
+"""How large sideslip and lateral acceleration get in each data set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vehest.report.style import DOUBLE_COLUMN, new_figure, paper_style
+from vehest_papers.real_cars.statistics import Statistics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+COLOURS = {"sideslip": "#b8480b", "ay": "#0b4f9c"}
+
+
+def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigure:
+    """A row a data set: 50, 90 and 99 % quantiles of |β| and |ay| while driving, on logarithmic axes.
+
+    Args:
+        rows: title, ``real`` or ``simulated``, statistics; from top to bottom.
+    """
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2))
+        left, right = figure.subplots(1, 2, sharey=True)
+        for axes, name, label in ((left, "sideslip", "|β| [deg]"), (right, "ay", "|a_y| [m/s²]")):
+            colour = COLOURS[name]
+            for height, (_, kind, found) in enumerate(rows):
+                values = np.array(getattr(found, name))
+                if not np.isfinite(values).all():
+                    axes.annotate(
+                        "not measured", (0.02, height), xycoords=("axes fraction", "data"), va="center", color="#767676", fontsize=6.5
+                    )
+                    continue
+                axes.plot(values[[0, -1]], [height, height], color=colour, linewidth=1.0)
+                for value, marker in zip(values, ("|", "o", "D"), strict=True):
+                    axes.plot(
+                        value, height, marker=marker, color=colour, markersize=4.5, markerfacecolor="white" if kind != "real" else colour
+                    )
+                axes.annotate(
+                    f"{values[-1]:.2g}", (values[-1], height), xytext=(5, 0), textcoords="offset points", va="center", fontsize=6.5
+                )
+            axes.set_xscale("log")
+            axes.set_xlabel(label)
+            axes.margins(x=0.12)
+        left.set_yticks(range(len(rows)), [title for title, _, _ in rows])
+        left.set_ylim(len(rows) - 0.5, -0.5)
+    return figure
