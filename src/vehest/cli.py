@@ -43,6 +43,7 @@ app.add_typer(data_app, name="data")
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
+MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
 
@@ -610,6 +611,36 @@ def data_check(
             _echo("nothing found")
     if any(row["level"] == "error" for row in findings):
         raise typer.Exit(3)
+
+
+@data_app.command("usable")
+def data_usable(
+    source: Annotated[
+        str,
+        typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
+    ],
+    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
+    from vehest.stages.inspect_data import examine_usability
+    from vehest.stages.usable import HEADER, borrowed_cars, remedies, table_row
+
+    found = examine_usability(source, overrides or [])
+    if as_json:
+        _echo(_json(found.as_plain()), keep="\n")
+        return
+    _table([*HEADER], [table_row(row) for row in found.rows])
+    _echo("")
+    for line in remedies(found.rows):
+        _echo(line)
+    if found.unscored:
+        _echo(f"every estimate is scored by {' and '.join(missing.channel for missing in found.unscored)}")
+    if found.columns:
+        names = ", ".join(found.columns[:MOST_COLUMNS]) + (", …" if len(found.columns) > MOST_COLUMNS else "")
+        _echo(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
+    if cars := borrowed_cars(found.rows):
+        _echo(cars)
 
 
 @data_app.command("align")
