@@ -225,7 +225,7 @@ def overrides_of(given: Given) -> Iterator[tuple[str, list[str]]]:
     match given.command:
         case ("ingest",) | ("downsample",):
             yield given.command[0], [f"dataset={first}", *given.overrides]
-        case ("data", "show" | "check"):
+        case ("data", "show" | "check" | "usable"):
             if Path(first).suffix or PLACEHOLDER.search(first):
                 yield "estimate", given.overrides
             else:

@@ -43,6 +43,7 @@ app.add_typer(data_app, name="data")
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
+MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
 
@@ -202,7 +203,7 @@ def train(
 
     config = _compose("train", overrides or [])
     with _workshop(config, force={"train"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
-        job = _train_job(config, workshop)
+        _, job = _train_job(config, workshop)
         members, failures = workshop.run_groups([Group([job], None, workshop.force)])
         _raise_failure(failures)
     from vehest.stages.train import read_fit_metrics
@@ -237,14 +238,16 @@ def evaluate(
     from vehest.stages.comparison import plain_resampling
     from vehest.stages.estimate import find_model, preparation_of
     from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
+    from vehest.stages.fitting import fitted_evaluation
     from vehest.stages.group import Evaluation
     from vehest.stages.train import trained_rate
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
     with _workshop(config, force={"evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
-        split, protocol = workshop.split(config), protocol_from_config(config["evaluation"])
+        split = workshop.split(config)
         if model is not None:
+            config = fitted_evaluation(config, workshop)
             trained = read_artefact(find_model(model, workshop.output))
             if trained.stage != "train":
                 raise ConfigurationError(f"'{trained.folder}' holds no model but what the stage '{trained.stage}' made")
@@ -252,16 +255,17 @@ def evaluate(
             if not _names("downsample", overrides):
                 config["downsample"] = preparation_of(trained.folder)
         else:
-            plan = _train_job(config, workshop).plan
-            found, rate = find(plan), float(config["estimator"]["rate_hz"])
+            config, job = _train_job(config, workshop)
+            found, rate, plan = find(job.plan), float(config["estimator"]["rate_hz"]), job.plan
             if found is None:
                 raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides or [])}' first")
             trained = found
+        protocol = protocol_from_config(config["evaluation"])
         data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-        job = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
-        artefact = workshop.ensure(job.plan, lambda folder: write_evaluation(job, folder))
+        scoring = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
+        artefact = workshop.ensure(scoring.plan, lambda folder: write_evaluation(scoring, folder))
         figures = test_figures(artefact)
-        how = Evaluation(split, data, references, job.kinds, protocol, workshop.output)
+        how = Evaluation(split, data, references, scoring.kinds, protocol, workshop.output)
         workshop.log_evaluation(artefact, trained, how)
     _say(as_json, {"folder": str(artefact.folder), "skipped": artefact.skipped, **figures})
 
@@ -457,9 +461,9 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.stages.config import as_yaml
+    from vehest.stages.config import GIVEN, as_yaml
 
-    config = _compose(command, overrides or [])
+    config = {key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN}
     _echo(_json(config) if as_json else as_yaml(config).rstrip(), keep="\n")
 
 
@@ -610,6 +614,36 @@ def data_check(
             _echo("nothing found")
     if any(row["level"] == "error" for row in findings):
         raise typer.Exit(3)
+
+
+@data_app.command("usable")
+def data_usable(
+    source: Annotated[
+        str,
+        typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
+    ],
+    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
+    from vehest.stages.inspect_data import examine_usability
+    from vehest.stages.usable import HEADER, borrowed_cars, remedies, table_row
+
+    found = examine_usability(source, overrides or [])
+    if as_json:
+        _echo(_json(found.as_plain()), keep="\n")
+        return
+    _table([*HEADER], [table_row(row) for row in found.rows])
+    _echo("")
+    for line in remedies(found.rows):
+        _echo(line)
+    if found.unscored:
+        _echo(f"every estimate is scored by {' and '.join(missing.channel for missing in found.unscored)}")
+    if found.columns:
+        names = ", ".join(found.columns[:MOST_COLUMNS]) + (", …" if len(found.columns) > MOST_COLUMNS else "")
+        _echo(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
+    if cars := borrowed_cars(found.rows):
+        _echo(cars)
 
 
 @data_app.command("align")
@@ -866,11 +900,14 @@ def _names(group: str, overrides: list[str] | None) -> bool:
     return any(override.lstrip("+~").startswith((f"{group}.", f"{group}=")) for override in overrides or [])
 
 
-def _train_job(config: Config, workshop: Workshop) -> Any:
+def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
+    """The configuration at a rate that the recordings have, and what it trains."""
+    from vehest.stages.fitting import fitted_job
     from vehest.stages.train import plan_train
 
-    split = workshop.split(config)
-    return plan_train(config, split, workshop.data_for(split, _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz"), config))
+    _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz")
+    split, config = workshop.split(config), fitted_job(config, workshop)
+    return config, plan_train(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.data.estimate import Estimate
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
-from vehest.data.schema import check_format, validated
+from vehest.data.schema import check_format, settings_from_config, validated
 from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
 from vehest.data.text_files import number_in, read_rows
 from vehest.data.transforms import Preparation, transform_from_config
@@ -694,3 +694,10 @@ def test_whole_numbers_with_a_point_stay_as_they_are_where_anything_may_stand() 
     assert described.format == 1
     assert isinstance(described.format, int)
     assert isinstance(described.settings["x"], float)
+
+
+def test_training_settings_within_training_settings_may_carry_the_name_of_their_file():
+    for name in ("cnn_ukf", "ensemble_ukf"):
+        config = compose_config("train", [f"estimator={name}"])
+        assert config["training"]["identification"]["name"] == "identification"
+        settings_from_config(estimator_class(name).training_type, config["training"], "training")

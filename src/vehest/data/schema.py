@@ -55,7 +55,7 @@ def validated(kind: type[Schema], content: Any, where: str, *, error: type[Vehes
 
 
 def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
-    """Settings of an estimator or a training from plain values; ``name``, which says whose they are, is left aside.
+    """Settings of an estimator or a training from plain values; ``name``, which says whose they are, is left aside, also in groups in them.
 
     Raises:
         ConfigurationError: an unknown key, a value of the wrong type, or one that makes no sense.
@@ -63,7 +63,16 @@ def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
     if not isinstance(config, dict):
         config = dict(config) if hasattr(config, "keys") else config
     content = {key: value for key, value in config.items() if key != "name"} if isinstance(config, dict) else config
-    return validated(kind, content, "", error=ConfigurationError, group=group)
+    return validated(kind, _without_names(content, kind), "", error=ConfigurationError, group=group)
+
+
+def _without_names(content: Any, kind: Any) -> Any:
+    """Plain values without the ``name`` of a group, as a choice of conf/training has it, where its dataclass knows none."""
+    plain = _plain(kind)
+    if not (isinstance(content, dict) and is_dataclass(plain)):
+        return content
+    hints = get_type_hints(plain, include_extras=True)
+    return {key: _without_names(inner, hints.get(str(key))) for key, inner in content.items() if key != "name" or "name" in hints}
 
 
 def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int:

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from vehest.data.errors import ConfigurationError, JobsFailedError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
 from vehest.stages.config import Config
 from vehest.stages.evaluate import protocol_from_config
-from vehest.stages.failures import Failure
+from vehest.stages.failures import Failure, failure_of
+from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished
 from vehest.stages.train import TrainJob, new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
@@ -36,41 +37,88 @@ class Compared:
     failures: Sequence[tuple[str, Failure]]
 
 
-def compare(configs: Sequence[Config], workshop: Workshop, command: str, *, only_report: bool = False) -> Compared:
+def prepare(configs: Sequence[Config], workshop: Workshop) -> Fitted:
+    """Fit the jobs of a comparison to its recordings, and say which of them lack something, before anything is trained.
+
+    Raises:
+        ConfigurationError: the jobs do not fit one comparison, or a setting makes no sense.
+        DataError: no job can be done, or the evaluation asks for more than the rate of the recordings.
+        NotThereYet: in a dry run, after saying what would be trained.
+    """
+    for config in configs:
+        for key in ("split", "evaluation", "downsample"):
+            if config[key] != configs[0][key]:
+                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
+    try:
+        found = fitted(configs, workshop)
+    except NotThereYet:
+        _say_plan(configs, workshop)
+        raise
+    lacking = _lacking(found)
+    for name, failure in lacking:
+        workshop.messages.line("fail", "train", name, failure.message)
+    if len(found.failures) == len(configs):
+        reasons = dict.fromkeys(failure.message for _, failure in lacking)
+        raise DataError(
+            f"none of these estimators can be used with the recordings of split '{configs[0]['split']['name']}'; {'; '.join(reasons)}"
+        )
+    return found
+
+
+def _lacking(found: Fitted) -> list[tuple[str, Failure]]:
+    """Jobs that cannot be done, those that differ in their seed alone under one name, as a group of them is called."""
+    named: dict[tuple[str, Failure], list[str]] = {}
+    for position, failure in found.failures.items():
+        config = found.configs[position]
+        estimator = new_estimator(config["estimator"])
+        named.setdefault((f"{estimator.name}-{estimator.variant}", failure), []).append(str(config["seed"]))
+    return [(f"{name} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}", failure) for (name, failure), seeds in named.items()]
+
+
+def _say_plan(configs: Sequence[Config], workshop: Workshop) -> None:
+    """What a dry run would train, where there are no recordings yet to plan with."""
+    for config in configs:
+        estimator = new_estimator(config["estimator"])
+        workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
+
+
+def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: bool = False) -> Compared:
     """Train and evaluate every job; what is there is skipped, and what fails keeps no other from running.
 
     Args:
-        configs: its jobs, which agree in split, evaluation and downsampling.
+        prepared: its jobs, which agree in split, evaluation and downsampling; from `prepare`.
         workshop: where stages run.
         command: the command that would train what is missing, for messages.
         only_report: take what is there, train and evaluate nothing.
 
     Raises:
         ConfigurationError: the jobs do not fit one comparison.
+        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator.
         MissingError: ``only_report`` and something is missing, or raw files are not here.
         NotThereYet: in a dry run.
         Stopped: a signal came.
     """
+    configs = [config for position, config in enumerate(prepared.configs) if position not in prepared.failures]
     first = configs[0]
     try:
-        groups = _groups(configs, workshop)
+        groups, unplanned = _groups(configs, workshop)
     except NotThereYet:
-        for config in configs:
-            estimator = new_estimator(config["estimator"])
-            workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
+        _say_plan(configs, workshop)
         raise
-    missing: list[tuple[str, Failure]] = []
+    missing = [*_lacking(prepared), *unplanned]
+    n_groups = len(groups) + len(missing)
     wanted = groups
     if only_report:
-        wanted, missing = _finished(groups, command)
+        wanted, absent = _finished(groups, command)
+        missing += absent
     members, failures = workshop.run_groups(wanted)
     order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
     members.sort(key=lambda member: order[member.job.plan.key])
     evaluation = groups[0].evaluation
     assert evaluation is not None
     titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
-    facts = [*training_facts(configs), resampling_fact(configs)]
-    return Compared(members, evaluation, titles, facts, len(groups), [*failures, *missing])
+    facts = [*training_facts(configs), resampling_fact(configs), *prepared.facts]
+    return Compared(members, evaluation, titles, facts, n_groups, [*failures, *missing])
 
 
 def _finished(groups: Sequence[Group], command: str) -> tuple[list[Group], list[tuple[str, Failure]]]:
@@ -107,21 +155,27 @@ def failed_in(compared: Iterable[Compared], workshop: Workshop) -> JobsFailedErr
     )
 
 
-def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
-    """Jobs that fit one batch, with the data they need, which is made on the way."""
+def _groups(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group], list[tuple[str, Failure]]]:
+    """Jobs that fit one batch, with the data they need, which is made on the way; and those whose data cannot be made, by name.
+
+    Raises:
+        DataError: there are no data for any.
+    """
     groups: dict[tuple[Any, ...], list[TrainJob]] = {}
     evaluations: dict[tuple[Any, ...], Evaluation] = {}
     labels: dict[str, str] = {}
-    for config in configs:
-        for key in ("split", "evaluation", "downsample"):
-            if config[key] != configs[0][key]:
-                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
+    unplanned: dict[int, Failure] = {}
+    for position, config in enumerate(configs):
         split = workshop.split(config)
         if not any(split.tests.values()):
             raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
         protocol = protocol_from_config(config["evaluation"])
-        data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
         references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
+        try:
+            data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
+        except DataError as error:
+            unplanned[position] = failure_of(error)
+            continue
         job = plan_train(config, split, data)
         if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
             raise ConfigurationError(
@@ -129,7 +183,12 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> list[Group]:
             )
         groups.setdefault(job.group, []).append(job)
         evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
-    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()]
+    if not groups:
+        raise DataError(next(iter(unplanned.values())).message)
+    failures = _lacking(Fitted(configs, unplanned))
+    for name, failure in failures:
+        workshop.messages.line("fail", "train", name, failure.message)
+    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()], failures
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:

@@ -38,6 +38,11 @@ MOST_ELEMENTS = 2_000
 COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "name", "out", "quiet")
 """Options of commands that are easily mistaken for keys of the configuration."""
 
+GIVEN = "given"
+"""Key of a configuration: rates that overrides chose, which nobody changes; a rate that is the default may be lowered to that of data."""
+
+RATES = ("estimator.rate_hz", "evaluation.rate_hz")
+
 _QUOTED_OR_ESCAPED = re.compile(r"""\\.|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'""", re.DOTALL)
 
 
@@ -58,7 +63,7 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         overrides: in Hydra's grammar, for example ``estimator=gru`` or ``training.patience=10``; no sweeps.
 
     Returns:
-        Plain dicts, lists, strings and numbers.
+        Plain dicts, lists, strings and numbers; and under `GIVEN`, if overrides name a rate of an estimator or of the evaluation, which.
 
     Raises:
         ConfigurationError: an unknown key or choice, a wrong value, or bad syntax.
@@ -88,7 +93,8 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     assert isinstance(resolved, dict)
     config = {str(key): value for key, value in resolved.items()}
     check_shape(config, command)
-    return config
+    chosen = [key for key in RATES if any(override.key_or_group == key for override in parsed)]
+    return {**config, GIVEN: chosen} if chosen else config
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:

@@ -20,6 +20,7 @@ MARKS = {
     "skip": ("skipped", "dim"),
     "plan": ("would", "cyan"),
     "once": ("once", "cyan"),
+    "note": ("note", "cyan"),
     "fail": ("failed", "red"),
     "stop": ("stopped", "yellow"),
     "wait": ("waiting", "cyan"),

@@ -1,10 +1,11 @@
-"""Looking at data sets and files: what `vehest data list | show | check` print."""
+"""Looking at data sets and files: what `vehest data list | show | check | usable` print."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,18 @@ import numpy as np
 from vehest.alignment.checks import checks_of_recording
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.data.contents import Contents, contents_of, stored_contents
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.sources.base import kind_of, open_source, read_single
+from vehest.sources.unused import unused_columns
 from vehest.stages.artefacts import find
 from vehest.stages.config import Config, compose_config
 from vehest.stages.config_files import choices
 from vehest.stages.ingest import plan_ingest, recording_file
+from vehest.stages.usable import Missing, Usability, all_usabilities, unscored
 
 
 def dataset_rows() -> list[dict[str, str]]:
@@ -59,6 +63,72 @@ def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
     config = config_of(source, overrides)
     with use_limits(limits_from_config(config["limits"])):
         return [row for recording in _recordings(source, config) for row in _finding_rows(recording)]
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What estimators could do with a data set or file.
+
+    Args:
+        source: its name.
+        recordings: what they have; of a simulation that has not been ingested one alone.
+        rows: an estimator each.
+        unscored: channels by which every estimate is scored and that are missing.
+        columns: of a table, that no channel uses.
+    """
+
+    source: str
+    recordings: tuple[Contents, ...]
+    rows: tuple[Usability, ...]
+    unscored: tuple[Missing, ...]
+    columns: tuple[str, ...]
+
+    @property
+    def rate_hz(self) -> float:
+        """The lowest rate [Hz]."""
+        return min(recording.rate_hz for recording in self.recordings)
+
+    def as_plain(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "source": self.source,
+            "recordings": [recording.id for recording in self.recordings],
+            "rate_hz": self.rate_hz,
+            "missing_to_score": [missing.channel for missing in self.unscored],
+            "unused_columns": list(self.columns),
+            "estimators": [row.as_plain() for row in self.rows],
+        }
+
+
+def examine_usability(source: str, overrides: Sequence[str]) -> Examined:
+    """Which estimators a data set or file can be used with, and what it lacks.
+
+    Raises:
+        VehestError: it cannot be read.
+    """
+    config = config_of(source, overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        recordings = tuple(_contents(source, config))
+        if not recordings:
+            raise DataError(f"'{source}' holds no recordings")
+        columns = unused_columns(config["dataset"], None if source in choices("dataset") else Path(source))
+    return Examined(source, recordings, tuple(all_usabilities(recordings)), unscored(recordings), tuple(columns))
+
+
+def _contents(source: str, config: Config) -> Iterator[Contents]:
+    """What recordings have: from the store if they are there, else from what is read; of a slow source the first."""
+    if source in choices("dataset"):
+        ingested = find(plan_ingest(config))
+        if ingested is not None:
+            yield from (stored_contents(ingested.folder / file) for file in ingested.outputs)
+            return
+    slow = open_source(config["dataset"]).slow
+    for recording in _recordings(source, config):
+        if isinstance(recording, tuple):
+            raise recording[1]
+        yield contents_of(recording)
+        if slow:
+            return
 
 
 def config_of(source: str, overrides: Sequence[str]) -> Config:

@@ -22,9 +22,10 @@ from vehest.data.schema import validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import read_yaml
 from vehest.stages.artefacts import Artefact, find
-from vehest.stages.comparison import Compared, compare, failed_in
-from vehest.stages.config import Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
+from vehest.stages.comparison import Compared, compare, failed_in, prepare
+from vehest.stages.config import GIVEN, Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
 from vehest.stages.config_files import GROUPS, find_pipeline, pipeline_names
+from vehest.stages.fitting import Fitted
 from vehest.stages.ingest import STAGE as INGEST
 from vehest.stages.ingest import plan_ingest
 from vehest.stages.publishing import Publication, publish_study
@@ -321,7 +322,7 @@ def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str
             own_seed = any(key_of(override) == "seed" for override in suiting)
             if seeds and not own_seed:
                 config["seed"] = value_of(seeds[-1])
-            configs.setdefault(json.dumps(config, sort_keys=True), config)
+            configs.setdefault(json.dumps({key: value for key, value in config.items() if key != GIVEN}, sort_keys=True), config)
     return list(configs.values())
 
 
@@ -363,6 +364,7 @@ def run_pipeline(
 
     Raises:
         JobsFailedError: some jobs of a study in parts, or all of another, failed; what was done is kept.
+        DataError: recordings lack what some job of a study in parts, or all of another, needs; nothing was trained.
         MissingError: ``only_report`` and something is missing.
         NotThereYet: in a dry run.
         Stopped: a signal came.
@@ -402,7 +404,11 @@ def run_pipeline(
 def _run_parts(
     pipeline: Pipeline, configs: Configs, workshop: Workshop, *, only_report: bool
 ) -> tuple[dict[str, Compared], list[AbsentPart]]:
-    """Every part, one after another, those left out whose raw files are not here though the study can go on without them."""
+    """Every part, one after another, those left out whose raw files are not here though the study can go on without them.
+
+    What the jobs of all parts lack is found before anything of any part is trained.
+    """
+    prepared: dict[str, Fitted] = {}
     compared: dict[str, Compared] = {}
     absent: list[AbsentPart] = []
     waits = False
@@ -415,7 +421,15 @@ def _run_parts(
                 absent.append(AbsentPart(part.name, part.title))
                 continue
         try:
-            compared[part.name] = compare(configs[part.name], workshop, f"vehest run {pipeline.file}", only_report=only_report)
+            prepared[part.name] = prepare(configs[part.name], workshop)
+        except NotThereYet:
+            waits = True
+    lacking = [failure.message for own in prepared.values() for failure in own.failures.values()]
+    if pipeline.in_parts and lacking:
+        raise DataError(f"a study in parts needs all of its jobs; {'; '.join(dict.fromkeys(lacking))}")
+    for name, own in prepared.items():
+        try:
+            compared[name] = compare(own, workshop, f"vehest run {pipeline.file}", only_report=only_report)
         except NotThereYet:
             waits = True
     if waits:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from vehest.data.errors import ConfigurationError, JobsFailedError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, VehestError
 from vehest.data.limits import use_limits
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import VALIDATION, Split, check_name
@@ -19,6 +19,7 @@ from vehest.stages.code_version import code_version
 from vehest.stages.comparison import plain_resampling, resampling_fact, training_facts
 from vehest.stages.config import Config, check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
 from vehest.stages.evaluate import COLUMNS, METRICS, protocol_from_config
+from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member
 from vehest.stages.pipeline import content_overrides
 from vehest.stages.train import new_estimator, plan_train
@@ -150,6 +151,7 @@ def run_sweep(sweep: Sweep, workshop: Workshop) -> SweepOutcome:
 
     Raises:
         JobsFailedError: every job failed.
+        DataError: recordings lack what every job needs.
         ConfigurationError: the split has no test ranges.
         NotThereYet: in a dry run.
         Stopped: a signal came; what was finished stays.
@@ -159,6 +161,7 @@ def run_sweep(sweep: Sweep, workshop: Workshop) -> SweepOutcome:
     for label, reason in refused.items():
         workshop.messages.line("fail", "sweep", label, reason)
     try:
+        sweep, found = _fitted(sweep, workshop)
         evaluation = _evaluation(sweep, workshop)
         groups, unplanned = _groups(sweep, evaluation, workshop)
     except NotThereYet:
@@ -170,12 +173,13 @@ def run_sweep(sweep: Sweep, workshop: Workshop) -> SweepOutcome:
     except NotThereYet:
         workshop.messages.line("plan", STAGE, sweep.name)
         raise
+    refused = {combination.label: combination.refusal for combination in sweep.combinations if combination.refusal}
     failures = {**refused, **unplanned, **untrained}
     if not members:
         n_jobs = len(sweep.combinations) * len(sweep.seeds)
         raise JobsFailedError(_failed_line(n_jobs, n_jobs, failures))
     jobs = _job_table(sweep, groups, members, failures, evaluation.split)
-    artefacts = _artefacts(sweep, jobs, evaluation, failures, workshop)
+    artefacts = _artefacts(sweep, jobs, evaluation, failures, found.facts, workshop)
     folder = workshop.ensure(_plan(artefacts, members, workshop.output), lambda aside: _write(artefacts, aside))
     table = summary(jobs, sweep.keys, artefacts.sets)
     return SweepOutcome(folder, artefacts, table, failures, int((jobs["status"] == FAILED).sum()))
@@ -196,6 +200,22 @@ def _combinations(jobs: Sequence[Sequence[str]], swept: Sequence[str]) -> list[C
             continue
         combinations.append(Combination(label or estimator.full_title, values, config, estimator.full_title))
     return combinations
+
+
+def _fitted(sweep: Sweep, workshop: Workshop) -> tuple[Sweep, Fitted]:
+    """The sweep at rates that its recordings have; a combination that lacks something is refused with the reason."""
+    open_ones = [position for position, combination in enumerate(sweep.combinations) if not combination.refusal]
+    found = fitted([sweep.combinations[position].config for position in open_ones], workshop)
+    combinations = list(sweep.combinations)
+    for position, own in enumerate(open_ones):
+        failure = found.failures.get(position)
+        refusal = "" if failure is None else failure.message
+        combinations[own] = replace(combinations[own], config=found.configs[position], refusal=refusal)
+        if refusal:
+            workshop.messages.line("fail", "sweep", combinations[own].label, refusal)
+    if len(found.failures) == len(open_ones):
+        raise DataError(f"no combination can be trained; {_listed({own.label: own.refusal for own in combinations})}")
+    return replace(sweep, combinations=combinations), found
 
 
 def _value(override: str) -> Value:
@@ -301,7 +321,9 @@ def _figures(member: Member | None, sets: Sequence[str]) -> dict[str, Any]:
     return {**own, **{column: found.get(column, float("nan")) for column in columns[2:]}, "model": member.model.folder.name}
 
 
-def _artefacts(sweep: Sweep, jobs: pd.DataFrame, evaluation: Evaluation, failures: Mapping[str, str], workshop: Workshop) -> SweepArtefacts:
+def _artefacts(
+    sweep: Sweep, jobs: pd.DataFrame, evaluation: Evaluation, failures: Mapping[str, str], facts: Sequence[str], workshop: Workshop
+) -> SweepArtefacts:
     configs = [combination.config for combination in sweep.combinations if not combination.refusal]
     titles = {name: str(workshop.dataset_config(name, sweep.first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
     return SweepArtefacts(
@@ -313,7 +335,7 @@ def _artefacts(sweep: Sweep, jobs: pd.DataFrame, evaluation: Evaluation, failure
         protocol=evaluation.protocol,
         kinds=evaluation.kinds,
         data_titles=titles,
-        facts=[*training_facts(configs), resampling_fact(configs)],
+        facts=[*training_facts(configs), resampling_fact(configs), *facts],
         failures=failures,
         patented=any(config["estimator"]["name"] == "ksnn" for config in configs),
     )

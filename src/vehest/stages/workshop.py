@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vehest.data.contents import Contents, stored_contents
 from vehest.data.split_files import Catalogue, Reader, dataset_names, split_from_config
 from vehest.data.splits import TRAINING, VALIDATION, Split
 from vehest.data.store import read_recording
@@ -30,6 +31,7 @@ from vehest.stages.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.stages.launcher import Task, launch
 from vehest.stages.locks import Waiting
 from vehest.stages.publishing import Publication
+from vehest.stages.rates import Note
 from vehest.stages.shown import Shown
 from vehest.stages.signals import StopSignals
 from vehest.stages.tracking import Tracker
@@ -71,6 +73,8 @@ class Workshop:
     _datasets: dict[str, Config] = field(default_factory=dict)
     _data: dict[tuple[str, float, str], Artefact] = field(default_factory=dict)
     _splits: dict[str, Split] = field(default_factory=dict)
+    _contents: dict[str, tuple[Contents, ...]] = field(default_factory=dict)
+    _noted: set[Note] = field(default_factory=set)
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate.
@@ -105,6 +109,25 @@ class Workshop:
             for role, kept in split.kept.items():
                 self.messages.line("done", "split", f"{split.name}, {role}", f"keeps {kept.describe()}")
         return self._splits[key]
+
+    def contents(self, config: Config) -> dict[str, tuple[Contents, ...]]:
+        """What the recordings have of every data set that a configuration's split draws on, which are ingested for it; no samples are read.
+
+        Raises:
+            NotThereYet: in a dry run, if they would have to be made.
+        """
+        names = dataset_names(config["split"])
+        for name in names:
+            if name not in self._contents:
+                ingested = self.ingest(self.dataset_config(name, config))
+                self._contents[name] = tuple(stored_contents(ingested.folder / file) for file in ingested.outputs)
+        return {name: self._contents[name] for name in names}
+
+    def note(self, note: Note) -> None:
+        """Say of a rate that it was lowered, once."""
+        if note not in self._noted:
+            self._noted.add(note)
+            self.messages.line("note", "rate", note.what, f"{note.told}; {note.advice}")
 
     def look_for_files(self, config: Config) -> None:
         """Make sure that the raw files of every data set that a split draws on are here; read nothing.

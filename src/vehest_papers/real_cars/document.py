@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
 from vehest_papers.real_cars.figure import distributions
@@ -47,7 +47,6 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         findings += [row for recording in recordings for row in _findings(dataset, recording)]
         if dataset.name == PLANTED_IN:
             planted = [detections(recordings[0].cut(*bounds)).assign(range=name) for name, bounds in RANGES.items()]
-    titles = {dataset.name: as_text(dataset.title) for dataset in artefacts.datasets}
     blocks: list[Block] = [
         *_headline(artefacts, together),
         _overview(artefacts.datasets, together),
@@ -56,7 +55,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             "distributions",
             "Sizes of the reference's sideslip angle and of the lateral acceleration while driving: 50, 90 and 99 % of the samples lie "
             "below the three marks of a row. Open markers: simulated by its publishers.",
-            distributions([(titles[dataset.name], dataset.kind, together[dataset.name]) for dataset in artefacts.datasets]),
+            distributions([(dataset.name, dataset.kind, together[dataset.name]) for dataset in artefacts.datasets]),
         ),
         "## Every recording",
         _recordings(own),
@@ -142,9 +141,9 @@ def _figures_of(found: Statistics) -> dict[str, float]:
 def _rules() -> str:
     return (
         f"**Rules**, fixed before any estimator was looked at. A recording can rank estimators if it has a reference of v, "
-        f"{LEAST_SECONDS:g} s of driving, a sideslip of {LEAST_SIDESLIP:g}° (rms) or more, and if a static map fitted on it leaves more than "
-        f"{LEAST_OVER_NOISE:g} times the reference's noise: else there is nothing to be told apart, or no way to tell. The noise is a lower "
-        f"bound: what is slow or smoothed in a reference is not seen, so 'yes' means that nothing speaks against it."
+        f"{LEAST_SECONDS:g} s of driving, a sideslip of {LEAST_SIDESLIP:g}° (rms) or more, and if a static map fitted on it leaves more "
+        f"than {LEAST_OVER_NOISE:g} times the reference's noise: else there is nothing to be told apart, or no way to tell. The noise is a "
+        f"lower bound: what is slow or smoothed in a reference is not seen, so 'yes' means that nothing speaks against it."
     )
 
 

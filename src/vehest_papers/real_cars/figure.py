@@ -22,6 +22,8 @@ def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigu
     Args:
         rows: title, ``real`` or ``simulated``, statistics; from top to bottom.
     """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2))
         left, right = figure.subplots(1, 2, sharey=True)
@@ -43,6 +45,9 @@ def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigu
                     f"{values[-1]:.2g}", (values[-1], height), xytext=(5, 0), textcoords="offset points", va="center", fontsize=6.5
                 )
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set_xlabel(label)
             axes.margins(x=0.12)
         left.set_yticks(range(len(rows)), [title for title, _, _ in rows])
