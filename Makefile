@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground sim_to_real pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -40,8 +40,19 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) lint ## lint, types, layers, tests (at most 10 minutes)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow"
+test: $(INSTALLED) lint ## lint, types, layers, tests (some 6 minutes)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart"
+
+test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
+
+test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow" $(TESTS_$(@:test-%=%))
+
+TESTS_docs := tests/test_docs.py tests/test_examples.py
+TESTS_fuzz := tests/fuzz
+TESTS_wheel := tests/test_wheel.py
+TESTS_processes := tests/stages/test_locks.py tests/stages/test_kills.py tests/stages/test_tracking.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

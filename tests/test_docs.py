@@ -22,7 +22,7 @@ from fuzz import case
 from vehest.alignment import checks
 from vehest.cli import app
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
-from vehest.data.splits import split_from_config
+from vehest.data.split_files import split_from_config
 from vehest.data.transforms import TRANSFORMS, Resample
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class, estimator_names
@@ -32,6 +32,8 @@ from vehest.stages.config import compose_config, expand
 from vehest.stages.config_files import GROUPS, choices
 from vehest.stages.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
 from vehest.studies.artefacts import METRIC_COLUMNS
+
+pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from vehest.data.splits import Split, split_from_config
+from vehest.data.split_files import split_from_config
+from vehest.data.splits import Split
 from vehest.sources.base import open_source
 from vehest.stages.config import compose_config
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -14,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
-from vehest.data.splits import Catalogue, Span, Split, dataset_names, split_from_config
+from vehest.data.split_files import Catalogue, dataset_names, split_from_config
+from vehest.data.splits import Span, Split
 from vehest.data.windows import window_starts, windows_of
 from vehest.sources.base import open_source
 from vehest.stages.config import compose_config
@@ -132,11 +135,14 @@ def test_a_split_may_have_tests_only_but_not_nothing() -> None:
         ({"validation": []}, "nothing to validate on"),
         ({"train": [{"recording": "a", "end": 3}]}, "split.train.0.end is not an option of split.train.0; options: dataset, recording"),
         ({"train": [{"start": 3}]}, "needs a recording"),
-        ({"train": [{"recording": "a", "start": "three"}]}, "split.train.0.start must be a number, not 'three'"),
-        ({"train": [{"recording": "a", "start": None}]}, "split.train.0.start must be a number, not None"),
+        (
+            {"train": [{"recording": "a", "start": "three"}]},
+            "start and stop are a number of seconds or a percentage such as \"60 %\", not 'three'",
+        ),
+        ({"train": [{"recording": "a", "start": None}]}, "split.train.0.start must be a number of seconds or a percentage"),
         ({"train": ["a"]}, "split.train.0 must be a group of options, not 'a'"),
         ({"train": {"recording": "a"}}, "split.train must be a list"),
-        ({"train": "a"}, "split.train must be a list"),
+        ({"train": "a"}, 'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"'),
         ({"tests": [{"recording": "a"}]}, "split.tests must be a mapping"),
         ({"tests": {"wet": {"recording": "a"}}}, "split.tests.wet must be a list"),
         ({"dataset": None}, "needs a recording and a dataset"),
@@ -153,16 +159,23 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
 def test_every_split_that_is_shipped_is_one(file: Path) -> None:
-    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has one of some name."""
+    """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
 
     def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
-        names = open_source(about).ids() if about["source"] == "simulated" else ["some"]
-        speed = np.full(200, 20.0)
-        ten_seconds = {"ay": np.full(200, 3.0), "vx": speed, "vx_ref": speed, "yaw_rate": np.full(200, 0.15), "sideslip_ref": np.zeros(200)}
-        return {name: Recording(name, "car", 20.0, 0.0, ten_seconds).select for name in names}
+        names = open_source(about).ids() if about["source"] == "simulated" else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
+        speed = np.full(20_000, 20.0)
+        long = {
+            "ay": np.full(20_000, 3.0),
+            "vx": speed,
+            "vx_ref": speed,
+            "yaw_rate": np.full(20_000, 0.15),
+            "sideslip_ref": np.zeros(20_000),
+        }
+        return {name: Recording(name, "car", 20.0, 0.0, long).select for name in names}
 
-    config = yaml.safe_load(file.read_text(encoding="utf-8"))
+    text = file.read_text(encoding="utf-8")
+    config = yaml.safe_load(text)
     split = split_from_config(config, cruising)
     assert split.name == file.stem
     assert set(dataset_names(config)) == set(split.datasets)
@@ -296,7 +309,7 @@ def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry
 @pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
 def test_patterns_and_conditions_without_recordings_say_what_they_need(entry: dict[str, object]) -> None:
     config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
-    with pytest.raises(ConfigurationError, match="patterns and conditions need the recordings of data set 'd'"):
+    with pytest.raises(ConfigurationError, match="its patterns and the like need the recordings of data set 'd'"):
         split_from_config(config)
 
 
@@ -350,3 +363,137 @@ def test_windows_over_gaps_are_refused_by_name() -> None:
     with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
         windows_of([recording], ["vx", "ay"], "vy_ref", 3)
     assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
+
+
+# --- percentages, laps and folds
+
+
+def circuit(name: str = "lap", laps: float = 4.3, start_time: float = 1.6e9, rate_hz: float = 20.0) -> tuple[Recording, float]:
+    """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
+    straight, radii = 200.0, (60.0, 30.0)
+    bends = [np.pi * radius for radius in radii]
+    length = 2.0 * straight + sum(bends) + 300.0
+    time = np.arange(int(laps * length / 20.0 * rate_hz)) / rate_hz
+    distance = 20.0 * time + 30.0 * np.sin(0.02 * time)
+    speed = np.gradient(distance, time)
+    place = np.mod(distance, length)
+    curvature = np.zeros(len(time))
+    curvature[(place >= straight) & (place < straight + bends[0])] = 1.0 / radii[0]
+    curvature[(place >= straight + bends[0] + 300.0) & (place < straight + 300.0 + sum(bends))] = 1.0 / radii[1]
+    noise = 0.01 * np.random.default_rng(0).standard_normal(len(time))
+    return Recording(
+        name, "car", rate_hz, start_time, {"vx": speed, "yaw_rate": curvature * speed + noise, "ay": curvature * speed**2}
+    ), length
+
+
+def catalogue_of(*recordings: Recording) -> Catalogue:
+    def reader(recording: Recording) -> Callable[[Iterable[str] | None], Recording]:
+        return lambda channels: recording if channels is None else recording.select(channels)
+
+    return lambda dataset: {recording.id: reader(recording) for recording in recordings}
+
+
+def test_laps_last_as_long_as_the_course_is_driven_round_once() -> None:
+    recording, length = circuit()
+    laps = laps_of(recording)
+    assert len(laps) == 4
+    distance = np.cumsum(recording["vx"]) / recording.rate_hz
+    driven = [np.interp(stop, recording.time, distance) - np.interp(start, recording.time, distance) for start, stop in laps]
+    np.testing.assert_allclose(driven, length, rtol=0.01)
+    assert all(one[1] == other[0] for one, other in pairwise(laps))
+
+
+def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn() -> None:
+    time = np.arange(6000) / 50.0
+    speed = np.full(6000, 10.0)
+    bend = np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0  # two equal halves: a straight, and half a turn of 20 m
+    oval = Recording("oval", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.where(bend, 0.5, 0.0)})
+    durations = [stop - start for start, stop in laps_of(oval)]
+    np.testing.assert_allclose(durations, 2.0 * (100.0 + 20.0 * np.pi) / 10.0, rtol=0.02)
+    circle = Recording("circle", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.full(6000, -0.4)})
+    np.testing.assert_allclose([stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03)
+
+
+def test_a_drive_that_never_repeats_has_no_laps() -> None:
+    generator = np.random.default_rng(1)
+    yaw_rate = np.convolve(generator.standard_normal(6000), np.full(200, 0.01), mode="same")
+    assert laps_of(Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})) == []
+    assert laps_of(Recording("parked", "car", 50.0, 0.0, {"vx": np.zeros(600), "yaw_rate": np.zeros(600)})) == []
+
+
+def test_percentages_follow_one_another_over_every_recording() -> None:
+    one = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
+    other = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
+    config = {"name": "s", "dataset": "d", "train": "60 %", "validation": "15%", "tests": {"wet": "20 %", "dry": "5 %"}}
+    split = split_from_config(config, catalogue_of(one, other))
+    assert split.train == (Span("d", "a", -math.inf, 110.0), Span("d", "b", -math.inf, 12.0))
+    assert split.validation == (Span("d", "a", 110.0, 125.0), Span("d", "b", 12.0, 15.0))
+    assert split.tests["wet"] == (Span("d", "a", 125.0, 145.0), Span("d", "b", 15.0, 19.0))
+    assert split.tests["dry"] == (Span("d", "a", 145.0, math.inf), Span("d", "b", 19.0, math.inf))
+
+
+def test_laps_are_named_from_either_end() -> None:
+    recording, _ = circuit()
+    laps = laps_of(recording)
+    entry = {"recording": "lap"}
+    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
+    split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
+    assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
+    assert split.validation == (Span("d", "lap", *laps[2]),)
+    assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
+
+
+def test_every_fold_is_tested_once_and_none_learns_from_its_test() -> None:
+    recording, _ = circuit(laps=6.5)
+    config = {"name": "s", "dataset": "d", "folds": {"number": 4, "of": "laps", "gap_seconds": 1.0}}
+    splits = [split_from_config({**config, "fold": fold}, catalogue_of(recording)) for fold in range(4)]
+    assert [split.name for split in splits] == ["s_fold_1", "s_fold_2", "s_fold_3", "s_fold_4"]
+    tested = sorted((span.start, span.stop) for split in splits for span in split.tests["test"])
+    assert tested[0][0] == recording.start_time
+    assert tested[-1][1] == recording.end_time
+    assert all(one[1] == other[0] for one, other in pairwise(tested))
+    for split, after in zip(splits, [*splits[1:], splits[0]], strict=True):
+        (tested_span,), (stopped_on,) = split.tests["test"], after.tests["test"]
+        assert stopped_on.start <= split.validation[0].start < split.validation[-1].stop <= stopped_on.stop
+        for span in (*split.train, *split.validation):
+            assert span.stop <= tested_span.start - 1.0 or span.start >= tested_span.stop + 1.0
+
+
+@pytest.mark.parametrize("of", ["recordings", "seconds"])
+def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
+    recordings = [Recording(name, "car", 10.0, 0.0, {"vx": np.ones(1000), "yaw_rate": np.zeros(1000)}) for name in "abcdef"]
+    config = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": of, "gap_seconds": 0.0}}
+    for fold in range(3):
+        split = split_from_config({**config, "fold": fold}, catalogue_of(*recordings))
+        length = {
+            role: sum(span.stop - span.start for span in spans)
+            for role, spans in (("train", split.train), ("validation", split.validation), ("test", split.tests["test"]))
+        }
+        assert sum(length.values()) == pytest.approx(600.0)
+        assert length["test"] == pytest.approx(200.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"train": "70 %", "validation": "20 %", "tests": {"t": "20 %"}}, "the percentages come to 110 %"),
+        ({"train": "most of it"}, "train must be a list of ranges, a percentage"),
+        ({"train": [{"recording": "lap", "start": "150 %"}]}, "start and stop are a number of seconds or a percentage"),
+        ({"train": [{"recording": "lap", "laps": "2 to 9"}]}, "has no '2 to 9': 4 complete laps were found; name times instead"),
+        ({"train": [{"recording": "lap", "laps": "some"}]}, "laps are said as first, last, first 3"),
+        ({"train": [{"recording": "lap", "laps": "1", "stop": 3}]}, "a range has laps, or start and stop, not both"),
+        ({"folds": {"number": 3}}, "folds make training, validation and test; leave train"),
+        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 2}}, "split.folds: number must be 3 or more"),
+        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 9}}, "do not fill 9 folds"),
+        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 3}, "fold": 3}, "fold 3 is not one of 0 to 2"),
+        ({"train": [], "validation": [], "tests": {}, "folds": {"of": "corners"}}, "folds.of 'corners' is not one of"),
+    ],
+    ids=str,
+)
+def test_portions_that_make_no_sense_are_refused_in_one_line(changes: dict[str, object], what: str) -> None:
+    config = {"name": "s", "dataset": "d", "train": [{"recording": "lap"}], "validation": [{"recording": "b"}], "tests": {}}
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config | changes, catalogue_of(circuit()[0]))
+    assert what in str(error.value)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)

@@ -11,6 +11,8 @@ from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span
+from vehest.evaluation.blocks import segments_of
+from vehest.evaluation.manoeuvres import kpis
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_squared_errors
 
 
@@ -111,3 +113,23 @@ def test_estimate_with_holes_is_an_error_not_a_better_score(drive):
     vy[500] = np.nan
     with pytest.raises(DataError, match="has no estimate for 1 of"):
         score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+
+
+def test_recording_without_lateral_acceleration_is_scored_all_but_the_nonlinear_range(drive):
+    without = drive.select([name for name in drive.channels if name != "ay"])
+    estimate = _estimate(drive.time, drive["vy_ref"] + 0.1 * np.sin(drive.time), 20.0, 0.0)
+    figures, known = (accuracy([score(estimate, own, Span("d", "drive", 10.0, 30.0), Protocol())]) for own in (without, drive))
+    blank = {"mse_sideslip_nonlinear", "max_error_sideslip_nonlinear"}
+    assert all(math.isnan(figures[name]) for name in blank)
+    assert {name: value for name, value in figures.items() if name not in blank} == {
+        name: value for name, value in known.items() if name not in blank
+    }
+
+
+def test_manoeuvres_without_lateral_acceleration_have_no_nonlinear_indicators(drive):
+    without = drive.select([name for name in drive.channels if name != "ay"])
+    part = score(_estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0), without, Span("d", "drive"), Protocol())
+    indicators = kpis({"slalom": [part]})
+    assert indicators.mse > 0
+    assert math.isnan(indicators.mse_nonlinear)
+    assert segments_of([part], 20.0).squared_error_vy.sum() == pytest.approx(0.01 * len(part.time))

@@ -16,6 +16,8 @@ from fuzz.families.planted import MISDEEDS
 from fuzz.runner import Fuzzer
 from fuzz.verdicts import VERDICTS, Outcome, differences, judge, snapshot
 
+pytestmark = pytest.mark.apart
+
 TESTS = Path(__file__).parents[1]
 
 

@@ -29,6 +29,7 @@ from vehest.report.style import MISSING, colour_of, decimals_for, fixed, lines_o
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
 from vehest.studies.drive import comparison, leaderboard
 from vehest.studies.kit.timings import timings_of_study
+from vehest.studies.kit.warnings import warnings_of
 
 RATE = 20.0
 PROTOCOL = Protocol(rate_hz=RATE, warm_up_seconds=2.0, skip_seconds=1.5)
@@ -237,6 +238,69 @@ def test_several_seeds_without_validation_metrics_are_refused(artefacts: PartArt
         leaderboard(replace(artefacts, metrics=metrics))
 
 
+# What the drive can show
+
+
+def with_rows(artefacts: PartArtefacts, metrics: dict[str, float], subset: str = "all") -> PartArtefacts:
+    rows = [row for model in artefacts.models for row in metric_rows(model, "test", metrics)]
+    added = pd.DataFrame(rows, columns=list(METRIC_COLUMNS)).assign(subset=subset)
+    return replace(artefacts, metrics=pd.concat([artefacts.metrics, added], ignore_index=True))
+
+
+def table_of(artefacts: PartArtefacts, name: str) -> Table | None:
+    return next((block for block in comparison(artefacts).blocks if isinstance(block, Table) and block.name == name), None)
+
+
+def test_bound_stands_beside_the_errors_where_there_is_one(artefacts: PartArtefacts) -> None:
+    def bounds(of: PartArtefacts) -> list[str]:
+        headers, rows, _ = formatted(table_of(of, "leaderboard_test"))
+        return [row[headers.index("bound [deg]")] for row in rows] if "bound [deg]" in headers else []
+
+    assert bounds(artefacts) == []
+    assert bounds(with_rows(artefacts, {"floor_cramer_rao": 0.125})) == ["0.125"] * 5
+
+
+def test_floors_of_the_drive_are_tabled_from_the_spread_down(artefacts: PartArtefacts) -> None:
+    frame = table_of(artefacts, "floors_test").frame
+    assert frame["what"].tolist()[:2] == ["v = 0: the reference itself", "noise of the reference, at least"]
+    scored = drive().cut(61.5, 85.0)
+    assert frame["vy"].iloc[0] == pytest.approx(np.sqrt(np.mean(scored["vy_ref"] ** 2)))
+    assert (frame["vy"].iloc[1:] < frame["vy"].iloc[0]).all()
+    assert "u, ω, a_y, a_x" in frame["inputs"].tolist()
+    assert not any("δ" in inputs for inputs in frame["inputs"]), "there is no steering angle in this drive"
+
+
+def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts: PartArtefacts) -> None:
+    assert table_of(artefacts, "regimes_test") is None
+    known = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
+    known = with_value(known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip")
+    headers, rows, _ = formatted(table_of(known, "regimes_test"))
+    assert headers == ["estimator", "turning (38 %)"]
+    assert {row[0]: row[1] for row in rows}["KS-NN linear + bias, P = 2"] == "0.500"
+    assert [row[1] for row in rows].count("0.250") == 4
+    pd.testing.assert_frame_equal(leaderboard(known), leaderboard(artefacts))
+
+
+def test_silent_drive_and_noisy_reference_are_warned_of(artefacts: PartArtefacts) -> None:
+    def warned(**floors: float) -> str:
+        return " ".join(warnings_of(with_rows(artefacts, floors)))
+
+    assert "silent" not in warned(floor_cramer_rao=0.1, floor_reference=0.01)
+    assert "close to the noise" not in warned(floor_cramer_rao=0.1, floor_reference=0.01)
+    assert "`test` is a silent drive: what the estimators read tells sideslip to no better than 1.2°" in warned(floor_cramer_rao=1.2)
+    assert "is close to the noise of the reference, at least 0.05°" in warned(floor_reference=0.05)
+
+
+def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(artefacts: PartArtefacts, tmp_path: Path) -> None:
+    whole = drive()
+    write_recording(whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet")
+    without = replace(artefacts, references={("toy", "lap"): tmp_path / "lap.parquet"})
+    assert warnings_of(without) == [line for line in warnings_of(artefacts) if "lateral acceleration" not in line]
+    names = [block.name for block in comparison(without).blocks if isinstance(block, Figure)]
+    assert "zoom_test" in names
+    assert "errors_over_ay_test" not in names
+
+
 # The words
 
 
@@ -312,7 +376,7 @@ def test_report_says_how_it_was_made(written: Path) -> None:
 def test_links_of_the_markdown_report_resolve(written: Path) -> None:
     text = (written / "report.md").read_text(encoding="utf-8")
     targets = re.findall(r"\]\(([^)]+)\)", text)
-    assert len(targets) == 3 + 2 * 6
+    assert len(targets) == 4 + 2 * 6
     for target in targets:
         assert (written / target).stat().st_size > 0, target
     assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {*targets, "report.md", "report.html"}
@@ -321,7 +385,7 @@ def test_links_of_the_markdown_report_resolve(written: Path) -> None:
 def test_rows_of_markdown_tables_have_as_many_cells_as_their_header(written: Path) -> None:
     lines = (written / "report.md").read_text(encoding="utf-8").splitlines()
     tables = [len(re.findall(r"(?<!\\)\|", line)) for line in lines if line.startswith("| ")]
-    assert set(tables) == {7, 11, 12}  # one bar more than columns, in a cell "\|" stands for a bar
+    assert set(tables) == {6, 7, 11, 12}  # one bar more than columns, in a cell "\|" stands for a bar
     assert any(r"GRU \| 5 &lt;states>" in line for line in lines)
 
 
@@ -337,7 +401,7 @@ def test_csv_tables_read_back_with_every_digit(artefacts: PartArtefacts, written
 def test_same_artefacts_give_the_same_bytes(artefacts: PartArtefacts, written: Path, tmp_path: Path) -> None:
     write_document(comparison(artefacts), tmp_path)
     files = [path.relative_to(written) for path in written.rglob("*.*")]
-    assert len(files) == 2 + 3 + 2 * 6
+    assert len(files) == 2 + 4 + 2 * 6
     for file in files:
         assert (tmp_path / file).read_bytes() == (written / file).read_bytes(), file
 

@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from vehest.data.recording import Recording
-from vehest.data.splits import Split, split_from_config
+from vehest.data.split_files import split_from_config
+from vehest.data.splits import Split
 from vehest.simulation.drive import simulate_drive
 from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import Follower

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.apart
+
 SCRIPT = Path(__file__).parents[1] / "kills" / "kills.py"
 
 

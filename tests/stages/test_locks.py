@@ -19,6 +19,8 @@ from vehest.stages.group import _held
 from vehest.stages.locks import Lock, Waiting, held
 from vehest.stages.train import TrainJob
 
+pytestmark = pytest.mark.apart
+
 HOLDER = """
 import sys
 from pathlib import Path

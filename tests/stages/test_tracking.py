@@ -23,6 +23,8 @@ from place import Place
 from vehest.stages.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.stages.tracking import Tracker
 
+pytestmark = pytest.mark.apart
+
 STARTUP_SECONDS = 120.0  # of a server on a busy machine
 
 

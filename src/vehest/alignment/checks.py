@@ -7,33 +7,38 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, signal
 
+from vehest.alignment.bandwidth import held_findings, low_pass_findings, low_passed
+from vehest.alignment.delays import delay_findings, delays_of, spectra_of
+from vehest.alignment.findings import Finding
+from vehest.alignment.motion import Motion, motion_of
+from vehest.alignment.offsets import offset_findings
+from vehest.alignment.signs import (
+    KINEMATIC_BAND_HZ,
+    LEAST_SLIDING,
+    SIGN_CORRELATION,
+    relations_of,
+    settled_samples,
+    sign_findings,
+    turned_channels,
+    wrong_unit,
+)
+from vehest.alignment.standstill import long_runs, standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
-BoolArray = NDArray[np.bool_]
-Level = Literal["error", "warning", "note"]
+__all__ = ["Finding", "checks_of_clock", "checks_of_recording"]
 
+MOST_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
-STANDSTILL_SPEED = 0.1  # m/s
-STANDSTILL_YAW_RATE = 0.05  # rad/s
-STANDSTILL_SHAKING = 0.3  # m/s²
 MOST_DRIFT = 0.5  # intervals
 LATEST_TIME = 1e15  # s; beyond it a double tells no two samples apart
-KINEMATIC_BAND_HZ = (0.1, 2.0)
-FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording
-SIGN_CORRELATION = 0.3
-MAX_SCALE = 1.7  # between d(vy_ref)/dt and what it must equal; km/h for m/s makes 3.6 or 1/3.6
-DEGREES_PER_RADIAN = 180.0 / np.pi
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
@@ -45,23 +50,6 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that a check found.
-
-    Args:
-        level: ``error`` stops an ingest, ``warning`` needs a look, ``note`` is information.
-        check: name of the check.
-        channel: the channel concerned, empty if it is not about one.
-        message: what was found, where, and what to do.
-    """
-
-    level: Level
-    check: str
-    channel: str
-    message: str
 
 
 def checks_of_clock(time: FloatArray) -> list[Finding]:
@@ -152,81 +140,49 @@ def _impossible_values(recording: Recording) -> list[Finding]:
     return findings
 
 
-def _yaw_rate_unit(recording: Recording) -> list[Finding]:
-    """In steady driving ay ≈ vx·yaw_rate; a slope near π/180 or a negative one gives the unit or the sign away."""
-    if not {"vx", "yaw_rate", "ay"} <= set(recording.channels):
+def _agreement(recording: Recording) -> list[Finding]:
+    """Channels that planar motion ties together: signs and units first, the rest with these put right."""
+    motion = motion_of(recording)
+    if not motion.moving.any():
         return []
-    expected = recording["vx"] * recording["yaw_rate"]
-    measured = recording["ay"]
-    known = np.isfinite(expected) & np.isfinite(measured)
-    if known.sum() < 100:
-        return []
-    expected, measured = expected[known] - expected[known].mean(), measured[known] - measured[known].mean()
-    scatter = expected.std() * measured.std()
-    if scatter == 0.0 or measured.std() < 0.2:
-        return []
-    correlation = float((expected * measured).mean() / scatter)
-    slope = float((expected * measured).sum() / (expected**2).sum())
-    if abs(correlation) < 0.7:
-        return []
-    ratio = abs(slope) * DEGREES_PER_RADIAN
-    if 0.4 < ratio < 2.5:
-        return [
-            Finding(
-                "error", "unit", "yaw_rate", f"ay is {slope:.3g} times vx·yaw_rate: yaw_rate is in degrees a second; set its unit to deg/s"
-            )
-        ]
-    if slope < 0:
-        return [
-            Finding(
-                "warning",
-                "sign",
-                "yaw_rate",
-                f"ay runs against vx·yaw_rate (slope {slope:.3g}, correlation {correlation:.2f}): "
-                f"the sign of ay or of yaw_rate is not ISO 8855's; set sign: -1 for it",
-            )
-        ]
-    if not 0.5 < slope < 2.0:
-        return [
-            Finding(
-                "warning", "unit", "ay", f"ay is {slope:.3g} times vx·yaw_rate, about 1 is expected: check the units of ay, vx and yaw_rate"
-            )
-        ]
-    return []
+    relations = relations_of(motion)
+    findings = sign_findings(relations, motion)
+    turned = turned_channels(relations, motion)
+    if turned:
+        motion = motion.corrected(dict.fromkeys(turned[0], -1.0))
+        relations = relations_of(motion)
+    for _ in range(MOST_WRONG_UNITS):
+        wrong = wrong_unit(relations)
+        if wrong is None:
+            break
+        findings.append(wrong.finding)
+        if not wrong.explanations:
+            break
+        motion = motion.corrected(wrong.factors)
+        relations = relations_of(motion)
+    clocks: list[Finding] = []
+    spectra = spectra_of(motion)
+    if spectra is not None:
+        slow = low_passed(motion, spectra)
+        clocks = low_pass_findings(motion, spectra, slow) + delay_findings(delays_of(motion, spectra, frozenset(slow)))
+    explained = any(finding.channel in ("ay", "yaw_rate", "vy_ref") for finding in clocks)
+    kinematics = [finding for finding in _kinematics(motion) if finding.level == "note" or not explained]
+    return findings + kinematics + offset_findings(motion) + clocks
 
 
-def _kinematic_sign(recording: Recording) -> list[Finding]:
-    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a); a reference's own vx_ref before one that wheels slip."""
-    speed = _speed_beside_reference(recording)
-    names = (speed, "yaw_rate", "ay", "vy_ref")
-    if not set(names) <= set(recording.channels):
+def _kinematics(motion: Motion) -> list[Finding]:
+    """ay - vx·yaw_rate must follow d(vy_ref)/dt (Da Lio et al. 2023, Eq. 4a)."""
+    settled = settled_samples(motion)
+    if settled is None or motion.velocity != "vy_ref" or not {"ay", "yaw_rate"} <= set(motion.channels):
         return []
-    if any(np.isnan(recording[name]).any() for name in names) or recording.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
-        return []
-    moving = ~_standstill(recording)
-    settled = moving.copy()
-    margin = round(FILTER_END_SECONDS * recording.rate_hz)
-    settled[:margin] = settled[len(settled) - margin :] = False
-    if settled.sum() < 10 * recording.rate_hz:
-        return []
-    band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=recording.rate_hz, output="sos")
-    predicted = signal.sosfiltfilt(band, recording["ay"] - recording[speed] * recording["yaw_rate"])[settled]
-    derived = signal.sosfiltfilt(band, np.gradient(recording["vy_ref"]) * recording.rate_hz)[settled]
-    if predicted.std() == 0.0 or derived.std() < 1e-3:
+    band = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=motion.rate_hz, output="sos")
+    expected = motion["ay"] - motion.turning
+    predicted, derived = (signal.sosfiltfilt(band, samples)[settled] for samples in (expected, motion.sliding))
+    if predicted.std() == 0.0 or derived.std() < LEAST_SLIDING:
         return []
     correlation = float(np.corrcoef(predicted, derived)[0, 1])
     where = f"between {KINEMATIC_BAND_HZ[0]:g} and {KINEMATIC_BAND_HZ[1]:g} Hz"
-    if correlation < -SIGN_CORRELATION:
-        return [
-            Finding(
-                "warning",
-                "sign",
-                "vy_ref",
-                f"ay - vx·yaw_rate disagrees in sign with d(vy_ref)/dt (correlation {correlation:.2f} {where}): "
-                f"vy_ref, or ay and yaw_rate together, point the other way; set sign: -1",
-            )
-        ]
-    if correlation < SIGN_CORRELATION:
+    if not correlation >= SIGN_CORRELATION:
         return [
             Finding(
                 "warning",
@@ -236,48 +192,15 @@ def _kinematic_sign(recording: Recording) -> list[Finding]:
                 f"check units, delays and where the sensors sit",
             )
         ]
-    scale = float(derived.std() / predicted.std())
-    if correlation > 0.8 and not 1 / MAX_SCALE < scale < MAX_SCALE:
-        return [
-            Finding(
-                "warning",
-                "unit",
-                "vy_ref",
-                f"d(vy_ref)/dt is {scale:.3g} times as large as ay - vx·yaw_rate {where} "
-                f"(correlation {correlation:.2f}): check the unit of vy_ref",
-            )
-        ]
-    residual = np.gradient(recording["vy_ref"]) * recording.rate_hz - (recording["ay"] - recording[speed] * recording["yaw_rate"])
-    residual = residual[moving]
+    bias = float((motion.sliding - expected)[motion.moving].mean())
     return [
         Finding(
             "note",
             "kinematics",
             "vy_ref",
-            f"d(vy_ref)/dt follows ay - vx·yaw_rate (correlation {correlation:.2f} {where}), mean bias {residual.mean():.3f} m/s²",
+            f"d(vy_ref)/dt follows ay - vx·yaw_rate (correlation {correlation:.2f} {where}), mean bias {bias:.3f} m/s²",
         )
     ]
-
-
-def _sideslip_unit(recording: Recording) -> list[Finding]:
-    """sideslip_ref must be atan2(vy_ref, vx) in radians; 57 times that is degrees."""
-    speed = _speed_beside_reference(recording)
-    if not {speed, "vy_ref", "sideslip_ref"} <= set(recording.channels):
-        return []
-    expected = np.arctan2(recording["vy_ref"], recording[speed])
-    given = recording["sideslip_ref"]
-    known = np.isfinite(expected) & np.isfinite(given) & ~_standstill(recording)
-    if known.sum() < 100 or np.std(expected[known]) < 1e-3:
-        return []
-    slope = float((expected[known] * given[known]).sum() / np.square(expected[known]).sum())
-    if 0.4 < slope / DEGREES_PER_RADIAN < 2.5:
-        message = f"sideslip_ref is {slope:.3g} times atan2(vy_ref, vx): it is in degrees; set its unit to deg"
-        return [Finding("error", "unit", "sideslip_ref", message)]
-    return []
-
-
-def _speed_beside_reference(recording: Recording) -> str:
-    return "vx_ref" if "vx_ref" in recording and not np.isnan(recording["vx_ref"]).any() else "vx"
 
 
 def _not_measured(recording: Recording) -> list[Finding]:
@@ -292,7 +215,7 @@ def _not_measured(recording: Recording) -> list[Finding]:
 def _stuck(recording: Recording) -> list[Finding]:
     """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
     findings = []
-    moving = ~_standstill(recording)
+    moving = ~standstill(recording)
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
         known = np.flatnonzero(~np.isnan(samples))
@@ -302,7 +225,7 @@ def _stuck(recording: Recording) -> list[Finding]:
         if len(known) > 1 and (samples[known] == samples[known[0]]).all():
             findings.append(Finding("warning", "stuck", name, f"never changes: {samples[known[0]]:.6g} {unit} throughout"))
             continue
-        starts, lengths = _long_runs(samples[known], at_least=3)
+        starts, lengths = long_runs(samples[known], at_least=3)
         if CHANNELS[name].rests:
             starts, lengths = starts[samples[known[starts]] != 0.0], lengths[samples[known[starts]] != 0.0]
         if not len(starts):
@@ -322,7 +245,7 @@ def _stuck(recording: Recording) -> list[Finding]:
 def _saturated(recording: Recording) -> list[Finding]:
     """Samples that pile up at the highest or lowest value, again and again, far more often than at the value next to it."""
     findings = []
-    moving = ~_standstill(recording)
+    moving = ~standstill(recording)
     for name, samples in recording.channels.items():
         known = samples[np.isfinite(samples) & moving]
         if len(known) < 100:
@@ -385,7 +308,7 @@ def _wheel_dropout(recording: Recording) -> list[Finding]:
     findings = []
     for place, name in enumerate(names):
         others = np.median(np.delete(wheels, place, axis=1), axis=1)
-        starts, lengths = _long_runs(rolling & (wheels[:, place] < DROPOUT_SHARE * others), at_least=1)
+        starts, lengths = long_runs(rolling & (wheels[:, place] < DROPOUT_SHARE * others), at_least=1)
         out = [
             (start, length)
             for start, length in zip(starts.tolist(), lengths.tolist(), strict=True)
@@ -412,7 +335,7 @@ def _reverse(recording: Recording) -> list[Finding]:
     if speed not in recording:
         return []
     samples = recording[speed]
-    starts, lengths = _long_runs(samples < -REVERSE_SPEED, at_least=math.ceil(REVERSE_SECONDS * recording.rate_hz))
+    starts, lengths = long_runs(samples < -REVERSE_SPEED, at_least=math.ceil(REVERSE_SECONDS * recording.rate_hz))
     backwards = samples[starts] < -REVERSE_SPEED
     starts, lengths = starts[backwards], lengths[backwards]
     if not len(starts):
@@ -432,45 +355,12 @@ def _reverse(recording: Recording) -> list[Finding]:
     ]
 
 
-def _standstill(recording: Recording) -> BoolArray:
-    """Where the car stands: the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
-    standing = np.zeros(len(recording), dtype=bool)
-    if "vx" not in recording:
-        return standing
-    slow = np.abs(recording["vx"]) < STANDSTILL_SPEED
-    starts, lengths = _long_runs(slow, at_least=1)
-    still = slow[starts]
-    if "yaw_rate" in recording:
-        still &= ~(np.fmax.reduceat(np.abs(recording["yaw_rate"]), starts) > STANDSTILL_YAW_RATE)
-    for name in ("ax", "ay"):
-        if name in recording:
-            still &= _spreads(recording[name], starts, lengths) <= STANDSTILL_SHAKING
-    return np.repeat(still, lengths)
-
-
-def _spreads(samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> FloatArray:
-    """Standard deviation of what is known of the samples, for each of the stretches that they consist of; 0 where nothing is."""
-    known = np.isfinite(samples)
-    number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
-    mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number
-    deviation = np.where(known, samples - np.repeat(mean, lengths), 0.0)
-    return np.asarray(np.sqrt(np.add.reduceat(np.square(deviation), starts) / number), dtype=np.float64)
-
-
-def _long_runs(samples: NDArray[Any], at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Starts and lengths of the runs of equal values that are long enough."""
-    edges = np.flatnonzero(np.concatenate([[True], samples[1:] != samples[:-1], [True]])) if len(samples) else np.zeros(1, dtype=np.int64)
-    lengths = np.diff(edges)
-    return edges[:-1][lengths >= at_least], lengths[lengths >= at_least]
-
-
 _CHECKS: tuple[Callable[[Recording], list[Finding]], ...] = (
     _impossible_values,
-    _yaw_rate_unit,
-    _kinematic_sign,
-    _sideslip_unit,
+    _agreement,
     _not_measured,
     _stuck,
+    held_findings,
     _saturated,
     _steering_offset,
     _wheel_dropout,

@@ -86,6 +86,15 @@ def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
     return Segments(**{name: np.concatenate(values) for name, values in columns.items()})
 
 
+def joined(parts: Sequence[Segments]) -> Segments:
+    """Segments of several test sets as of one, whose pieces stay apart."""
+    first, columns = 0.0, {name: [np.asarray(getattr(part, name)) for part in parts] for name in COLUMNS}
+    for position, part in enumerate(parts):
+        columns["piece"][position] = part.piece + first
+        first += float(part.piece.max()) + 1.0
+    return Segments(**{name: np.concatenate(values) for name, values in columns.items()})
+
+
 def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
     """Write the segments of every test set into one CSV file, floats to the last digit."""
     with open(path, "w", newline="", encoding="utf-8") as stream:

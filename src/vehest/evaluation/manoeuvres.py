@@ -33,7 +33,7 @@ BIN = 0.25  # deg, of Figs. 5 and 11
 
 @dataclass(frozen=True)
 class Kpis:
-    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it.
+    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured.
 
     Args:
         mse: mean squared error over all samples [deg²].
@@ -135,5 +135,5 @@ def sideslip_error(part: Scored) -> FloatArray:
 
 
 def is_nonlinear(part: Scored) -> NDArray[np.bool_]:
-    """Which samples have |ay| ≥ 4 m/s², (K,)."""
+    """Which samples have |ay| ≥ 4 m/s², (K,); none where ay was not measured."""
     return np.abs(part.ay) >= NONLINEAR_AY

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -42,6 +42,11 @@ UNITS: dict[str, str] = {
     "nis": "1",
     "coverage_1sigma": "1",
     "coverage_2sigma": "1",
+    "share": "1",
+    "floor_reference": "deg",
+    "floor_reference_vy": "m/s",
+    "floor_cramer_rao": "deg",
+    "floor_cramer_rao_vy": "m/s",
     "n_sequences": "1",
     "n_parameters": "1",
     "epochs": "1",
@@ -101,7 +106,7 @@ class Scored:
         vy_ref: reference lateral velocity [m/s].
         sideslip: estimated sideslip angle, atan2(vy, vx) with the measured vx [rad].
         sideslip_ref: reference sideslip angle, atan2(vy_ref, vx) [rad].
-        ay: measured lateral acceleration [m/s²].
+        ay: measured lateral acceleration [m/s²]; NaN where the recording has none.
         others: ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there.
         covariance: of the errors in ``covariance_of``, shape (K, n, n), where the method gives one.
         covariance_of: those quantities among `errors` that the covariance is of.
@@ -189,13 +194,35 @@ def score_all(
     Raises:
         DataError: as `score` and `sequences` say.
     """
+    return [
+        score(estimate_of(position), reference, piece, protocol)
+        for position, (reference, piece) in enumerate(pieces_of(spans, recording_of, protocol))
+    ]
+
+
+def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> Iterator[tuple[Recording, Span]]:
+    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time.
+
+    Args:
+        spans: ranges of the test set.
+        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
+        protocol: see `Protocol`.
+
+    Raises:
+        DataError: as `sequences` says.
+    """
     read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
 
     def cached(span: Span) -> Recording:
         return read(span.dataset, span.recording)
 
-    pieces = sequences(spans, cached, protocol)
-    return [score(estimate_of(position), cached(piece), piece, protocol) for position, piece in enumerate(pieces)]
+    for piece in sequences(spans, cached, protocol):
+        yield cached(piece), piece
+
+
+def scored_range(reference: Recording, span: Span, protocol: Protocol) -> tuple[int, int]:
+    """First index and end index of the samples of a recording that are scored in a range."""
+    return reference.index_range(max(span.start, reference.start_time) + protocol.skip_seconds, span.stop)
 
 
 def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protocol) -> Scored:
@@ -203,7 +230,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
 
     Args:
         estimate: at any rate; a value made for time t is scored at t.
-        reference: the recording at ``protocol.rate_hz``, with vx, ay and vy_ref.
+        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be told apart by it.
         span: the range that is scored, after ``protocol.skip_seconds``.
         protocol: see `Protocol`.
 
@@ -212,7 +239,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     """
     start = max(span.start, reference.start_time) + protocol.skip_seconds
     scored = reference.cut(start, span.stop)
-    for name in ("vx", "vy_ref", "ay"):
+    for name in ("vx", "vy_ref", *(["ay"] if "ay" in scored else [])):
         if np.isnan(scored[name]).any():
             raise DataError(f"recording '{reference.id}': channel '{name}' has gaps within {span.describe()}; test on a range without")
 
@@ -234,7 +261,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         vy_ref=scored["vy_ref"],
         sideslip=np.arctan2(vy, scored["vx"]),
         sideslip_ref=np.arctan2(scored["vy_ref"], scored["vx"]),
-        ay=scored["ay"],
+        ay=scored["ay"] if "ay" in scored else np.full(len(scored), np.nan),
         others=others,
         covariance=covariance,
         covariance_of=covariance_of,
@@ -262,7 +289,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     """Metrics over all parts together.
 
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
-    ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none.
+    ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none, or no a_y.
     ``…_weighted`` are the mean of `weighted_squared_errors`, the mean and the 99th percentile of `weighted_absolute_errors`.
 
     Returns:

@@ -151,13 +151,19 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
 
 def zoom_figure(
-    time: FloatArray, ay: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str, *, error_limit: float = math.inf
+    time: FloatArray,
+    ay: FloatArray | None,
+    reference: Traces,
+    estimates: Sequence[Traces],
+    time_label: str,
+    *,
+    error_limit: float = math.inf,
 ) -> MatplotlibFigure:
     """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration.
 
     Args:
         time: [s], shape (K,).
-        ay: measured lateral acceleration [m/s²], shape (K,).
+        ay: measured lateral acceleration [m/s²], shape (K,); None leaves its axes out.
         reference: measured.
         estimates: in the order of the legend.
         time_label: label of the time axis.
@@ -166,8 +172,10 @@ def zoom_figure(
     from matplotlib.ticker import MaxNLocator
 
     with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 6.0)
-        top, middle, below, bottom = figure.subplots(4, 1, sharex=True, height_ratios=(1.5, 1.5, 1.2, 0.6))
+        heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
+        figure = new_figure(DOUBLE_COLUMN, 1.25 * sum(heights))
+        all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
+        (top, middle, below), bottom = all_axes[:3], all_axes[-1]
         for source in (*reversed(estimates), reference):
             looks = {"color": source.line.colour, "linestyle": source.line.dash, "linewidth": 1.4 if source is reference else 1.0}
             top.plot(time, source.vy, label=source.label, **looks)
@@ -176,9 +184,10 @@ def zoom_figure(
                 error = source.sideslip - reference.sideslip
                 below.plot(time, np.where(np.abs(error) <= error_limit, error, np.nan), **looks)
         below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
-        bottom.plot(time, ay, color="#444444", linewidth=0.8)
+        if ay is not None:
+            bottom.plot(time, ay, color="#444444", linewidth=0.8)
         labels = ("lateral velocity [m/s]", "sideslip [deg]", "sideslip error [deg]", "$a_y$ [m/s²]")
-        for axes, label in zip((top, middle, below, bottom), labels, strict=True):
+        for axes, label in zip(all_axes, labels, strict=False):
             axes.set_ylabel(label)
             axes.margins(x=0.0)
         bottom.set_xlabel(time_label)

@@ -22,8 +22,10 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import About, load_model, read_description
 from vehest.estimators.registry import estimator_module
 from vehest.evaluation.blocks import Segments, segments_of, write_segments
+from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.intervals import figure_intervals
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, reference_state, score_all, sequences
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, sequences
+from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.train import file_digest, learnt_spans, read_fit_metrics, recording_file
@@ -157,7 +159,8 @@ def code_of_evaluation(module: str) -> str:
     Args:
         module: that of the estimator.
     """
-    return code_version([module, "vehest.evaluation.metrics", "vehest.estimators.model_files"], own=[__name__])
+    parts = ("blocks", "floors", "intervals", "metrics", "regimes")
+    return code_version([module, *(f"vehest.evaluation.{part}" for part in parts), "vehest.estimators.model_files"], own=[__name__])
 
 
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
@@ -180,10 +183,14 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         if job.protocol.sequence_seconds is not None:
             figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
-            figures |= {key: fit[key] for key in FIT_FIGURES}
+            figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, job, spans)
             if estimator.causal:
                 figures["step_seconds"] = _step_seconds(estimator, _measured(job, pieces[0]))
         rows += _rows(estimator, about, job, name, spans, figures, figure_intervals(blocks[name]))
+        if name != VALIDATION:
+            masks = [regimes_of(reference, piece, job.protocol) for reference, piece in pieces_of(spans, job.reference, job.protocol)]
+            for regime, own in errors_by_regime(scored, masks, job.protocol.rate_hz).items():
+                rows += _rows(estimator, about, job, name, spans, own, {}, subset=regime)
     rows += _training_rows(estimator, about, job)
     write_segments(folder / BLOCKS, blocks)
     for file, timed in ((METRICS, False), (TIMINGS, True)):
@@ -201,18 +208,34 @@ def _rows(
     spans: Sequence[Span],
     figures: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]],
+    subset: str = "all",
 ) -> list[tuple[Any, ...]]:
-    """Rows of `COLUMNS` for one set of ranges."""
+    """Rows of `COLUMNS` for one set of ranges, or for the samples of it that lie in a regime."""
     trained_on = "+".join(about.datasets)
     datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
     kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
     mode = "causal" if estimator.causal else "offline"
-    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, "all", "nominal", job.protocol.rate_hz, mode)
+    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, subset, "nominal", job.protocol.rate_hz, mode)
     rows = []
     for metric, value in figures.items():
         ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]
         rows.append((*head, about.seed, metric, repr(float(value)), UNITS[metric], *ends))
     return rows
+
+
+def _floors(estimator: Estimator, job: EvaluateJob, spans: Sequence[Span]) -> dict[str, float]:
+    """The noise of the reference, and the bound for the inputs of a causal estimator; nothing where there is none."""
+    drives = drives_of(spans, job.reference, job.protocol)
+    inputs = inputs_of(estimator.channels) if estimator.causal else None
+    floors = {
+        "floor_reference": reference_floor(drives),
+        "floor_cramer_rao": cramer_rao_floor(drives, inputs) if inputs is not None else None,
+    }
+    figures: dict[str, float] = {}
+    for name, floor in floors.items():
+        if floor is not None:
+            figures |= {name: floor.sideslip, f"{name}_vy": floor.vy}
+    return figures
 
 
 def _training_rows(estimator: Estimator, about: About, job: EvaluateJob) -> list[tuple[Any, ...]]:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import difflib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
 
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
+from vehest.data.folds import FoldsFile
 from vehest.data.limits import use_limits
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
@@ -82,6 +83,7 @@ class Part:
         split: conf/split it works on.
         sweeps: overrides of each sweep, several values allowed.
         optional: whether the study goes on without it where its raw files are not here.
+        overrides: of all its jobs, before those of the sweeps.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Part:
     split: str
     sweeps: tuple[tuple[str, ...], ...]
     optional: bool = False
+    overrides: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,13 +172,14 @@ def read_pipeline(name: str) -> Pipeline:
     if form == "split":
         parts = {"": PartFile(described.split, described.sweeps)}
     check_name(described.study, f"'{file}': study")
-    _check_module(described.report, form, file)
+    folded = _check_module(described.report, form, file)
+    made = tuple(_part(own, part, file) for own, part in parts.items())
     return Pipeline(
         study=described.study,
         title=" ".join((described.title or described.study).split()),
         about=" ".join((described.about or "").split()),
         report=described.report,
-        parts=tuple(_part(own, part, file) for own, part in parts.items()),
+        parts=_folds_of(made[0], file) if folded else made,
         evaluation=tuple(f"evaluation.{key}={_as_override(value)}" for key, value in (described.evaluation or {}).items()),
         publish=described.publish,
         file=file,
@@ -243,13 +247,32 @@ def _part(name: str, part: PartFile | None, file: Path) -> Part:
     return Part(name=name, title=title, split=part.split, sweeps=part.sweeps, optional=part.optional)
 
 
-def _check_module(name: str, form: str, file: Path) -> None:
+def _folds_of(part: Part, file: Path) -> tuple[Part, ...]:
+    """A comparison on a split that is cross-validated as parts, a fold each."""
+    folds = compose_config("train", [f"split={part.split}"])["split"].get("folds")
+    number = folds.get("number", FoldsFile.number) if isinstance(folds, dict) else None
+    if not isinstance(number, int) or number < 1:
+        raise ConfigurationError(f"'{file}': its report takes folds; split '{part.split}' says no folds: {{number: 5, of: laps}}")
+    check_jobs(number, f"the folds of '{file.name}' stand")
+    return tuple(
+        replace(part, name=f"fold_{fold + 1}", title=f"fold {fold + 1} of {number}", overrides=(f"++split.fold={fold}",))
+        for fold in range(number)
+    )
+
+
+def _check_module(name: str, form: str, file: Path) -> bool:
+    """Whether a module draws a study of this form; True where it needs a split's folds as parts."""
     if name not in study_names():
         raise ConfigurationError(f"'{file}': there is no study module '{name}'; there are: {', '.join(study_names())}")
     takes = getattr(study_module(name), "TAKES", None)
+    if takes == "folds" and form == "split":
+        return True
     if takes != form:
-        draws = "split and sweeps" if takes == "split" else takes or "something else"
+        draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(
+            str(takes), takes or "something else"
+        )
         raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {draws}")
+    return False
 
 
 def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
@@ -288,7 +311,7 @@ def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str
 
     configs: dict[str, Config] = {}
     for sweep in part.sweeps:
-        for job in expand([f"split={part.split}", *evaluation, *sweep]):
+        for job in expand([f"split={part.split}", *part.overrides, *evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
             shared = tuple(override for override in job if override not in seeds)
             base = config_of(shared)
@@ -356,9 +379,10 @@ def run_pipeline(
         workshop.tags = {"vehest.study": pipeline.study}
         compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
         failed = failed_in(compared.values(), workshop)
-        if failed is not None and (pipeline.in_parts or not any(own.members for own in compared.values())):
+        shows_failed = not pipeline.in_parts or getattr(study_module(pipeline.report), "SHOWS_FAILED", False)
+        if failed is not None and not (shows_failed and any(own.members for own in compared.values())):
             raise failed
-        parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if part.name in compared}
+        parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if _has_members(compared, part)}
     job = ReportJob(
         study=pipeline.study,
         title=pipeline.title,
@@ -400,6 +424,10 @@ def _run_parts(
     if not compared:
         raise MissingError(f"nothing that '{pipeline.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
     return compared, absent
+
+
+def _has_members(compared: Mapping[str, Compared], part: Part) -> bool:
+    return part.name in compared and bool(compared[part.name].members)
 
 
 def datasets_of(pipeline: Pipeline, configs: Configs, workshop: Workshop) -> dict[str, Config]:

@@ -65,17 +65,18 @@ def shown_of_pipeline(title: str, outcome: PipelineOutcome) -> Shown:
         outcome: what it made.
     """
     overview = outcome.overview
+    note = "\n".join(f"left out: {name}: {reason}" for name, reason in outcome.left_out.items())
+    failed = {"failed": dict(outcome.left_out)} if outcome.left_out else {}
     if overview is not None:
         rows = tuple(tuple(_cell(value) for value in row) for row in overview.itertuples(index=False))
         tables = (ShownTable("", tuple(str(name) for name in overview.columns), rows),)
-        return Shown(tables, "", "report.html", json.dumps({"overview": _records(overview)}))
+        return Shown(tables, note, "report.html", json.dumps({"overview": _records(overview)} | failed))
     boards = []
     for test_set, rows_of_set in outcome.leaderboard.groupby("test_set", sort=False):
         given = " (estimates start at the reference state)" if (rows_of_set["start"] == "reference").any() else ""
         board = tuple(_board_row(row) for row in rows_of_set.to_dict("records"))
         boards.append(ShownTable(f"{title}: test set '{test_set}'{given}", BOARD_HEADER, board))
-    note = "\n".join(f"left out: {name}: {reason}" for name, reason in outcome.left_out.items())
-    figures = {"leaderboard": _records(outcome.leaderboard)} | ({"failed": dict(outcome.left_out)} if outcome.left_out else {})
+    figures = {"leaderboard": _records(outcome.leaderboard)} | failed
     return Shown(tuple(boards), note, "report.html", json.dumps(figures))
 
 

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from vehest.data.splits import dataset_names
+from vehest.data.split_files import dataset_names
 from vehest.estimators.registry import estimator_module
 from vehest.sources.base import kind_of, source_module
 from vehest.stages.comparison import resampling_fact, training_facts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vehest.data.recording import Recording
-from vehest.data.splits import TRAINING, VALIDATION, Catalogue, Split, dataset_names, split_from_config
+from vehest.data.split_files import Catalogue, Reader, dataset_names, split_from_config
+from vehest.data.splits import TRAINING, VALIDATION, Split
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import kind_of
@@ -116,7 +116,7 @@ class Workshop:
             plan_ingest(self.dataset_config(name, config))
 
     def _catalogue(self, config: Config) -> Catalogue:
-        def recordings_of(name: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+        def recordings_of(name: str) -> Mapping[str, Reader]:
             ingested = self.ingest(self.dataset_config(name, config))
             return {file.removesuffix(".parquet"): partial(read_recording, ingested.folder / file) for file in ingested.outputs}
 
@@ -305,9 +305,9 @@ class Workshop:
 
 
 def test_figures(evaluation: Artefact) -> dict[str, float]:
-    """Figures of an evaluation, ``<metric>.<test set>`` -> value."""
+    """Figures of an evaluation over all samples, ``<metric>.<test set>`` -> value."""
     table = read_metrics(evaluation.folder)
-    tested = table[~table["test_set"].isin((VALIDATION, TRAINING))]
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all")]
     return {
         f"{metric}.{name}": float(value) for metric, name, value in zip(tested["metric"], tested["test_set"], tested["value"], strict=True)
     }

@@ -19,10 +19,11 @@ from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
-from vehest.report.style import MISSING, REFERENCE, Line, decimals_for, fixed, lines_of
+from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.drives import floors_table, regime_table
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
-from vehest.studies.kit.standing import ranking_of, standing_columns, verdict_sentences
+from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "split"
@@ -31,6 +32,7 @@ MOST_SHOWN = 8
 
 _ACCURACY = ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip")
 _OF_MODEL = ("n_parameters", "epochs")
+_BOUND = "floor_cramer_rao"
 _OTHER_RANGES = (("sideslip", TRAINING), ("sideslip", VALIDATION), ("vy", VALIDATION))
 _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rmse_sideslip_std")
 
@@ -51,7 +53,7 @@ def comparison(artefacts: PartArtefacts) -> Document:
     blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines)
-    blocks += [*_training(artefacts, board, lines), *_how_it_was_made(artefacts, board)]
+    blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
     return Document(artefacts.title, blocks)
@@ -64,7 +66,8 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     data choose nothing. ``rmse_sideslip_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation) are taken
     over all seeds with a finite value; ``_std`` is NaN if there are fewer than two. ``_low`` and ``_high`` are the 95 % interval over
     blocks of the drive and seeds; ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to the lowest error) are
-    corrected by Holm (`ranking_of`). ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
+    corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
+    ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
     initial state over, else ``own``.
     Sideslip in deg, velocities in m/s.
 
@@ -86,6 +89,7 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             row |= standing_columns(ranking, name)
             row |= {f"rmse_{what}_{role}": values_of(runs, name, [seed], role, f"rmse_{what}")[0] for what, role in _OTHER_RANGES}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
+            row[_BOUND] = values_of(runs, name, [seed], test_set, _BOUND)[0]
             rows.append(row)
     board = pd.DataFrame(rows, columns=list(_LEADERBOARD_COLUMNS))
     board["epochs"] = board["epochs"].where(board["epochs"] > 0)
@@ -117,8 +121,12 @@ _LEADERBOARD_COLUMNS = (
     "fvu",
     "p99_sideslip",
     "max_error_sideslip",
+    _BOUND,
     *_OF_MODEL,
 )
+
+
+_BOUND_SENTENCE = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
 
 
 # The leaderboard's parts
@@ -140,7 +148,7 @@ def _headline(artefacts: PartArtefacts) -> list[Block]:
     verdicts = [
         verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
     ]
-    headline = "\n\n".join([_data_sentence(artefacts), *verdicts, _budget_sentence(artefacts)])
+    headline = "\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)])
     warned = warnings_of(artefacts)
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
     blocks.append(headline)
@@ -155,7 +163,8 @@ def _where(artefacts: PartArtefacts, test_set: str) -> str:
     return f"test set `{test_set}` ({kind}; {_spans_in_words(spans)})"
 
 
-def _data_sentence(artefacts: PartArtefacts) -> str:
+def data_sentence(artefacts: PartArtefacts) -> str:
+    """Which data sets the numbers come from, and which of them are real."""
     kinds = {dataset: artefacts.kinds[dataset] for dataset in artefacts.split.datasets}
     titles = {dataset: as_text(artefacts.data_titles.get(dataset, dataset)) for dataset in kinds}
     if len(set(kinds.values())) == 1:
@@ -165,7 +174,8 @@ def _data_sentence(artefacts: PartArtefacts) -> str:
     return f"**Real and simulated data:** {parts}."
 
 
-def _budget_sentence(artefacts: PartArtefacts) -> str:
+def budget_sentence(artefacts: PartArtefacts) -> str:
+    """How many estimators, seeds and epochs stand behind the numbers."""
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
     seeds = f"{counts[0]} {_plural('seed', counts[0])} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
@@ -178,7 +188,8 @@ def _budget_sentence(artefacts: PartArtefacts) -> str:
     return words + "."
 
 
-def _how_it_was_made(artefacts: PartArtefacts, board: pd.DataFrame) -> list[Block]:
+def how_it_was_made(artefacts: PartArtefacts) -> list[Block]:
+    """The appendix: command, protocol, budgets, and the table ``ranges``."""
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
@@ -249,9 +260,14 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     lost = board[~np.isfinite(board["rmse_sideslip"])]
     if len(lost):
         blocks.append(f"No finite error, and so not in the figures: {', '.join(lost['title'])}.")
+    blocks.append(floors_table(artefacts, test_set, f"floors_{file}"))
     finite = board[np.isfinite(board["rmse_sideslip"])]
     if finite.empty:
         return blocks
+    chosen = {(row["estimator"], row["variant"]): (row["title"], row["seed"]) for row in finite.to_dict("records")}
+    by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}")
+    if by_regime is not None:
+        blocks.append(by_regime)
     blocks.append(_spread(artefacts, finite, test_set, f"spread_{file}", lines))
     shown = _shown(finite)
     drive = _Drive.of(artefacts, shown, test_set)
@@ -266,15 +282,13 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
     decimals = decimals_for(frame["rmse_sideslip"].tolist())
-    frame["interval"] = [
-        f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
-        for low, high in zip(frame["rmse_sideslip_low"], frame["rmse_sideslip_high"], strict=True)
-    ]
+    frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     standing = Table(
         name,
         f"Estimators on test set `{test_set}`, of each the seed chosen on validation. Interval: 95 % of RMSE(β) over all seeds, for "
         f"another stretch of such a drive and another training. The difference to the lowest, and whether v = 0 and the static map are "
-        f"beaten: paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v that is left unexplained.",
+        f"beaten: paired over blocks and seeds, corrected by Holm. FVU is the fraction of the variance of v that is left unexplained."
+        f"{_BOUND_SENTENCE if frame[_BOUND].notna().any() else ''}",
         frame,
         {
             "title": Column("estimator"),
@@ -288,6 +302,7 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
             "rmse_sideslip_validation": Column("validation [deg]", decimals=decimals),
             "rmse_vy": Column("RMSE(v) [m/s]"),
             "fvu": Column("FVU"),
+            **({_BOUND: Column("bound [deg]", decimals=decimals)} if frame[_BOUND].notna().any() else {}),
         },
     )
     seeds = Table(
@@ -367,6 +382,11 @@ class _Drive:
         """Which samples are samples, not gaps; shape (K,)."""
         return ~np.isnan(self.reference.vy_ref)
 
+    @property
+    def has_ay(self) -> bool:
+        """Whether lateral acceleration was measured at every scored sample."""
+        return bool(np.isfinite(self.reference.ay[self.scored]).all())
+
 
 def _joined(parts: Sequence[Scored], step: float) -> Scored:
     """Ranges one after another; a single one keeps its times."""
@@ -421,21 +441,27 @@ def _figures_of(drive: _Drive, board: pd.DataFrame, file: str, lines: dict[Name,
         Figure(
             f"zoom_{file}",
             f"The {drive.zoom[1] - drive.zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
-            f"its error (estimate − measured), and the measured lateral acceleration.",
-            figures.zoom_figure(drive.time[inside], drive.reference.ay[inside], zoomed[0], zoomed[1:], drive.time_label),
+            f"its error (estimate − measured){', and the measured lateral acceleration' * drive.has_ay}.",
+            figures.zoom_figure(
+                drive.time[inside], drive.reference.ay[inside] if drive.has_ay else None, zoomed[0], zoomed[1:], drive.time_label
+            ),
         ),
         Figure(
             f"errors_{file}",
             "Distribution of the sideslip error; the few errors beyond the axis are counted in its outermost bins.",
             figures.error_histogram(errors),
         ),
-        Figure(
-            f"errors_over_ay_{file}",
-            f"Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
-            f"{figures.LEAST_SAMPLES} samples show no error.",
-            figures.error_over_ay(drive.reference.ay[scored], errors),
-        ),
+        *([_errors_over_ay(drive, errors, file)] if drive.has_ay else []),
     ]
+
+
+def _errors_over_ay(drive: _Drive, errors: Sequence[figures.Errors], file: str) -> Figure:
+    return Figure(
+        f"errors_over_ay_{file}",
+        f"Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
+        f"{figures.LEAST_SAMPLES} samples show no error.",
+        figures.error_over_ay(drive.reference.ay[drive.scored], errors),
+    )
 
 
 # The training

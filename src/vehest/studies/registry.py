@@ -5,6 +5,7 @@ those that re-create papers come so, from ``vehest_papers``. Such a module has
 
 - ``TAKES``: what its pipelines name, ``split``, ``parts`` or ``datasets``;
 - ``documents(artefacts: StudyArtefacts) -> {name: Document}``, of which one starts with ``report``;
+- ``SHOWS_FAILED = True``, if its report can leave out what failed and say so;
 - ``leaderboard(artefacts: PartArtefacts) -> DataFrame``, if it takes a split, or a table ``overview`` in its report, for the terminal.
 """
 
@@ -18,7 +19,7 @@ from types import ModuleType
 from vehest.data.errors import ConfigurationError
 
 ENTRY_POINTS = "vehest.studies"
-OWN = ("drive", "sweep")
+OWN = ("drive", "folds", "sweep", "transfer")
 
 
 @cache

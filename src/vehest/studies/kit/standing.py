@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
@@ -44,6 +45,12 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
         columns[f"beats_{baseline}"] = _answer(ranking, name, baseline)
     columns["against_best"] = _against_best(ranking, name)
     return columns
+
+
+def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
+    """The interval of a row with `standing_columns`: ``0.31 … 0.38``."""
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    return f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
 
 
 def _answer(ranking: Ranking, name: Name, baseline: str) -> str:

@@ -16,13 +16,15 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name, of_model, runs_of
 
 LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
+CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
+SILENT = 0.7  # bound over the reference itself, above which a drive says less of v than was known before
 DIFFERENT = 1.5  # ratio of the 99th percentiles of test and training, from which on they differ in kind
 
 
 def warnings_of(artefacts: PartArtefacts) -> list[str]:
     """Sentences, each about one test set or one estimator, those first that are left out; none where there is nothing to warn of."""
     left_out = [f"{as_code(name)} is left out: {as_text(reason)}" for name, reason in artefacts.failed.items()]
-    return [*left_out, *_excitation(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
+    return [*left_out, *_excitation(artefacts), *_floors(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
 
 
 def _excitation(artefacts: PartArtefacts) -> list[str]:
@@ -38,6 +40,32 @@ def _excitation(artefacts: PartArtefacts) -> list[str]:
     return found
 
 
+def _floors(artefacts: PartArtefacts) -> list[str]:
+    """Tests whose reference is about as noisy as the lowest error is large, or whose inputs say little of v."""
+    runs, found = runs_of(artefacts), list[str]()
+    for test_set, spans in artefacts.split.tests.items():
+        own = [metrics for (*_, name), metrics in runs.items() if name == test_set]
+        error, noise, bound = (
+            min((metrics[name] for metrics in own if name in metrics), default=math.nan)
+            for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
+        )
+        if error < CLOSE * noise:
+            found.append(
+                f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
+                f"who is first may be the reference's doing."
+            )
+        if math.isnan(bound):
+            continue
+        size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
+        level = float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))  # of a car that rolls backwards too
+        if bound > SILENT * level:
+            found.append(
+                f"Test set `{test_set}` is a silent drive: what the estimators read tells sideslip to no better than {bound:.2g}° "
+                f"(Cramér-Rao), and v = 0 errs by {level:.2g}°; it cannot rank estimators."
+            )
+    return found
+
+
 def _kinds(artefacts: PartArtefacts) -> list[str]:
     """Where a test goes beyond what was learnt from, in lateral acceleration, sideslip or speed."""
     if not artefacts.split.train:
@@ -48,6 +76,8 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
         tested = _reference(artefacts, spans)
         beyond, short = [], []
         for name, word in words.items():
+            if not (name in tested and name in learnt):
+                continue
             own, other = (float(np.quantile(np.abs(part[name]), 0.99)) for part in (tested, learnt))
             if other > 0 and own > DIFFERENT * other:
                 beyond.append(f"{word} ({own / other:.2g} times at the 99th percentile)")
@@ -81,15 +111,18 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
-    """ay [m/s²], sideslip [rad] and vx [m/s] of ranges, end to end, samples without reference left out."""
-    parts: dict[str, list[FloatArray]] = {"ay": [], "sideslip": [], "vx": []}
+    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, samples without reference left out."""
+    parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
             continue
         recording = read_recording(artefacts.references[span.dataset, span.recording])
         own = recording.cut(max(span.start, -math.inf), span.stop)
-        known = np.isfinite(own["vy_ref"]) & np.isfinite(own["ay"]) & np.isfinite(own["vx"])
-        parts["ay"].append(own["ay"][known])
+        if "ay" not in own:
+            parts.pop("ay", None)
+        known = np.logical_and.reduce([np.isfinite(own[name]) for name in ("vy_ref", "vx", *(["ay"] if "ay" in parts else []))])
+        if "ay" in parts:
+            parts["ay"].append(own["ay"][known])
         parts["vx"].append(own["vx"][known])
         parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
     return {name: np.concatenate(values) if values else np.zeros(1) for name, values in parts.items()}

@@ -1,0 +1,132 @@
+"""Channels that show less than their rate promises: low-passed ones and held ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vehest.alignment.delays import LONGEST_UNREPORTED
+from vehest.alignment.findings import Finding
+from vehest.alignment.motion import Motion
+from vehest.alignment.spectra import LONGEST_TIME_CONSTANT, CrossSpectra, Lag, Measured, lag_of
+from vehest.alignment.standstill import standstill
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+
+LEAST_FIT = 0.9  # share of the phase that a low-pass must explain
+SHORTEST_TIME_CONSTANT = 0.1  # s; a shorter one is a delay in the band where cars move
+LONGEST_YAW_RESPONSE = 0.3  # s; of the yaw rate to the steering angle
+FEWEST_CHANGES = 20
+ADJACENT_CHANGES = 0.1  # share of changes that may follow the one before at once
+SINGLE_STEPS = 0.5  # share of changes by one quantum from which on a channel is quantised, not held
+
+
+def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
+    """Channels that follow what they must agree with as a first-order low-pass does: name -> what it was compared with, lag.
+
+    Where ay and yaw rate are held against each other, one that is low-passed makes the other lead; the one whose phase is explained better
+    is named.
+    """
+    lateral = f"d({motion.velocity})/dt"
+    together = {"ay": {"ay": 1.0}, "lateral": {"turning": 1.0, "sliding": 1.0}}
+    sideways = spectra.combined(together) if {"ay", "turning", "sliding"} <= set(spectra.names) else spectra
+    candidates = [
+        ("ax", f"d({motion.speed})/dt", _established(spectra, "forward", "ax")),
+        ("yaw_rate", "yaw_rate_ref", _established(spectra, "yaw_rate_ref", "yaw_rate")),
+        ("yaw_rate", f"(ay - {lateral})/{motion.speed}", _established(spectra, "turn", "turned")),
+        ("ay", f"{motion.speed}·yaw_rate + {lateral}", _established(sideways, "lateral", "ay")),
+    ]
+    found: dict[str, tuple[str, Lag]] = {}
+    for channel, text, lag in candidates:
+        if lag is not None and (channel != "ay" or "yaw_rate" not in found or lag.fit > found["yaw_rate"][1].fit):
+            found.setdefault(channel, (text, lag))
+    return found
+
+
+def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | None:
+    lag = lag_of(spectra, source, follower, low_pass=True)
+    if lag is None or lag.fit < LEAST_FIT or lag.time_constant.value >= LONGEST_TIME_CONSTANT:
+        return None
+    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor knows what comes
+    slow = min(lag.time_constant.low, lag.together.low) > SHORTEST_TIME_CONSTANT
+    return lag if slow and not advanced else None
+
+
+def low_pass_findings(motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]) -> list[Finding]:
+    """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held against."""
+    findings = [
+        Finding(
+            "warning",
+            "bandwidth",
+            channel,
+            f"follows {text} as a first-order low-pass with a time constant of {_seconds(lag.time_constant)} would: "
+            f"transients are gone; an estimator must be trained with it as it is, or do without",
+        )
+        for channel, (text, lag) in slow.items()
+    ]
+    alone = "yaw_rate" in motion and not {"ay", "yaw_rate_ref"} & set(motion.channels)
+    if alone:
+        lag = lag_of(spectra, "steered", "yaw_rate", low_pass=True)
+        if lag is not None and lag.fit > LEAST_FIT and lag.together.low > LONGEST_YAW_RESPONSE:
+            findings.append(
+                Finding(
+                    "warning",
+                    "bandwidth",
+                    "yaw_rate",
+                    f"follows {motion.steering} by {_seconds(lag.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
+                    f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide",
+                )
+            )
+    return findings
+
+
+def _seconds(measured: Measured) -> str:
+    return f"{measured.value:.2g} s (95 %: {max(measured.low, 0.0):.2g} to {measured.high:.2g})"
+
+
+def held_findings(recording: Recording) -> list[Finding]:
+    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate are told of together."""
+    moving = ~standstill(recording)
+    held: dict[str, list[str]] = {}
+    for name, samples in recording.channels.items():
+        rate = held_rate(samples[moving], recording.rate_hz)
+        if rate is not None:
+            held.setdefault(f"{rate:.3g}", []).append(name)
+    findings = []
+    for rate_text, names in held.items():
+        delay = 0.5 / float(rate_text)
+        others = f", and so do {', '.join(names[1:])}" if len(names) > 1 else ""
+        findings.append(
+            Finding(
+                "warning" if delay > LONGEST_UNREPORTED else "note",
+                "held",
+                names[0],
+                f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
+                f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)",
+            )
+        )
+    return findings
+
+
+def held_rate(samples: FloatArray, rate_hz: float) -> float | None:
+    """How often a held channel really changes [1/s]; None if it is not held.
+
+    A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does so too while it moves slowly, but
+    by one quantum at a time.
+
+    Args:
+        samples: of one channel, (T,); a gap ends a hold.
+        rate_hz: sampling rate.
+    """
+    steps = np.diff(samples[np.isfinite(samples)])
+    changes = np.flatnonzero(steps)
+    if len(changes) < FEWEST_CHANGES:
+        return None
+    spacing = np.diff(changes)
+    if np.mean(spacing == 1) > ADJACENT_CHANGES:
+        return None
+    sizes = np.abs(steps[changes])
+    if np.mean(sizes < 1.5 * sizes.min()) > SINGLE_STEPS:
+        return None
+    return float(rate_hz / np.median(spacing))

@@ -1,0 +1,186 @@
+"""Delays between channels that must agree: which is late, by how much, and how surely.
+
+Three accelerations are tied together, ay = vx·yaw_rate + d(vy)/dt, and two by two: ax and d(vx)/dt, a channel and its reference,
+wheels and the speed. A delay is reported where its whole 95 % interval lies beyond 15 ms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vehest.alignment.findings import Finding
+from vehest.alignment.imu import TILT_LAG_GAIN
+from vehest.alignment.lateral import lateral_lateness
+from vehest.alignment.motion import WHEELS, Motion
+from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
+from vehest.constants import FloatArray
+from vehest.data.channels import REFERENCE_SUFFIX
+
+LONGEST_UNREPORTED = 0.015  # s
+LEAST_FIT = 0.97  # share of the phase that a delay must explain
+SLIPPING = frozenset({"vx", "motor_speed", "wheel speeds"})
+"""Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead and never lag."""
+LARGEST_HALF_WIDTH = 0.05  # s; a delay that is known no better is not known
+DELAYED = {"wheel speeds": WHEELS}
+
+
+@dataclass(frozen=True)
+class Delay:
+    """By how much a channel is late against another.
+
+    Args:
+        channel: the one that may be late.
+        against: the other.
+        signals: what was compared, for people.
+        delay: lateness of the channel with its 95 % interval, negative if the other is the late one [s].
+    """
+
+    channel: str
+    against: str
+    signals: str
+    delay: Measured
+
+    @property
+    def established(self) -> bool:
+        """Whether the whole interval lies beyond what is not reported."""
+        return abs(self.delay.value) - self.delay.half_width > LONGEST_UNREPORTED
+
+    @property
+    def on_time(self) -> bool:
+        """Whether the whole interval lies within it."""
+        return abs(self.delay.value) + self.delay.half_width < LONGEST_UNREPORTED
+
+    @property
+    def turned(self) -> Delay:
+        """The same seen from the other channel."""
+        return Delay(self.against, self.channel, self.signals, Measured(-self.delay.value, self.delay.half_width))
+
+
+def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
+    """All signals that delays and low-passes are found from, under names of their own."""
+    signals: dict[str, FloatArray] = {}
+    if motion.speed and {"ay", "yaw_rate"} <= set(motion.channels):
+        signals |= {"ay": motion["ay"], "turning": motion.turning}
+        if motion.velocity:
+            signals["sliding"] = motion.sliding
+            steady = motion.vx / (np.square(motion.vx) + np.square(0.3 * np.sqrt(np.mean(np.square(motion.vx)))) + np.finfo(float).tiny)
+            signals |= {"turned": motion.turning * steady, "turn": (motion["ay"] - motion.sliding) * steady}
+    if motion.speed and "ax" in motion:
+        signals |= {"ax": motion["ax"], "forward": motion.forward}
+    for name in ("vx", "vx_ref"):
+        if name in motion:
+            signals[f"d({name})"] = motion.derivative(motion[name])
+    if "motor_speed" in motion:
+        signals["d(motor_speed)"] = motion.derivative(motion["motor_speed"])
+    if set(WHEELS) <= set(motion.channels):
+        signals["d(wheel speeds)"] = motion.derivative(motion.wheels)
+    for name in ("yaw_rate", "yaw_rate_ref"):
+        if name in motion:
+            signals[name] = motion[name]
+    if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
+        signals |= {"sideslip_ref": motion["sideslip_ref"], "slip of vy_ref": np.arctan2(motion.vy, motion.vx)}
+    if motion.speed and motion.steering:
+        signals["steered"] = motion.vx * motion[motion.steering]
+    return {name: samples for name, samples in signals.items() if 0.0 < np.ptp(samples) < np.inf}
+
+
+def spectra_of(motion: Motion) -> CrossSpectra | None:
+    """Their cross-spectra; None for a drive that is too short."""
+    signals = signals_to_compare(motion)
+    return cross_spectra(signals, motion.rate_hz, motion.moving) if signals else None
+
+
+def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()) -> list[Delay]:
+    """Every delay that the drive shows, established or not.
+
+    Args:
+        motion: the drive.
+        spectra: of its signals.
+        slow: channels that are low-passed; a delay says nothing of those.
+    """
+    found: list[Delay] = []
+    if not slow & {"ay", "yaw_rate"}:
+        found += _lateral(motion)
+    found += _pair(spectra, "forward", "ax", (motion.speed, "ax"), f"ax and d({motion.speed})/dt", tilted=True)
+    found += _pair(spectra, "yaw_rate_ref", "yaw_rate", ("yaw_rate_ref", "yaw_rate"), "both")
+    found += _pair(spectra, "d(vx_ref)", "d(vx)", ("vx_ref", "vx"), "both")
+    for name in ("motor_speed", "wheel speeds"):
+        found += _pair(spectra, f"d({motion.speed})", f"d({name})", (motion.speed, name), "both")
+    found += _pair(spectra, "slip of vy_ref", "sideslip_ref", ("vy_ref", "sideslip_ref"), f"sideslip_ref and atan2(vy_ref, {motion.speed})")
+    return [delay for delay in found if not {delay.channel, delay.against} & slow]
+
+
+def _lateral(motion: Motion) -> list[Delay]:
+    """Between ay, yaw rate and lateral velocity."""
+    lateness = lateral_lateness(motion)
+    if lateness is None or not all(_sound(measured) for measured in lateness):
+        return []
+    turning, sliding, difference = lateness
+    signals = f"ay, vx·yaw_rate and d({motion.velocity})/dt"
+    return [
+        Delay("yaw_rate", "ay", signals, turning.widened(TILT_LAG_GAIN)),
+        Delay(motion.velocity, "ay", signals, sliding.widened(TILT_LAG_GAIN)),
+        Delay("yaw_rate", motion.velocity, signals, difference),
+    ]
+
+
+def _pair(
+    spectra: CrossSpectra, source: str, follower: str, channels: tuple[str, str], signals: str, *, tilted: bool = False
+) -> list[Delay]:
+    if not {source, follower} <= set(spectra.names):
+        return []
+    lag = lag_of(spectra, source, follower, low_pass=False)
+    if lag is None or lag.fit < LEAST_FIT or not _sound(lag.delay):
+        return []
+    delay = lag.delay.widened(TILT_LAG_GAIN) if tilted else lag.delay
+    return [Delay(channels[1], channels[0], signals, delay)]
+
+
+def _sound(delay: Measured) -> bool:
+    return delay.half_width <= LARGEST_HALF_WIDTH and abs(delay.value) < LARGEST_LAG
+
+
+def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
+    """A warning for every channel that is later than another; what lags is taken to be late, not the other early.
+
+    The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
+    """
+    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in delays if delay.established]
+    late = [delay for delay in late if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")]
+    punctual = {delay.channel for delay in delays if delay.on_time and delay.against.endswith(REFERENCE_SUFFIX)}
+    late = [delay for delay in late if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))]
+    findings = []
+    for channel in dict.fromkeys(delay.channel for delay in late):
+        own = [delay for delay in late if delay.channel == channel]
+        signals = [text for text in dict.fromkeys(delay.signals for delay in own) if text != "both"]
+        figures = " and ".join(f"{_milliseconds(delay.delay)} behind {delay.against}" for delay in own)
+        names = DELAYED.get(channel, (channel,))
+        longest = max(delay.delay.value for delay in own)
+        findings.append(
+            Finding(
+                "warning",
+                "delay",
+                names[0],
+                f"is late{' with the other wheels' if len(names) > 1 else ''}, {figures}{f', from {_listed(signals)}' if signals else ''}"
+                f"{_doubt(own)}; {{name: delay_correction, delay: {longest:.3f}, channels: [{', '.join(names)}]}} takes it off",
+            )
+        )
+    return findings
+
+
+def _doubt(own: Sequence[Delay]) -> str:
+    """What else could be meant."""
+    if [delay.against for delay in own] == ["vx"]:
+        return "; or vx comes from wheels, whose slip makes it lead"
+    return ""
+
+
+def _listed(texts: Sequence[str]) -> str:
+    return "; ".join(texts)
+
+
+def _milliseconds(measured: Measured) -> str:
+    return f"{1e3 * measured.value:.0f} ms (95 %: {1e3 * measured.low:.0f} to {1e3 * measured.high:.0f})"

@@ -1,0 +1,25 @@
+"""What a check found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Level = Literal["error", "warning", "note"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a check found.
+
+    Args:
+        level: ``error`` stops an ingest, ``warning`` needs a look, ``note`` is information.
+        check: name of the check.
+        channel: the channel concerned, empty if it is not about one or if the data do not decide which.
+        message: what was found, where, and what to do.
+    """
+
+    level: Level
+    check: str
+    channel: str
+    message: str

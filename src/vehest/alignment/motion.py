@@ -1,0 +1,120 @@
+"""Signals of a recording that planar motion ties together, made ready for comparing them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vehest.alignment.standstill import BoolArray, standstill
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.recording import Recording
+
+LARGEST_EXCESS = 100.0  # times what a vehicle can do; beyond lies no wrong unit
+MOST_MISSING = 0.05  # of the samples of a channel, which a line then bridges
+WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Complete channels of a drive, and what of the motion is made of them.
+
+    Args:
+        rate_hz: sampling rate.
+        channels: name -> samples without gaps, (T,).
+        speed: the channel that gives the forward velocity: the reference's own before one that wheels slip; empty if there is none.
+        velocity: the channel that gives the lateral velocity; empty if there is none.
+        moving: where the car does not stand, (T,).
+    """
+
+    rate_hz: float
+    channels: dict[str, FloatArray]
+    speed: str
+    velocity: str
+    moving: BoolArray
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.channels
+
+    def __getitem__(self, name: str) -> FloatArray:
+        return self.channels[name]
+
+    def __len__(self) -> int:
+        return len(self.moving)
+
+    @property
+    def steering(self) -> str:
+        """The channel that tells where the driver steers; empty if there is none."""
+        return next((name for name in ("steer", "handwheel") if name in self), "")
+
+    @property
+    def vx(self) -> FloatArray:
+        """Forward velocity [m/s], (T,)."""
+        return self[self.speed]
+
+    @property
+    def vy(self) -> FloatArray:
+        """Lateral velocity of the reference [m/s], (T,)."""
+        if self.velocity == "sideslip_ref":
+            return self.vx * np.tan(np.clip(self["sideslip_ref"], -1.5, 1.5))
+        return self[self.velocity]
+
+    @property
+    def turning(self) -> FloatArray:
+        """vx·yaw_rate [m/s²], (T,)."""
+        return self.vx * self["yaw_rate"]
+
+    @property
+    def sliding(self) -> FloatArray:
+        """d(vy)/dt [m/s²], (T,)."""
+        return self.derivative(self.vy)
+
+    @property
+    def forward(self) -> FloatArray:
+        """What ``ax`` must be: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
+        gained = self.derivative(self.vx)
+        return gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
+
+    @property
+    def wheels(self) -> FloatArray:
+        """Mean of the four wheel speeds [rad/s], (T,)."""
+        return np.asarray(np.mean([self[name] for name in WHEELS], axis=0), dtype=np.float64)
+
+    def derivative(self, samples: FloatArray) -> FloatArray:
+        """By time, with central differences, which delay nothing."""
+        return np.asarray(np.gradient(samples) * self.rate_hz, dtype=np.float64) if len(samples) > 1 else np.zeros(len(samples))
+
+    def slower(self, factor: int) -> Motion:
+        """Means of so many samples each, at a rate that is so many times slower."""
+        if factor == 1:
+            return self
+        count = len(self) // factor
+        channels = {name: samples[: count * factor].reshape(count, factor).mean(axis=1) for name, samples in self.channels.items()}
+        moving = np.asarray(self.moving[: count * factor].reshape(count, factor).all(axis=1), dtype=bool)
+        return replace(self, rate_hz=self.rate_hz / factor, channels=channels, moving=moving)
+
+    def corrected(self, factors: dict[str, float]) -> Motion:
+        """The same with some channels multiplied by factors."""
+        return replace(self, channels={name: samples * factors.get(name, 1.0) for name, samples in self.channels.items()})
+
+
+def motion_of(recording: Recording) -> Motion:
+    """What can be compared: channels that are complete, or nearly, and that no wrong unit alone would bring where they are."""
+    channels = {name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None}
+    speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
+    velocity = next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""
+    return Motion(recording.rate_hz, channels, speed, velocity, ~standstill(recording))
+
+
+def _whole(recording: Recording, name: str) -> FloatArray | None:
+    samples = recording[name]
+    described = CHANNELS[name]
+    unknown = np.isnan(samples) if name in recording.gappy else None
+    if unknown is not None and unknown.any():
+        if unknown.mean() > MOST_MISSING:
+            return None
+        places = np.arange(len(samples))
+        samples = np.interp(places, places[~unknown], samples[~unknown])
+    bound = LARGEST_EXCESS * max(abs(described.low), abs(described.high))
+    return None if np.abs(samples).max() > bound else samples

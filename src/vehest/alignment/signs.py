@@ -1,0 +1,326 @@
+"""Signs and units: which products of channels contradict each other, and which channel that speaks against."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from vehest.alignment.findings import Finding, Level
+from vehest.alignment.motion import Motion
+from vehest.alignment.standstill import BoolArray
+from vehest.constants import GRAVITY, FloatArray
+
+KINEMATIC_BAND_HZ = (0.1, 2.0)
+FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording
+FEWEST_SAMPLES = 100
+LEAST_SECONDS = 10.0  # of filtered samples
+STEADY_CORRELATION = 0.7
+SIGN_CORRELATION = 0.3  # of what hangs on derivatives
+SCALE_CORRELATION = 0.8
+SAME_CORRELATION = 0.95  # of one quantity measured twice; a driven wheel that spins is no wrong unit
+LEAST_ACCELERATION = 0.2  # m/s², standard deviation
+LEAST_SLIDING = 1e-3  # m/s²
+LEAST_SIDESLIP = 1e-3  # rad
+DRIFTING = 0.2  # rad of sideslip, beyond which drivers steer against the turn
+STEERED_SECONDS = 5.0
+MOST_TURNED = 4  # channels at a time
+KILOMETRES_AN_HOUR = 3.6
+DEGREES_PER_RADIAN = 180.0 / np.pi
+TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
+LONGITUDINAL_TOLERANCE = 3.0  # of ax, which pitch, grade and slip change; its wrong factor is 9.8
+EXACTNESS = 1.25  # within which a wrong factor must explain a scale
+WRONG_FACTORS = {
+    "vx": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
+    "vx_ref": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
+    "vy_ref": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
+    "ax": ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g")),
+    "ay": ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g")),
+    "yaw_rate": ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s")),
+    "yaw_rate_ref": ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s")),
+    "sideslip_ref": ((DEGREES_PER_RADIAN, "deg"), (1.0 / DEGREES_PER_RADIAN, "rad taken for deg")),
+}
+UNSAFE = {"yaw_rate": "deg/s", "sideslip_ref": "deg"}
+"""Units that stop an ingest: no estimator survives them."""
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Two quantities that must be equal, or at least of one sign.
+
+    Args:
+        left: what is compared, as in a sentence.
+        right: what it must be.
+        channels: those of the two that a fault may sit in, the likeliest first.
+        powers: of each channel in left over right, 1 or -1.
+        scale: left over right.
+        correlation: between them.
+        tolerance: factor within which they must be equal; infinite where only the sign counts.
+        least_correlation: below which the scale says nothing.
+    """
+
+    left: str
+    right: str
+    channels: tuple[str, ...]
+    powers: tuple[int, ...]
+    scale: float
+    correlation: float
+    tolerance: float = TOLERANCE
+    least_correlation: float = SCALE_CORRELATION
+
+    @property
+    def text(self) -> str:
+        """The relation as a subject."""
+        return f"{self.left} and {self.right}"
+
+    def holds(self, scale: float) -> bool:
+        """Whether left over right could be such."""
+        return abs(self.correlation) < self.least_correlation or 1.0 / self.tolerance < abs(scale) < self.tolerance
+
+    def without(self, channel: str, factor: float) -> float:
+        """What left over right would be were a channel not that factor too large."""
+        power = dict(zip(self.channels, self.powers, strict=True)).get(channel, 0)
+        return float(self.scale / factor**power)
+
+
+def relations_of(motion: Motion) -> list[Relation]:
+    """All relations between the channels that the drive shows clearly."""
+    found: list[Relation] = []
+    band = _band(motion)
+    if motion.speed and "yaw_rate" in motion and "ay" in motion:
+        found += _lateral(motion, band)
+    if motion.speed and "yaw_rate" in motion and motion.steering:
+        found += _steered(motion)
+    if motion.speed and "ax" in motion and band is not None:
+        found += _filtered(band, motion["ax"], motion.forward, "ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1))
+    for name in ("yaw_rate", "vx"):
+        reference = f"{name}_ref"
+        if name in motion and reference in motion:
+            found += _direct(motion, motion[name], motion[reference], name, reference, (name, reference), (1, -1))
+    if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
+        expected = np.arctan2(motion.vy, motion.vx)
+        if np.std(expected[motion.moving]) >= LEAST_SIDESLIP:
+            names = ("sideslip_ref", "vy_ref", motion.speed)
+            right = f"atan2(vy_ref, {motion.speed})"
+            found += _direct(motion, motion["sideslip_ref"], expected, "sideslip_ref", right, names, (1, -1, 1))
+    return [relation for relation in found if np.isfinite(relation.scale) and np.isfinite(relation.correlation) and relation.scale != 0.0]
+
+
+def _lateral(motion: Motion, band: _Band | None) -> list[Relation]:
+    """ay against vx·yaw_rate as it is, and d(vy)/dt against what remains of both without vx·yaw_rate and its derivative.
+
+    The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass for one of the other sign.
+    """
+    moving = motion.moving
+    measured, turning = motion["ay"], motion.turning
+    product = f"{motion.speed}·yaw_rate"
+    if np.count_nonzero(moving) < FEWEST_SAMPLES or measured.std() < LEAST_ACCELERATION:
+        return []
+    found = []
+    steady = _compared(measured[moving] - measured[moving].mean(), turning[moving] - turning[moving].mean())
+    if steady is not None and abs(steady[1]) >= STEADY_CORRELATION:
+        found.append(Relation("ay", product, ("ay", "yaw_rate", motion.speed), (1, -1, -1), *steady))
+    if not motion.velocity or band is None:
+        return found
+    a, p, d, steep = (band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning)))
+    if d.std() < LEAST_SLIDING or p.std() == 0.0:
+        return found
+    explained, _ = np.linalg.qr(np.stack([p, steep / motion.rate_hz], axis=1))
+    left, right = (samples - explained @ (explained.T @ samples) for samples in (a, d))
+    partial = _compared(right, left)
+    if partial is not None and abs(partial[1]) >= SIGN_CORRELATION:
+        powers = (1, -1, 1) if motion.velocity == "sideslip_ref" else (1, -1)
+        channels = (motion.velocity, "ay", motion.speed)[: len(powers)]
+        found.append(Relation(f"d({motion.velocity})/dt", f"ay - {product}", channels, powers, *partial))
+    return found
+
+
+def _steered(motion: Motion) -> list[Relation]:
+    """Steering against yaw rate: of one sign while the car does not drift."""
+    rolling = motion.moving.copy()
+    if motion.velocity:
+        rolling &= np.abs(motion.vy) < DRIFTING * np.abs(motion.vx)
+    if np.count_nonzero(rolling) < max(STEERED_SECONDS * motion.rate_hz, FEWEST_SAMPLES):
+        return []
+    steering = motion.vx * motion[motion.steering]
+    left, right = steering[rolling], motion["yaw_rate"][rolling]
+    compared = _compared(left - left.mean(), right - right.mean())
+    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
+        return []
+    names = (motion.steering, "yaw_rate", motion.speed)
+    return [Relation(motion.steering, "yaw_rate", names, (1, -1, 1), *compared, tolerance=np.inf)]
+
+
+def _filtered(
+    band: _Band, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
+) -> list[Relation]:
+    compared = _compared(band(left), band(right))
+    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
+        return []
+    return [Relation(name, other, channels, powers, *compared, tolerance=LONGITUDINAL_TOLERANCE)]
+
+
+def _direct(
+    motion: Motion, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
+) -> list[Relation]:
+    moving = motion.moving
+    if np.count_nonzero(moving) < FEWEST_SAMPLES:
+        return []
+    compared = _compared(left[moving], right[moving])
+    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
+        return []
+    return [Relation(name, other, channels, powers, *compared, least_correlation=SAME_CORRELATION)]
+
+
+def _compared(left: FloatArray, right: FloatArray) -> tuple[float, float] | None:
+    """Ratio of the sizes of two signals with their sign, and their correlation about nil."""
+    sizes = float(np.sqrt(np.mean(np.square(left)))), float(np.sqrt(np.mean(np.square(right))))
+    if not 0.0 < min(sizes) <= max(sizes) < np.inf:
+        return None
+    correlation = float(np.mean(left / sizes[0] * (right / sizes[1])))
+    return float(np.copysign(sizes[0] / sizes[1], correlation)), correlation
+
+
+_Band = Callable[[FloatArray], FloatArray]
+
+
+def _band(motion: Motion) -> _Band | None:
+    """The band-pass of all comparisons with a derivative, which keeps moving samples away from the ends; None for a short drive."""
+    settled = settled_samples(motion)
+    if settled is None:
+        return None
+    design = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=motion.rate_hz, output="sos")
+
+    def band(samples: FloatArray) -> FloatArray:
+        return np.asarray(signal.sosfiltfilt(design, samples)[settled], dtype=np.float64)
+
+    return band
+
+
+def settled_samples(motion: Motion) -> BoolArray | None:
+    """Where a band-pass has forgotten the ends and the car moves; None if that is too little, or the rate too low."""
+    if motion.rate_hz <= 2.5 * KINEMATIC_BAND_HZ[1]:
+        return None
+    settled = motion.moving.copy()
+    margin = round(FILTER_END_SECONDS * motion.rate_hz)
+    settled[:margin] = settled[max(len(settled) - margin, 0) :] = False
+    return settled if np.count_nonzero(settled) >= LEAST_SECONDS * motion.rate_hz else None
+
+
+# --- signs -------------------------------------------------------------------------------------------------------------------------
+
+
+def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple[str, ...]]:
+    """Sets of channels whose reversal would make all relations agree, the smallest first; none if all agree or nothing explains it.
+
+    The lateral velocity and the sideslip angle come from one sensor: reversed together they count once. A forward speed is only
+    suspected where it is negative, which the check ``reverse`` speaks of.
+    """
+    if all(relation.correlation > 0.0 for relation in relations):
+        return []
+    suspects = sorted({name for relation in relations for name in relation.channels if name != motion.speed or motion.vx.mean() < 0.0})
+    explaining: list[tuple[int, tuple[str, ...]]] = []
+    for number in range(1, MOST_TURNED + 1):
+        for turned in itertools.combinations(suspects, number):
+            if all((len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0) for relation in relations):
+                explaining.append((number - ({"vy_ref", "sideslip_ref"} <= set(turned)), turned))
+    explaining.sort()
+    return [turned for cost, turned in explaining if cost <= explaining[0][0] + 1]
+
+
+def sign_findings(relations: Sequence[Relation], motion: Motion) -> list[Finding]:
+    """What contradicts what, and the channel that points the other way where steering or heading decides."""
+    against = [relation for relation in relations if relation.correlation < 0.0]
+    if not against:
+        return []
+    agreeing = [relation.text for relation in relations if relation.correlation > 0.0]
+    figures = ", ".join(f"{relation.text} disagree in sign (correlation {relation.correlation:.2f})" for relation in against)
+    evidence = figures + (f"; {_listed(agreeing)} agree" if agreeing else "")
+    explanations = turned_channels(relations, motion)
+    if not explanations:
+        return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
+    best, others = explanations[0], explanations[1:]
+    if _decided(relations, explanations):
+        alternative = f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
+        advice = f"{_listed(best)} {'points' if len(best) == 1 else 'point'} the other way{alternative}; set sign: -1 for it"
+        return [Finding("warning", "sign", name, f"{evidence}: {advice}") for name in best]
+    either = " or ".join(_together(names) for names in explanations)
+    advice = f"either {either} point the other way, which a steering angle or yaw_rate_ref would decide; set sign: -1 for it"
+    return [Finding("warning", "sign", "", f"{evidence}: {advice}")]
+
+
+def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
+    """One explanation is the smallest, and the next needs two more channels, or steering or heading was asked."""
+    sizes = [len(names) - ({"vy_ref", "sideslip_ref"} <= set(names)) for names in explanations]
+    if len(sizes) == 1:
+        return True
+    heading = any(set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations)
+    return sizes[1] > sizes[0] and heading
+
+
+# --- units -------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class WrongUnit:
+    """A factor by which channels disagree.
+
+    Args:
+        relations: that are wrong by it.
+        explanations: channel, factor and unit that would explain it equally well; empty if nothing that is known does.
+    """
+
+    relations: tuple[Relation, ...]
+    explanations: tuple[tuple[str, float, str], ...]
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """What puts the first explanation right."""
+        return {name: 1.0 / factor for name, factor, _ in self.explanations[:1]}
+
+    @property
+    def finding(self) -> Finding:
+        """What to say of it."""
+        figures = ", ".join(
+            f"{relation.left} is {relation.scale:.3g} times as large as {relation.right} (correlation {relation.correlation:.2f})"
+            for relation in self.relations
+        )
+        if len(self.explanations) == 1:
+            name, _, unit = self.explanations[0]
+            level: Level = "error" if UNSAFE.get(name) == unit else "warning"
+            return Finding(level, "unit", name, f"{figures}: {name} is in {unit}; set its unit")
+        if self.explanations:
+            either = " or ".join(f"{name} is in {unit}" for name, _, unit in self.explanations)
+            return Finding("warning", "unit", self.explanations[0][0], f"{figures}: either {either}; set the unit")
+        names = list(dict.fromkeys(name for relation in self.relations for name in relation.channels))
+        return Finding("warning", "unit", names[0], f"{figures}, about 1 is expected: check the units of {_listed(names)}")
+
+
+def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
+    """The wrong unit that explains most of the scales that are wrong and breaks none that is right; None if all are right."""
+    wrong = [relation for relation in relations if not relation.holds(relation.scale)]
+    if not wrong:
+        return None
+    explained: dict[tuple[str, float, str], list[Relation]] = {}
+    for name, factors in WRONG_FACTORS.items():
+        for factor, unit in factors:
+            put_right = [relation for relation in wrong if 1.0 / EXACTNESS < abs(relation.without(name, factor)) < EXACTNESS]
+            broken = [one for one in relations if one not in wrong and not one.holds(one.without(name, factor))]
+            if put_right and not broken:
+                explained[name, factor, unit] = put_right
+    if not explained:
+        return WrongUnit(tuple(wrong), ())
+    most = max(len(put_right) for put_right in explained.values())
+    best = tuple(key for key, put_right in explained.items() if len(put_right) == most)
+    return WrongUnit(tuple(explained[best[0]]), best)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _together(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{_listed(names)} together"

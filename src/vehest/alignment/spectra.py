@@ -1,0 +1,261 @@
+"""Cross-spectra of signals over segments of a drive, and lags from their phase."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from vehest.alignment.standstill import BoolArray
+from vehest.constants import FloatArray
+
+ComplexArray = NDArray[np.complex128]
+
+BAND_HZ = (0.1, 3.0)  # where cars move and references can be differentiated
+SEGMENT_SECONDS = (4.0, 16.0)
+SEGMENTS_IN_A_DRIVE = 8.0  # without overlap, of a short one
+SHORTEST_DRIVE = 16.0  # s
+LOWEST_RATE = 5.0  # Hz
+FEWEST_BINS = 4
+FEWEST_SEGMENTS = 6
+SAMPLES_A_PERIOD = 5.0  # at least
+RATE_KEPT = 30.0  # Hz; a faster recording is averaged down to at least this
+MOST_GROUPS = 12
+SMOOTHED_BINS = 5
+LARGEST_COHERENCE = 0.99
+LEAST_POWER = 1e-6  # of the strongest bin; below a window leaks more than that
+LEAST_COHERENCE = 0.25  # mean over the band; below nothing is said of a lag
+LARGEST_LAG = 0.5  # s
+LONGEST_TIME_CONSTANT = 10.0  # s
+N_STEPS = 25
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class CrossSpectra:
+    """Cross-spectra of N signals in F bins of the band, in G groups of segments that follow one another.
+
+    Args:
+        names: of the signals.
+        frequency: of the bins [Hz], (F,).
+        groups: sums of conj(X_i)·X_j over the segments of a group, (G, F, N, N).
+    """
+
+    names: tuple[str, ...]
+    frequency: FloatArray
+    groups: ComplexArray
+
+    @property
+    def omega(self) -> FloatArray:
+        """Angular frequency [rad/s], (F,)."""
+        return 2.0 * math.pi * self.frequency
+
+    @property
+    def whole(self) -> ComplexArray:
+        """Sum over the groups, (F, N, N)."""
+        return np.asarray(self.groups.sum(axis=0), dtype=np.complex128)
+
+    def combined(self, combinations: Mapping[str, Mapping[str, float]]) -> CrossSpectra:
+        """Spectra of sums of the signals: name -> signal -> factor."""
+        rows = np.array([[factors.get(name, 0.0) for name in self.names] for factors in combinations.values()])
+        return CrossSpectra(tuple(combinations), self.frequency, np.asarray(rows @ self.groups @ rows.T, dtype=np.complex128))
+
+
+def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None) -> CrossSpectra | None:
+    """Welch's cross-spectra in the band, from segments under a Hann window that overlap by half.
+
+    Args:
+        signals: name -> samples without gaps, (T,) each.
+        rate_hz: sampling rate.
+        used: samples that a segment may hold, (T,); all if not given.
+
+    Returns:
+        None where the recording is too short or sampled too slowly to say anything.
+    """
+    duration = len(next(iter(signals.values()), ())) / rate_hz
+    if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
+        return None
+    factor = max(math.floor(rate_hz / RATE_KEPT), 1)
+    rate = rate_hz / factor
+    seconds = min(max(duration / SEGMENTS_IN_A_DRIVE, SEGMENT_SECONDS[0]), SEGMENT_SECONDS[1])
+    length = round(seconds * rate)
+    frequency = np.fft.rfftfreq(length, 1.0 / rate)
+    inside = (frequency >= max(BAND_HZ[0], 1.5 / seconds)) & (frequency <= min(BAND_HZ[1], rate / SAMPLES_A_PERIOD))
+    if np.count_nonzero(inside) < FEWEST_BINS:
+        return None
+    window = np.hanning(length + 1)[:-1]
+    whole = None
+    if used is not None and not used.all():
+        whole = _pieces(used.astype(np.float64), factor, length).min(axis=1) == 1.0
+        if np.count_nonzero(whole) < FEWEST_SEGMENTS:
+            return None
+    parts = []
+    for samples in signals.values():
+        pieces = _pieces(samples, factor, length)
+        pieces = pieces if whole is None else pieces[whole]
+        level = pieces.mean(axis=1, keepdims=True)
+        parts.append(np.fft.rfft((pieces - level) * window, axis=1)[:, inside])
+    spectrum = np.stack(parts, axis=-1)  # (segments, F, N)
+    edges = np.linspace(0, len(spectrum), min(MOST_GROUPS, len(spectrum)) + 1).astype(int)
+    groups = [_outer(spectrum[first:last]) for first, last in itertools.pairwise(edges)]
+    return CrossSpectra(tuple(signals), np.asarray(frequency[inside], dtype=np.float64), np.stack(groups))
+
+
+def _pieces(samples: FloatArray, factor: int, length: int) -> FloatArray:
+    """Segments of the averaged samples, (segments, length)."""
+    slower = samples[: len(samples) // factor * factor].reshape(-1, factor).mean(axis=1)
+    return np.lib.stride_tricks.sliding_window_view(slower, length)[:: max(length // 2, 1)]
+
+
+def _outer(spectrum: ComplexArray) -> ComplexArray:
+    across = spectrum.transpose(1, 2, 0)  # (F, N, segments)
+    return np.asarray(across.conj() @ across.transpose(0, 2, 1), dtype=np.complex128)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A quantity with the half width of its 95 % interval."""
+
+    value: float
+    half_width: float
+
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.value - self.half_width
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.value + self.half_width
+
+    def widened(self, deviation: float) -> Measured:
+        """With another, systematic standard uncertainty in it."""
+        return Measured(self.value, math.hypot(self.half_width, student(math.inf) * deviation))
+
+
+def jackknife(spectra: CrossSpectra, fit: Callable[[ComplexArray], FloatArray]) -> list[Measured]:
+    """Values of a fit, with intervals from leaving out one group of segments after another (Student's).
+
+    Args:
+        spectra: of G groups.
+        fit: of cross-spectra (F, N, N) to P values.
+    """
+    whole = spectra.whole
+    values = fit(whole)
+    number = len(spectra.groups)
+    left_out = np.stack([fit(whole - group) for group in spectra.groups])
+    spread = np.sqrt((number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0))
+    factor = student(number - 1)
+    return [Measured(value, factor * width) for value, width in zip(values.tolist(), spread.tolist(), strict=True)]
+
+
+def student(freedom: float) -> float:
+    """Half width of the 95 % interval in standard deviations."""
+    return float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom))
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How one signal follows another: a delay and a first-order low-pass, of which either may be held at nil.
+
+    Args:
+        delay: [s].
+        time_constant: [s].
+        together: their sum, which is the delay of slow motion [s].
+        fit: how well the phase is explained, 1 if wholly.
+        coherence: mean over the band.
+    """
+
+    delay: Measured
+    time_constant: Measured
+    together: Measured
+    fit: float
+    coherence: float
+
+
+def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool) -> Lag | None:
+    """The lag of a signal behind another from the phase of their cross-spectrum, -ωτ - atan(ωT).
+
+    The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not the mean phase. Each bin has the
+    weight of maximum likelihood, coherence² / (1 - coherence²) (Hannan & Thomson, Biometrika 60 (3), 1973).
+
+    Args:
+        spectra: of both signals.
+        source: what is followed.
+        follower: what may be late.
+        low_pass: whether T is fitted too.
+
+    Returns:
+        None where one is missing, or the two are hardly coherent.
+    """
+    if not {source, follower} <= set(spectra.names):
+        return None
+    x, y = spectra.names.index(source), spectra.names.index(follower)
+    whole = spectra.whole
+    across = smoothed(whole[:, x, y].real) + 1j * smoothed(whole[:, x, y].imag)
+    power = smoothed(whole[:, x, x].real) * smoothed(whole[:, y, y].real)
+    if not (power > 0.0).all() or not np.isfinite(power).all():
+        return None
+    coherence = np.minimum(np.square(np.abs(across)) / power, LARGEST_COHERENCE)
+    coherence[power < LEAST_POWER**2 * power.max()] = 0.0
+    if coherence.mean() < LEAST_COHERENCE:
+        return None
+    weight = coherence / (1.0 - coherence) / np.maximum(np.abs(across), np.finfo(float).tiny)
+    omega = spectra.omega
+    start = _coarse(weight * whole[:, x, y], omega, low_pass=low_pass)
+
+    def fitted(cross_spectra: ComplexArray) -> FloatArray:
+        delay, time_constant = _refined(weight * cross_spectra[:, x, y], omega, start, low_pass=low_pass)
+        return np.array([delay, time_constant, delay + time_constant])
+
+    delay, time_constant, together = jackknife(spectra, fitted)
+    phase = omega * delay.value + np.arctan(omega * time_constant.value)
+    explained = np.sum(weight * (whole[:, x, y] * np.exp(1j * phase)).real) / np.sum(weight * np.abs(whole[:, x, y]))
+    return Lag(delay, time_constant, together, float(explained), float(coherence.mean()))
+
+
+def smoothed(values: FloatArray) -> FloatArray:
+    """Running mean over the bins, (F,)."""
+    reach = SMOOTHED_BINS // 2
+    return np.convolve(np.pad(values, reach, mode="edge"), np.full(SMOOTHED_BINS, 1.0 / SMOOTHED_BINS), "valid")
+
+
+def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
+    """The best point of a grid."""
+    delays = np.linspace(-LARGEST_LAG, LARGEST_LAG, 41)
+    constants = np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)]) if low_pass else np.zeros(1)
+    advance = np.exp(1j * np.multiply.outer(delays, omega)) * cross
+    turn = np.exp(1j * np.arctan(np.multiply.outer(constants, omega)))
+    score = advance.real @ turn.real.T - advance.imag @ turn.imag.T
+    delay, constant = np.unravel_index(np.argmax(score), score.shape)
+    return float(delays[delay]), float(constants[constant])
+
+
+def _refined(cross: ComplexArray, omega: FloatArray, start: tuple[float, float], *, low_pass: bool) -> tuple[float, float]:
+    """Gauss-Newton on the weighted phase; the time constant cannot be negative."""
+    delay, constant = start
+    size = np.abs(cross)
+    for _ in range(N_STEPS):
+        turned = cross * np.exp(1j * (omega * delay + np.arctan(omega * constant)))
+        by_delay, by_constant = omega, omega / (1.0 + np.square(omega * constant))
+        first, second = -(by_delay * turned.imag).sum(), -(by_constant * turned.imag).sum()
+        own, shared, other = (size * by_delay**2).sum(), (size * by_delay * by_constant).sum(), (size * by_constant**2).sum()
+        if own <= 0.0:
+            break
+        determinant = own * other * (1.0 + 1e-6) - shared * shared
+        step, change = first / own, 0.0
+        if low_pass and determinant > 0.0:
+            moved = (own * second - shared * first) / determinant
+            if constant > 0.0 or moved > 0.0:
+                step, change = (other * first - shared * second) / determinant, moved
+        step, change = min(max(step, -0.1), 0.1), min(max(change, -0.5), 0.5)
+        delay, constant = min(max(delay + step, -LARGEST_LAG), LARGEST_LAG), min(max(constant + change, 0.0), LONGEST_TIME_CONSTANT)
+        if abs(step) + abs(change) < 1e-7:
+            break
+    return float(delay), float(constant)

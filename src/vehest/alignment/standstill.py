@@ -1,0 +1,49 @@
+"""Where the car stands, and where samples stay the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+
+BoolArray = NDArray[np.bool_]
+
+STANDSTILL_SPEED = 0.1  # m/s
+STANDSTILL_YAW_RATE = 0.05  # rad/s
+STANDSTILL_SHAKING = 0.3  # m/s²
+
+
+def standstill(recording: Recording) -> BoolArray:
+    """Where the car stands, (T,): the speed is nil and, where they are measured, neither yaw rate nor accelerations speak of motion."""
+    standing = np.zeros(len(recording), dtype=bool)
+    if "vx" not in recording:
+        return standing
+    slow = np.abs(recording["vx"]) < STANDSTILL_SPEED
+    starts, lengths = long_runs(slow, at_least=1)
+    still = slow[starts]
+    if "yaw_rate" in recording:
+        still &= ~(np.fmax.reduceat(np.abs(recording["yaw_rate"]), starts) > STANDSTILL_YAW_RATE)
+    for name in ("ax", "ay"):
+        if name in recording:
+            still &= _spreads(recording[name], starts, lengths) <= STANDSTILL_SHAKING
+    return np.repeat(still, lengths)
+
+
+def long_runs(samples: NDArray[Any], at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Starts and lengths of the runs of equal values that are long enough."""
+    edges = np.flatnonzero(np.concatenate([[True], samples[1:] != samples[:-1], [True]])) if len(samples) else np.zeros(1, dtype=np.int64)
+    lengths = np.diff(edges)
+    return edges[:-1][lengths >= at_least], lengths[lengths >= at_least]
+
+
+def _spreads(samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> FloatArray:
+    """Standard deviation of what is known of the samples, for each of the stretches that they consist of; 0 where nothing is."""
+    known = np.isfinite(samples)
+    number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
+    mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number
+    deviation = np.where(known, samples - np.repeat(mean, lengths), 0.0)
+    return np.asarray(np.sqrt(np.add.reduceat(np.square(deviation), starts) / number), dtype=np.float64)

@@ -1,0 +1,121 @@
+"""Blocked cross-validation: recordings, laps or stretches of time are dealt into folds that follow one another."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from vehest.data.errors import ConfigurationError
+from vehest.data.laps import laps_of
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+
+FEWEST = 3  # one to test, one to stop on, the rest to learn from
+
+
+@dataclass(frozen=True)
+class FoldsFile:
+    """How a split is cross-validated.
+
+    Args:
+        number: of folds, three or more.
+        of: what is never cut in two: a recording, a lap, or ``block_seconds`` of driving.
+        recordings: pattern of those that take part.
+        block_seconds: length of a block for ``of: seconds`` [s].
+        gap_seconds: taken off training and validation where they border on another fold [s], since filters and windows reach across.
+    """
+
+    number: int = 5
+    of: Literal["recordings", "laps", "seconds"] = "laps"
+    recordings: str = "*"
+    block_seconds: float = 30.0
+    gap_seconds: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.number < FEWEST:
+            raise ValueError(f"number must be {FEWEST} or more (test, validation, training), not {self.number}")
+        if not self.block_seconds > 0.0:
+            raise ValueError(f"block_seconds must be positive, not {self.block_seconds:g}")
+        if not self.gap_seconds >= 0.0:
+            raise ValueError(f"gap_seconds must not be negative, not {self.gap_seconds:g}")
+
+
+def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str] | None], Recording]]) -> list[Span]:
+    """The blocks of recordings in order, each with its start and stop; what is before the first lap or after the last is a block too.
+
+    Args:
+        folds: what is never cut in two.
+        recordings: a span that names a recording -> what reads it.
+
+    Raises:
+        DataError: laps are asked for and a recording lacks speed or yaw rate.
+    """
+    blocks = []
+    for whole, read in recordings.items():
+        recording = read(None)
+        bounds = [recording.start_time, recording.end_time]
+        if folds.of == "laps":
+            bounds += [time for lap in laps_of(recording) for time in lap]
+        elif folds.of == "seconds":
+            bounds += (recording.start_time + np.arange(folds.block_seconds, recording.duration, folds.block_seconds)).tolist()
+        edges = sorted(set(bounds))
+        blocks += [replace(whole, start=start, stop=stop) for start, stop in pairwise(edges)]
+    return blocks
+
+
+def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
+    """Training, validation and test of one fold: blocks stay in order and folds last about as long as each other.
+
+    The fold after the tested one (the first after the last) is the one to stop on.
+
+    Args:
+        blocks: from `blocks_of`.
+        folds: their number, and the gap between them.
+        fold: which of them is tested, from 0.
+        where: the split, for messages.
+
+    Raises:
+        ConfigurationError: there is no such fold, or too few blocks to fill them.
+    """
+    if not 0 <= fold < folds.number:
+        raise ConfigurationError(f"{where}: fold {fold} is not one of 0 to {folds.number - 1}")
+    lengths = np.array([block.stop - block.start for block in blocks])
+    middles = np.cumsum(lengths) - 0.5 * lengths
+    dealt = np.minimum((middles / lengths.sum() * folds.number).astype(np.int64), folds.number - 1)
+    empty = sorted(set(range(folds.number)) - set(dealt.tolist()))
+    if empty:
+        what = f"{len(blocks)} blocks ({folds.of}) do not fill {folds.number} folds, number {empty[0]} stays empty"
+        raise ConfigurationError(f"{where}: {what}; take fewer folds, or of: seconds with a shorter block_seconds")
+    roles = np.where(dealt == fold, 2, np.where(dealt == (fold + 1) % folds.number, 1, 0)).tolist()
+    train, validation, test = (_joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3))
+    if not (train and validation):
+        raise ConfigurationError(
+            f"{where}: gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from; set folds.gap_seconds lower"
+        )
+    return train, validation, test
+
+
+def _joined(blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float) -> tuple[Span, ...]:
+    """Blocks of a role, neighbours as one, shortened by the gap where they border on blocks of another role."""
+    spans: list[Span] = []
+    for place, block in enumerate(blocks):
+        if roles[place] != role:
+            continue
+        before = place > 0 and _touch(blocks[place - 1], block)
+        after = place + 1 < len(blocks) and _touch(block, blocks[place + 1])
+        start = block.start + (gap if before and roles[place - 1] != role else 0.0)
+        stop = block.stop - (gap if after and roles[place + 1] != role else 0.0)
+        if before and roles[place - 1] == role and spans and math.isclose(spans[-1].stop, block.start):
+            spans[-1] = replace(spans[-1], stop=stop)
+        elif start < stop:
+            spans.append(replace(block, start=start, stop=stop))
+    return tuple(spans)
+
+
+def _touch(one: Span, other: Span) -> bool:
+    return (one.dataset, one.recording) == (other.dataset, other.recording) and math.isclose(one.stop, other.start)

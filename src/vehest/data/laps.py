@@ -1,0 +1,117 @@
+"""Laps of a recording, found without positions: where the curvature of the path, over the distance driven, begins to repeat."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+
+POINTS = 8192
+"""Of the path at most."""
+LEAST_CORRELATION = 0.6
+"""Between the curvatures of a lap and of the next; drivers take other lines, the course stays."""
+LEAST_SHARE_OF_BEST = 0.9
+"""Of the best correlation, from which the shorter of two periods is taken: two laps repeat too."""
+MOST_TURN_OFF = 0.8  # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
+STEADY = 0.2
+"""Spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn."""
+SEARCH = 0.04
+"""Share of a lap by which the next boundary is looked for before and after where it is expected."""
+
+
+def laps_of(recording: Recording) -> list[tuple[float, float]]:
+    """Start and stop of each complete lap [s], one after another; empty where nothing repeats, as in less than two laps.
+
+    The path is that of ``vx`` and ``yaw_rate``, driven forwards. The first lap begins where the
+    recording does, wherever that is on the course.
+
+    Args:
+        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref).
+
+    Raises:
+        DataError: it lacks them.
+    """
+    speed, turning = _first_of(recording, "vx", "vx_ref"), _first_of(recording, "yaw_rate", "yaw_rate_ref")
+    distance = np.cumsum(np.maximum(speed, 0.0)) / recording.rate_hz
+    heading = np.cumsum(np.where(speed > 0.0, turning, 0.0)) / recording.rate_hz
+    if len(recording) < 16 or not distance[-1] > 0.0:
+        return []
+    points = min(POINTS, len(recording))
+    grid = np.linspace(0.0, distance[-1], points)
+    turned = np.interp(grid, distance, heading)
+    curvature = np.diff(turned) / (grid[1] - grid[0])
+    if np.std(curvature) < STEADY * abs(float(np.mean(curvature))):
+        bounds = _turns(turned)
+    else:
+        period = _period(curvature, turned)
+        bounds = [] if period is None else _boundaries(curvature, period)
+    times = [float(np.interp(grid[bound], distance, recording.time)) for bound in bounds]
+    return list(pairwise(times))
+
+
+def _first_of(recording: Recording, *names: str) -> FloatArray:
+    name = next((name for name in names if name in recording), None)
+    if name is None:
+        raise DataError(f"recording '{recording.id}' has neither {' nor '.join(names)}, without which no laps can be found")
+    return np.nan_to_num(recording[name])
+
+
+def _turns(turned: FloatArray) -> list[int]:
+    """Points at which whole turns of a circle are done."""
+    whole = np.floor(np.abs(turned - turned[0]) / (2.0 * math.pi) + 1e-9)
+    return [0, *(np.flatnonzero(np.diff(np.maximum.accumulate(whole))) + 1).tolist()]
+
+
+def _period(curvature: FloatArray, turned: FloatArray) -> int | None:
+    """Points after which the curvature repeats and the heading is the same again; None where that is never."""
+    correlation = _correlations(curvature)
+    lags = np.arange(len(correlation))
+    sums = np.concatenate([[0.0], np.cumsum(turned)])
+    mean_turn = (sums[-1] - sums[lags] - sums[len(turned) - lags]) / (len(turned) - lags)
+    off = np.abs(mean_turn - 2.0 * math.pi * np.rint(mean_turn / (2.0 * math.pi)))
+    peak = np.zeros(len(correlation), dtype=bool)
+    peak[1:-1] = (correlation[1:-1] >= correlation[:-2]) & (correlation[1:-1] > correlation[2:])
+    found = np.flatnonzero(peak & (correlation > LEAST_CORRELATION) & (off < MOST_TURN_OFF) & (lags >= 8))
+    if not len(found):
+        return None
+    best = correlation[found].max()
+    return int(found[correlation[found] >= LEAST_SHARE_OF_BEST * best][0])
+
+
+def _correlations(samples: FloatArray) -> FloatArray:
+    """Pearson's correlation of samples with themselves some points later, for lags up to half of them."""
+    number = len(samples)
+    size = 1 << (2 * number - 1).bit_length()
+    spectrum = np.fft.rfft(samples, size)
+    products = np.fft.irfft(spectrum * spectrum.conj(), size)[:number]
+    sums, squares = (np.concatenate([[0.0], np.cumsum(power)]) for power in (samples, np.square(samples)))
+    lags = np.arange(number // 2 + 1)
+    left = number - lags
+    first_sum, second_sum = sums[left], sums[number] - sums[lags]
+    first_square, second_square = squares[left] - first_sum**2 / left, squares[number] - squares[lags] - second_sum**2 / left
+    scatter = np.sqrt(np.maximum(first_square * second_square, 0.0))
+    together = products[: len(lags)] - first_sum * second_sum / left
+    return np.divide(together, scatter, out=np.zeros(len(lags)), where=scatter > 1e-12 * squares[number])
+
+
+def _boundaries(curvature: FloatArray, period: int) -> list[int]:
+    """Points at which laps begin: each a period after the one before, moved to where the two laps fit best."""
+    bounds, reach = [0], max(round(SEARCH * period), 1)
+    while bounds[-1] + period < len(curvature):
+        last = bounds[-1]
+        length = min(period, len(curvature) - last - period)
+        template = curvature[last : last + length]
+        moves = [move for move in range(-reach, reach + 1) if last + period + move + length <= len(curvature)]
+        if length < period // 4 or not moves:
+            bounds.append(last + period)
+            continue
+        fits = [float(np.dot(template, curvature[last + period + move : last + period + move + length])) for move in moves]
+        bounds.append(last + period + moves[int(np.argmax(fits))])
+    if len(curvature) - bounds[-1] >= period - reach and len(bounds) > 1:
+        bounds.append(len(curvature))
+    return bounds

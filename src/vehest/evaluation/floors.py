@@ -1,0 +1,504 @@
+"""What a drive can show: the noise of its reference, and how well v can be told at all from a set of inputs along it.
+
+Two figures to hold errors against, so that a poor estimator is told from a silent drive. Both rest on models: yardsticks, not truths.
+
+**Noise of the reference** (`reference_floor`). White noise of standard deviation σ has third differences of variance 20 σ². What the
+inertial signals explain of those of v, the second differences of a_y and of u ω, is taken out by least squares. The rest is measured by
+the median of its size, so that kerbs and jumps do not count. Not seen are errors that are slow (an offset, a lever arm), that smoothing
+of the reference hid, or that it shares with the inertial signals: a lower bound. A reference in coarse steps errs by at least step/√12.
+
+**Cramér-Rao bound** (`cramer_rao_floor`). No causal estimator has a mean squared error below the posterior bound (Tichavský, Muravchik &
+Nehorai, Posterior Cramér-Rao bounds for discrete-time nonlinear filtering, IEEE Trans. Signal Processing 46 (5), 1998), which is taken of
+a model whose states and noise are drawn at random and whose parameters are known. For a linear model with Gaussian noise its recursion is
+that of the Kalman filter's covariance. The model, with yaw rate ω and speed u as measured:
+
+    v is a Gauss-Markov process with the spread and correlation time of the drive's v           (always)
+    dv/dt = a_y - u ω - b - n          b slow (bank, roll, offset), n white                     (where a_y is read)
+    du/dt = a_x + v ω + c + m          c slow, m white; u is measured with white noise          (where a_x is read)
+    v = l_r ω - (1 + s_r) u α_r + e_r,         α = k₁ a + k₂ dω/dt + k₃ a³                      (rear axle, if the car is known)
+    v = (δ - δ₀) u - l_f ω - (1 + s_f) u α_f + e_f                                              (front axle, where steer is read too)
+
+The axles are the balances of forces of the single track, each with the load and inertia that belong to it (J = m l_f l_r) and a tyre that
+gives way with the third power; a is a_y where it is read, else u ω.
+
+Unknown to the bound are v, u, b, c, the errors e of the axles (a Gauss-Markov process and white noise), and the stiffness of the tyres, of
+which a data sheet says no more than 6 to 15 per rad: s has a standard deviation of 23 %. Known are arms, shape of the tyre, offset of the
+steering angle and all levels of noise, read off the test drive and its reference for the bound's own use: mostly more than an estimator
+knows. An error below the bound says that an estimator knows more of the car still, and an error above it what it leaves unused.
+
+Without the car (``car=False``) the axles are left out: what kinematics alone tells of a car of which nothing is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.evaluation.metrics import Protocol, pieces_of, scored_range
+from vehest.evaluation.regimes import filled
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.kalman import LinearModel
+from vehest.filters.kalman_scan import kalman_scan
+
+INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")
+"""Channels that a bound knows what to make of; the first two are needed."""
+SETS = (
+    ("vx", "yaw_rate"),
+    ("vx", "yaw_rate", "ay"),
+    ("vx", "yaw_rate", "ay", "ax"),
+    ("vx", "yaw_rate", "steer"),
+    ("vx", "yaw_rate", "ay", "steer"),
+    ("vx", "yaw_rate", "ay", "ax", "steer"),
+)
+"""Sets of inputs that reports compare."""
+
+STIFFNESS_DEVIATION = math.log(15.0 / 6.0) / 4.0  # 0.23: 6 to 15 per rad as four standard deviations (Milliken & Milliken 1995)
+BLOCK_SECONDS = 1.0  # over which residuals are averaged to part slow from white noise
+SLOW_SECONDS = (2.0, 100.0)  # between which the time constant of slow noise is looked for
+LEAST_SAMPLES = 20
+LEAST_WHITE = 0.01  # of an axle's slow error, so that no measurement is exact
+CHUNK = 20_000  # samples that are held at once
+UNIFORM = 180.0 / math.sqrt(3.0)  # deg, of an angle of which nothing is known
+TINY = 1e-9
+
+_SPEEDS = ("motor_speed", "wheel_speed_")
+_SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")  # thrust and brakes say nothing of v that the speed does not
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A standard deviation over the scored samples of a test set.
+
+    Args:
+        vy: of lateral velocity [m/s].
+        sideslip: of the sideslip angle [deg].
+    """
+
+    vy: float
+    sideslip: float
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,).
+
+    Args:
+        rate_hz: [Hz].
+        inputs: those of `INPUTS` that were measured, gaps filled by straight lines [SI].
+        vy_ref: reference lateral velocity [m/s]; may be NaN before the scored samples.
+        first: index of the first scored sample; all after it are scored.
+        told: whether estimators are told the state at the first sample.
+    """
+
+    rate_hz: float
+    inputs: dict[str, FloatArray]
+    vy_ref: FloatArray
+    first: int
+    told: bool = False
+
+    @property
+    def step(self) -> float:
+        """Sampling time [s]."""
+        return 1.0 / self.rate_hz
+
+    @property
+    def scored(self) -> Drive:
+        """The scored samples alone."""
+        own = {name: samples[self.first :] for name, samples in self.inputs.items()}
+        return Drive(self.rate_hz, own, self.vy_ref[self.first :], 0)
+
+
+def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Drive]:
+    """The ranges or sequences of a test set, as `score_all` counts them.
+
+    Args:
+        spans: ranges of the test set.
+        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
+        protocol: see `Protocol`.
+    """
+    return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
+
+
+def drive_of(reference: Recording, span: Span, protocol: Protocol) -> Drive:
+    """One range or sequence of a recording, with the warm-up before it."""
+    begin = reference.index_range(span.start - protocol.warm_up_seconds, span.stop)[0]
+    first, end = scored_range(reference, span, protocol)
+    inputs = {name: filled(reference[name][begin:end]) for name in INPUTS if name in reference}
+    return Drive(reference.rate_hz, inputs, reference["vy_ref"][begin:end], first - begin, protocol.initial_state)
+
+
+def inputs_of(channels: Collection[str]) -> frozenset[str] | None:
+    """The inputs of the bound for an estimator that reads these channels; None where no bound suits.
+
+    Wheels and motor stand for the speed, the angle of the steering wheel for that of the road wheels. Measured tyre forces and other
+    channels tell what the bound does not know; without yaw rate there is none.
+    """
+    found = set()
+    for name in channels:
+        if name in INPUTS:
+            found.add(name)
+        elif name.startswith(_SPEEDS):
+            found.add("vx")
+        elif name == "handwheel":
+            found.add("steer")
+        elif not name.startswith(_SILENT):
+            return None
+    return frozenset(found) if {"vx", "yaw_rate"} <= found else None
+
+
+def reference_spread(drives: Sequence[Drive]) -> Floor:
+    """Root mean square of the reference itself, the error of v = 0; of a sideslip within a quarter turn, whichever way the car rolls."""
+    velocity, speed = _joined(drives)
+    return Floor(_rms([velocity]), _rms([np.degrees(np.arctan2(velocity, np.abs(speed)))]))
+
+
+# Noise of the reference
+
+
+def reference_floor(drives: Sequence[Drive]) -> Floor | None:
+    """White noise of the reference, as it stands at the evaluation rate; None where there are too few samples.
+
+    The sideslip's is that of v times |∂β/∂v| = u/(u² + v²), at most that of an angle of which nothing is known.
+    """
+    third, explained, longest = [], [], 0
+    both = {name for name in ("ay", "yaw_rate") if all(name in drive.inputs for drive in drives)}
+    for drive in (drive.scored for drive in drives):
+        if len(drive.vy_ref) < 4:
+            continue
+        own = drive.inputs
+        parts = ([own["ay"]] if "ay" in both else []) + ([own["vx"] * own["yaw_rate"]] if "yaw_rate" in both else [])
+        third.append(np.diff(drive.vy_ref, 3))
+        explained.append(np.stack([np.diff(_middle(part), 2) for part in parts], 1) if parts else np.empty((len(third[-1]), 0)))
+        longest += len(third[-1])
+    if longest < LEAST_SAMPLES:
+        return None
+    rest, known = np.concatenate(third), np.concatenate(explained)
+    if known.shape[1]:
+        rest = rest - known @ np.linalg.lstsq(known, rest, rcond=None)[0]
+    velocity, speed = _joined(drives)
+    level = max(_robust_deviation(rest) / math.sqrt(20.0), quantisation_step(velocity) / math.sqrt(12.0))
+    return Floor(level, _rms([_sideslip_deviation(np.full_like(velocity, level), velocity, speed)]))
+
+
+def white_level(series: Sequence[FloatArray]) -> float:
+    """Standard deviation of the white noise of a smooth signal, from its third differences and not below step/√12; 0 if too short."""
+    third = [np.diff(samples, 3) for samples in series if len(samples) >= 4]
+    noise = _robust_deviation(np.concatenate(third)) / math.sqrt(20.0) if third else 0.0
+    return max(noise, quantisation_step(np.concatenate(series)) / math.sqrt(12.0))
+
+
+def quantisation_step(samples: FloatArray) -> float:
+    """Step of a signal whose values are multiples of one; 0 where fewer than half of them occur twice, or there is none."""
+    values = np.unique(samples)
+    if len(values) < 2 or len(values) > len(samples) // 2:
+        return 0.0
+    steps = np.diff(values)
+    step = float(steps.min())
+    return step if np.all(np.abs(steps / step - np.round(steps / step)) < 0.01) else 0.0
+
+
+def _robust_deviation(samples: FloatArray) -> float:
+    """Standard deviation of a normal distribution about zero with this median of sizes."""
+    return float(np.median(np.abs(samples))) / 0.6744897501960817
+
+
+# The bound
+
+
+class Noise(NamedTuple):
+    """A disturbance in two parts.
+
+    Attributes:
+        density: of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T.
+        deviation: standard deviation of its slow part, a Gauss-Markov process [unit].
+        time_constant: of the slow part [s].
+    """
+
+    density: float
+    deviation: float
+    time_constant: float
+
+
+class Axle(NamedTuple):
+    """What the force balance of an axle says of v, fitted to a test set.
+
+    Attributes:
+        coefficients: of the columns of `_axle_columns`.
+        error: what it leaves of v, in m/s.
+    """
+
+    coefficients: FloatArray
+    error: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Levels:
+    """What a bound knows of a test set: processes and noise, read off all its drives together."""
+
+    velocity: Noise
+    lateral: Noise | None
+    longitudinal: Noise | None
+    speed: float
+    reference: float
+    rear: Axle | None
+    front: Axle | None
+
+
+def cramer_rao_floor(drives: Sequence[Drive], inputs: Collection[str], *, car: bool = True) -> Floor | None:
+    """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored samples.
+
+    Args:
+        drives: of a test set.
+        inputs: some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
+        car: whether the car is known to about what a data sheet tells; else kinematics alone is.
+
+    Returns:
+        None where an input was not measured, or there are too few samples.
+
+    Raises:
+        ValueError: vx or yaw_rate is not among the inputs, or one of them is none of `INPUTS`.
+    """
+    if not {"vx", "yaw_rate"} <= set(inputs) <= set(INPUTS):
+        raise ValueError(f"inputs of a bound are vx, yaw_rate and some of {', '.join(INPUTS[2:])}, not {', '.join(sorted(inputs))}")
+    if not all(set(inputs) <= set(drive.inputs) for drive in drives) or sum(len(drive.scored.vy_ref) for drive in drives) < LEAST_SAMPLES:
+        return None
+    levels = _levels(drives, set(inputs), car)
+    velocity, speed = _joined(drives)
+    deviation = np.concatenate([_deviation_along(drive, set(inputs), levels)[drive.first :] for drive in drives])
+    return Floor(_rms([deviation]), _rms([_sideslip_deviation(deviation, velocity, speed)]))
+
+
+def posterior_bound(model: LinearModel[FloatArray], prior: FloatArray) -> FloatArray:
+    """Smallest covariance of any causal estimate of the state of a linear model with Gaussian noise, (T, n, n).
+
+    Args:
+        model: see `LinearModel`, observation (T, m, n); offsets do not matter.
+        prior: covariance of the state at the first sample before its measurement, (n, n).
+
+    Source: Tichavský, Muravchik & Nehorai 1998, whose recursion is then the Riccati recursion of the Kalman filter.
+    """
+    steps, m, n = model.observation.shape
+    zero = LinearModel(model.transition, np.zeros(n), model.process_noise, model.observation, np.zeros(m), model.observation_noise)
+    return kalman_scan(zero, np.zeros((steps, m)), Gaussian(np.zeros(n), prior)).filtered.covariance
+
+
+def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
+    """Part a disturbance into white noise and a slow Gauss-Markov process, by the covariances of its means over seconds.
+
+    Means of the slow part over τ = 1 s have the covariance d² 2(cosh x - 1)/x² e^(-kx) at a lag of k > 0 seconds, x = τ/T, and
+    d² 2(x - 1 + e^(-x))/x² at none, where white noise adds its density over τ. Lags of one and two seconds give d and T. The mean counts
+    as part of the disturbance, and white noise has no more than the variance that the slow part leaves.
+
+    Args:
+        series: uninterrupted stretches of it, (T,) each.
+        rate_hz: sampling rate [Hz].
+    """
+    block = max(round(BLOCK_SECONDS * rate_hz), 1)
+    means = [samples[: len(samples) // block * block].reshape(-1, block).mean(1) for samples in series]
+    lags = [_covariance(means, lag) for lag in range(3)]
+    variance = _rms(series) ** 2
+    if not min(lags[:2]) > 0:
+        return Noise(min(max(lags[0], 0.0) * BLOCK_SECONDS, variance / rate_hz), 0.0, SLOW_SECONDS[0])
+    low, high = (math.exp(-BLOCK_SECONDS / time) for time in SLOW_SECONDS)
+    ratio = min(max(lags[2] / lags[1], low), high)
+    x = -math.log(ratio)
+    apart, together = 2.0 * (math.cosh(x) - 1.0) / x**2, 2.0 * (x - 1.0 + ratio) / x**2
+    slow = min(lags[1] / (ratio * apart), lags[0] / together)
+    white = min((lags[0] - slow * together) * BLOCK_SECONDS, max(variance - slow, 0.0) / rate_hz)
+    return Noise(max(white, 0.0), math.sqrt(slow), BLOCK_SECONDS / x)
+
+
+def _covariance(series: Sequence[FloatArray], lag: int) -> float:
+    """Mean product of values so many apart, about zero."""
+    products = [own[lag:] * own[: len(own) - lag] for own in series if len(own) > lag]
+    return float(np.concatenate(products).mean()) if products else 0.0
+
+
+def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
+    """A process by its root mean square and the time in which its autocorrelation falls to 1/e."""
+    deviation = _rms(series)
+    longest = max(len(samples) for samples in series)
+    total = np.zeros(longest)
+    for samples in series:
+        spectrum = np.fft.rfft(samples, 2 * len(samples))
+        total[: len(samples)] += np.fft.irfft(np.square(np.abs(spectrum)), 2 * len(samples))[: len(samples)]
+    below = np.flatnonzero(total < total[0] / math.e)
+    lags = int(below[0]) if len(below) else longest
+    return Noise(0.0, max(deviation, TINY), max(lags, 1) / rate_hz)
+
+
+def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
+    parts, rate = [drive.scored for drive in drives], drives[0].rate_hz
+    lateral = longitudinal = rear = front = None
+    if "ay" in inputs:
+        left = [(own.vy_ref, own.inputs["ay"] - own.inputs["vx"] * own.inputs["yaw_rate"], own.inputs["ay"]) for own in parts]
+        lateral = split_noise(_unexplained(left, rate), rate)
+    if "ax" in inputs:
+        left = [(own.inputs["vx"], own.inputs["ax"] + own.vy_ref * own.inputs["yaw_rate"], own.inputs["ax"]) for own in parts]
+        longitudinal = split_noise(_unexplained(left, rate), rate)
+    if car:
+        rear = _fitted_axle(parts, inputs, False)
+        front = _fitted_axle(parts, inputs, True) if "steer" in inputs else None
+    reference = reference_floor(drives)
+    return _Levels(
+        velocity=gauss_markov([own.vy_ref for own in parts], rate),
+        lateral=lateral,
+        longitudinal=longitudinal,
+        speed=max(white_level([own.inputs["vx"] for own in parts]), TINY),
+        reference=reference.vy if reference is not None else 0.0,
+        rear=rear,
+        front=front,
+    )
+
+
+def _unexplained(series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float) -> list[FloatArray]:
+    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out.
+
+    Args:
+        series: velocity, rate and sensor of each stretch, (T,) each.
+        rate_hz: sampling rate [Hz].
+    """
+    left = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
+    sensor = [_middle(own) for *_, own in series]
+    power = sum(float(own @ own) for own in sensor)
+    scale = sum(float(own @ other) for own, other in zip(left, sensor, strict=True)) / power if power > 0 else 0.0
+    return [own - scale * other for own, other in zip(left, sensor, strict=True)]
+
+
+def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
+    columns = [_axle_columns(own, inputs, front) for own in parts]
+    coefficients = np.linalg.lstsq(np.concatenate(columns), np.concatenate([_target(own, front) for own in parts]), rcond=None)[0]
+    left = [_target(own, front) - known @ coefficients for own, known in zip(parts, columns, strict=True)]
+    return Axle(coefficients, split_noise(left, parts[0].rate_hz))
+
+
+def _target(drive: Drive, front: bool) -> FloatArray:
+    """v, or v - δ u, of which an axle's slip and arm make up the rest."""
+    return drive.vy_ref - drive.inputs["steer"] * drive.inputs["vx"] if front else drive.vy_ref
+
+
+def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:
+    """Arm, three of the slip angle and, in front, an offset of the steering angle: ω, u a, u dω/dt, u a³, u; (T, 4) or (T, 5)."""
+    u, yaw_rate = drive.inputs["vx"], drive.inputs["yaw_rate"]
+    a = drive.inputs["ay"] if "ay" in inputs else u * yaw_rate
+    change = np.gradient(yaw_rate) * drive.rate_hz if len(u) > 1 else np.zeros_like(u)
+    return np.stack([yaw_rate, u * a, u * change, u * a**3, *([u] if front else [])], 1)
+
+
+def _deviation_along(drive: Drive, inputs: set[str], levels: _Levels) -> FloatArray:
+    """Standard deviation of v along a drive [m/s], (T,)."""
+    model, prior = _model_of(drive, inputs, levels)
+    deviation = np.empty(len(drive.vy_ref))
+    for begin in range(0, len(deviation), CHUNK):
+        part = slice(begin, begin + CHUNK)
+        own = model._replace(transition=model.transition[part], observation=model.observation[part])
+        covariance = posterior_bound(own, prior)
+        deviation[part] = np.sqrt(covariance[:, 0, 0])
+        last = own.transition[-1]
+        prior = last @ covariance[-1] @ last.T + model.process_noise
+    return deviation
+
+
+def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearModel[FloatArray], FloatArray]:
+    """The model of the module's docstring in steps, and the prior covariance of its state, v first.
+
+    The increment z = v⁺ - v + τ b + n that a_y measures shares its noise with that of v⁺ = φ v + ξ: given z, with the gain K = q/(q + r),
+    v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 - K) q, and z itself measures (φ - 1) v + τ b with the variance q + r.
+    """
+    steps, step = len(drive.vy_ref), drive.step
+    blocks = _Blocks(steps)
+    decay, noise = _in_steps(levels.velocity, step)
+    start = levels.reference**2 if drive.told else levels.velocity.deviation**2
+    v = blocks.state(decay, noise, start)
+    if levels.lateral is not None:
+        white = levels.lateral.density * step + TINY**2
+        gain = noise / (noise + white)
+        offset = blocks.state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
+        blocks.transition[v, v], blocks.transition[v, offset] = decay - gain * (decay - 1.0), -gain * step
+        blocks.noise[v] = noise * (1.0 - gain)
+        blocks.measure({v: decay - 1.0, offset: step}, noise + white)
+    if levels.longitudinal is not None:
+        speed = blocks.state(1.0, levels.longitudinal.density * step, levels.speed**2)
+        pitch = blocks.state(*_in_steps(levels.longitudinal, step), levels.longitudinal.deviation**2)
+        blocks.transition[speed, v], blocks.transition[speed, pitch] = drive.inputs["yaw_rate"] * step, step
+        blocks.measure({speed: 1.0}, levels.speed**2)
+    for axle, front in ((levels.rear, False), (levels.front, True)):
+        if axle is not None:
+            error = blocks.state(*_in_steps(axle.error, step), axle.error.deviation**2)
+            stiffness = blocks.state(1.0, 0.0, STIFFNESS_DEVIATION**2)
+            slip = _axle_columns(drive, inputs, front)[:, 1:4] @ axle.coefficients[1:4]
+            white = axle.error.density / step + levels.reference**2 + (LEAST_WHITE * axle.error.deviation) ** 2
+            blocks.measure({v: 1.0, error: -1.0, stiffness: -slip}, white)
+    return blocks.model()
+
+
+class _Blocks:
+    """States and measurements of a linear model, put together one by one."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+        self.transition: dict[tuple[int, int], FloatArray | float] = {}
+        self.noise: list[float] = []
+        self.prior: list[float] = []
+        self.measured: list[tuple[dict[int, FloatArray | float], float]] = []
+
+    def state(self, decay: float, noise: float, prior: float) -> int:
+        """Add x⁺ = decay x + w; returns its index."""
+        index = len(self.noise)
+        self.transition[index, index] = decay
+        self.noise.append(noise)
+        self.prior.append(prior)
+        return index
+
+    def measure(self, of: dict[int, FloatArray | float], variance: float) -> None:
+        """Add a measurement of a combination of states."""
+        self.measured.append((of, variance))
+
+    def model(self) -> tuple[LinearModel[FloatArray], FloatArray]:
+        """The model and the prior covariance of its state."""
+        n, m = len(self.noise), max(len(self.measured), 1)
+        A, C = np.zeros((self.steps, n, n)), np.zeros((self.steps, m, n))
+        for (row, column), value in self.transition.items():
+            A[:, row, column] = value
+        for row, (of, _) in enumerate(self.measured):
+            for column, value in of.items():
+                C[:, row, column] = value
+        R = np.diag([variance + TINY**2 for _, variance in self.measured] or [1.0])
+        return LinearModel(A, np.zeros(n), np.diag(self.noise), C, np.zeros(m), R), np.diag(self.prior)
+
+
+def _in_steps(process: Noise, step: float) -> tuple[float, float]:
+    """Decay over a step and the variance of what is new in it."""
+    decay = math.exp(-step / process.time_constant)
+    return decay, process.deviation**2 * (1.0 - decay**2)
+
+
+# Arrays
+
+
+def _middle(samples: FloatArray) -> FloatArray:
+    """Means of neighbours, (T - 1,)."""
+    return 0.5 * (samples[1:] + samples[:-1])
+
+
+def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+    """v_ref and u of all scored samples."""
+    parts = [drive.scored for drive in drives]
+    return np.concatenate([own.vy_ref for own in parts]), np.concatenate([own.inputs["vx"] for own in parts])
+
+
+def _rms(series: Sequence[FloatArray]) -> float:
+    return float(np.sqrt(np.mean(np.square(np.concatenate(series)))))
+
+
+def _sideslip_deviation(deviation: FloatArray, velocity: FloatArray, speed: FloatArray) -> FloatArray:
+    """Standard deviation of atan2(v, u) [deg] to first order, (K,)."""
+    slope = np.abs(speed) / np.maximum(np.square(speed) + np.square(velocity), TINY)
+    return np.minimum(np.degrees(deviation * slope), UNIFORM)

@@ -1,0 +1,125 @@
+"""Errors by regime: straight ahead or turning, by lateral acceleration, in transients or steady; each a ``subset`` of the metrics.
+
+| regime | samples |
+| `straight`, `turning` | yaw rate within ±0.05 rad/s, and the rest |
+| `ay_0_2`, `ay_2_4`, `ay_4_6`, `ay_6_` | size of the lateral acceleration from so many to so many m/s² |
+| `transient`, `steady` | yaw rate changes faster than 0.1 rad/s² or lateral acceleration faster than 2 m/s³, and the rest |
+
+The two limits of transients are the same at 20 m/s, where a_y ≈ u ω changes by 2 m/s³ with 0.1 rad/s². They were set before any error was
+looked at. Rates of change are slopes of lines fitted by least squares to 0.5 s around each sample (Savitzky & Golay 1964, first order): a
+regime says what the car did, so it may look ahead.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
+
+Mask = NDArray[np.bool_]
+
+STRAIGHT_YAW_RATE = 0.05  # rad/s
+AY_EDGES = (0.0, 2.0, 4.0, 6.0, math.inf)  # m/s²
+TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}  # rad/s², m/s³
+SLOPE_SECONDS = 0.5
+LEAST_SECONDS = 2.0  # of samples in a regime, below which it has no errors
+METRICS = ("rmse_vy", "rmse_sideslip")
+
+
+def band_name(low: float, high: float) -> str:
+    """``ay_2_4``; ``ay_6_`` for a band without upper end."""
+    return f"ay_{low:g}_{high:g}" if math.isfinite(high) else f"ay_{low:g}_"
+
+
+AY_BANDS = {band_name(low, high): (low, high) for low, high in itertools.pairwise(AY_EDGES)}
+"""Name of a band of lateral acceleration -> its ends [m/s²]."""
+
+REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
+"""In the order of tables."""
+
+
+def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:
+    """Which scored samples of a range lie in which regime.
+
+    Args:
+        reference: the recording at ``protocol.rate_hz``.
+        span: the range.
+        protocol: see `Protocol`.
+
+    Returns:
+        Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration no bands, without both none.
+    """
+    first, end = scored_range(reference, span, protocol)
+    margin = math.ceil(SLOPE_SECONDS * reference.rate_hz)
+    around = slice(max(first - margin, 0), end + margin)
+    inside = slice(first - around.start, end - around.start)
+    own = {name: reference[name][around] for name in ("yaw_rate", "ay") if name in reference}
+    size = {name: np.abs(samples[inside]) for name, samples in own.items()}
+    found: dict[str, Mask] = {}
+    if "yaw_rate" in size:
+        found["straight"] = size["yaw_rate"] < STRAIGHT_YAW_RATE
+        found["turning"] = size["yaw_rate"] >= STRAIGHT_YAW_RATE
+    if "ay" in size:
+        found |= {name: (size["ay"] >= low) & (size["ay"] < high) for name, (low, high) in AY_BANDS.items()}
+    if own:
+        fast = [np.abs(slope(samples, reference.rate_hz)[inside]) > TRANSIENT[name] for name, samples in own.items()]
+        transient = np.logical_or.reduce(fast)
+        found |= {"transient": transient, "steady": ~transient}
+    return found
+
+
+def slope(samples: FloatArray, rate_hz: float) -> FloatArray:
+    """Rate of change of a signal, from a line through `SLOPE_SECONDS` around each sample, (T,) [unit/s]; 0 if it is too short."""
+    samples = filled(samples)
+    window = min(2 * max(round(0.5 * SLOPE_SECONDS * rate_hz), 1) + 1, len(samples) - (len(samples) + 1) % 2)
+    if window < 3:
+        return np.zeros_like(samples)
+    return np.asarray(signal.savgol_filter(samples, window, 1, deriv=1, delta=1.0 / rate_hz), dtype=np.float64)
+
+
+def filled(samples: FloatArray) -> FloatArray:
+    """The same with straight lines over gaps (NaN), and zeros where nothing is known."""
+    known = np.isfinite(samples)
+    if known.all():
+        return samples
+    at = np.arange(len(samples))
+    return np.interp(at, at[known], samples[known]) if known.any() else np.zeros_like(samples)
+
+
+def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
+    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together.
+
+    Args:
+        parts: estimate and reference of each range or sequence.
+        masks: of each, from `regimes_of`.
+        rate_hz: of the scored samples [Hz].
+
+    Returns:
+        Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples.
+    """
+    total = sum(len(part.time) for part in parts)
+    found = {}
+    for name in REGIMES:
+        if not all(name in own for own in masks):
+            continue
+        inside = [_only(part, own[name]) for part, own in zip(parts, masks, strict=True)]
+        count = sum(len(part.time) for part in inside)
+        if count < max(LEAST_SECONDS * rate_hz, 1.0):
+            continue
+        figures = accuracy(inside)
+        found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
+    return found
+
+
+def _only(part: Scored, chosen: Mask) -> Scored:
+    columns = (getattr(part, name)[chosen] for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay"))
+    return Scored(*columns)

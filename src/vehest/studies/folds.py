@@ -1,0 +1,134 @@
+"""The study of one car by blocked cross-validation: every estimator on every fold, each estimated by a model that had not seen it.
+
+Used by pipelines whose split has ``folds``. Errors of all folds count together, so that all that was driven decides, not one stretch of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from vehest.data.errors import DataError
+from vehest.evaluation.blocks import Segments, joined
+from vehest.evaluation.ranking import Name, Ranking, rank
+from vehest.report import figures
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.style import decimals_for, lines_of, listed
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.drive import budget_sentence, data_sentence, how_it_was_made
+from vehest.studies.kit.runs import by_name
+from vehest.studies.kit.standing import standing_columns, verdict_sentences
+from vehest.studies.kit.warnings import warnings_of
+
+TAKES = "folds"
+SHOWS_FAILED = True
+TEST = "test"
+
+
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
+    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix.
+
+    Raises:
+        DataError: no estimator was scored on all folds, or errors by segment are missing or damaged.
+    """
+    parts = artefacts.parts
+    folds = segments_of_folds(parts)
+    first = next(iter(parts.values()))
+    ranking = rank({name: [joined(own) for own in seeds] for name, seeds in folds.items()}, first.protocol.rate_hz)
+    titles = {(model.estimator, model.variant): as_text(model.title) for part in parts.values() for model in part.models}
+    where = (
+        f"all {len(parts)} folds ({' and '.join(sorted(set(first.kinds.values())))} data), each estimated by models that had not seen it"
+    )
+    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), budget_sentence(first)]))
+    left_out = _left_out(parts, folds, titles)
+    if left_out:
+        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in left_out))
+    board = overview(ranking, folds, titles)
+    blocks += ["## All folds", _table(board, list(parts)), _figure(board, list(parts)), *how_it_was_made(first)[:1]]
+    for name, part in parts.items():
+        warned = [line for line in warnings_of(part) if "is left out" not in line]
+        blocks.append(f"## Appendix: {as_text(part.title)}\n\n" + "\n".join(f"- {line}" for line in warned))
+        blocks += [replace(block, name=f"{block.name}_{name}") for block in how_it_was_made(part)[1:] if isinstance(block, Table)]
+    if any(name[0] == "ksnn" for name in folds):
+        blocks.append(PATENT_NOTE)
+    return {REPORT: Document(artefacts.title, blocks)}
+
+
+def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
+    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold.
+
+    Raises:
+        DataError: there are none.
+    """
+    groups = [{name: {model.seed: model for model in own} for name, own in by_name(part.models).items()} for part in parts.values()]
+    found = {}
+    for name in groups[0]:
+        if not all(name in group and set(group[name]) == set(groups[0][name]) for group in groups):
+            continue
+        seeds = [[group[name][seed].segments(TEST) for group in groups] for seed in sorted(groups[0][name])]
+        if all(math.isfinite(float(own.squared_error_sideslip.sum())) for folds in seeds for own in folds):
+            found[name] = seeds
+    if not found:
+        raise DataError("no estimator has finite errors in all folds")
+    return found
+
+
+def overview(ranking: Ranking, folds: Mapping[Name, Sequence[Sequence[Segments]]], titles: Mapping[Name, str]) -> pd.DataFrame:
+    """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands, and its error in each fold [deg]."""
+    rows = []
+    for name in ranking.order:
+        seeds = folds[name]
+        row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": titles[name], "n_seeds": len(seeds)}
+        row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
+        for fold in range(len(seeds[0])):
+            square = np.mean([own[fold].squared_error_sideslip.sum() / own[fold].samples.sum() for own in seeds])
+            row[f"fold_{fold + 1}"] = float(np.sqrt(square))
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _left_out(parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]) -> list[str]:
+    """What is not in the table, and why."""
+    lines = [f"{as_text(part.title)}: {line}" for part in parts.values() for line in warnings_of(part) if "is left out" in line]
+    lost = [titles[name] for name in titles if name not in folds]
+    return [*lines, *([f"Not in every fold with a finite error, and so not in the table: {listed(lost)}."] if lost else [])]
+
+
+def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
+    decimals = decimals_for(board["rmse_sideslip"].tolist())
+    columns = {
+        "title": Column("estimator"),
+        "n_seeds": Column("seeds"),
+        "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
+        "rmse_sideslip_low": Column("95 % from", decimals=decimals),
+        "rmse_sideslip_high": Column("to", decimals=decimals),
+        "against_best": Column("to the lowest [deg]"),
+        "beats_zero": Column("beats v = 0"),
+        "beats_static_map": Column("beats static map"),
+        **{f"fold_{fold + 1}": Column(f"fold {fold + 1}", decimals=decimals) for fold in range(len(parts))},
+    }
+    caption = (
+        "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
+        "difference to the lowest, and whether v = 0 and the static map are beaten: paired, corrected by Holm."
+    )
+    return Table("overview", caption, board[list(columns)], columns)
+
+
+def _figure(board: pd.DataFrame, parts: Sequence[str]) -> Figure:
+    lines = lines_of([(row["estimator"], row["variant"]) for row in board.to_dict("records")])
+    rows = [
+        figures.Spread(
+            row["title"],
+            lines[row["estimator"], row["variant"]],
+            np.array([row["rmse_sideslip"], *(row[f"fold_{fold + 1}"] for fold in range(len(parts)))]),
+            row["rmse_sideslip"],
+        )
+        for row in board.to_dict("records")
+    ]
+    caption = "Sideslip error of each fold (dots) and of all folds together (diamonds), over all seeds."
+    return Figure("folds", caption, figures.spread_figure(rows, "RMSE(β) [deg]"))

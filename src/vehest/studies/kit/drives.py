@@ -1,0 +1,119 @@
+"""What the drive of a test set can show: its floors beside the reference, and errors by regime; tables of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pandas as pd
+
+from vehest.data.store import read_recording
+from vehest.evaluation.floors import SETS, Floor, cramer_rao_floor, drives_of, reference_floor, reference_spread
+from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, REGIMES, STRAIGHT_YAW_RATE, TRANSIENT
+from vehest.report.document import Column, Table
+from vehest.report.style import MISSING, fixed
+from vehest.studies.artefacts import PartArtefacts
+from vehest.studies.kit.runs import Name
+
+SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table of floors.
+
+    Args:
+        what: for people.
+        inputs: that are read, in symbols.
+        floor: standard deviations.
+        share: of the mean square of v that it comes to.
+    """
+
+    what: str
+    inputs: str
+    floor: Floor
+    share: float
+
+
+def floors_of(part: PartArtefacts, test_set: str) -> list[Row]:
+    """The reference's spread and noise, then the bounds without and with the car by set of inputs, of those that were measured."""
+    drives = drives_of(
+        part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol
+    )
+    spread = reference_spread(drives)
+    found: list[tuple[str, str, Floor | None]] = [
+        ("v = 0: the reference itself", MISSING, spread),
+        ("noise of the reference, at least", MISSING, reference_floor(drives)),
+    ]
+    for car, what in ((False, "bound, kinematics alone"), (True, "bound, axles known")):
+        for inputs in SETS:
+            if car or ("ay" in inputs and "steer" not in inputs):
+                found.append((what, ", ".join(SYMBOLS[name] for name in inputs), cramer_rao_floor(drives, inputs, car=car)))
+    return [
+        Row(what, inputs, floor, (floor.vy / spread.vy) ** 2 if spread.vy > 0 else float("nan"))
+        for what, inputs, floor in found
+        if floor is not None
+    ]
+
+
+def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
+    """Table of `floors_of`."""
+    rows = [
+        {"what": row.what, "inputs": row.inputs, "vy": row.floor.vy, "sideslip": row.floor.sideslip, "share": row.share}
+        for row in floors_of(part, test_set)
+    ]
+    return Table(
+        name,
+        f"What the drive of test set `{test_set}` can show, root mean square over the scored samples: the reference, the white noise in it "
+        f"(slow or smoothed errors are not seen), and the posterior Cramér-Rao bound of causal estimators by what they read. Kinematics "
+        f"alone knows nothing of the car; the other bounds know its axles but for 23 % of the tyres' stiffness and for errors as large as "
+        f"this drive's own. A yardstick under these models: an error below a bound says that an estimator knows more of the car.",
+        pd.DataFrame(rows),
+        {
+            "what": Column("what"),
+            "inputs": Column("inputs"),
+            "vy": Column("v [m/s]", decimals=3),
+            "sideslip": Column("β [deg]", decimals=3),
+            "share": Column("share of v²", digits=2, each=True),
+        },
+    )
+
+
+def regime_table(part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], name: str) -> Table | None:
+    """RMSE(β) of candidates by regime; None where metrics have no regimes.
+
+    Args:
+        part: a comparison.
+        test_set: the test set.
+        chosen: (estimator, variant) -> title and seed, in the order of the rows.
+        name: of the table.
+    """
+    metrics = part.metrics
+    own = metrics[(metrics["test_set"] == test_set) & metrics["subset"].isin(REGIMES) & (metrics["condition"] == "nominal")]
+    seen = [regime for regime in REGIMES if regime in set(own["subset"])]
+    if not seen:
+        return None
+    errors = own[own["metric"] == "rmse_sideslip"]
+    keys = zip(errors["estimator"], errors["variant"].fillna(""), errors["seed"], errors["subset"], strict=True)
+    values = dict(zip(keys, errors["value"], strict=True))
+    shares = own[own["metric"] == "share"].groupby("subset")["value"].first()
+    rows = [
+        {"title": title} | {regime: values.get((*key, seed, regime), float("nan")) for regime in seen}
+        for key, (title, seed) in chosen.items()
+    ]
+    headers = {regime: f"{_in_words(regime)} ({fixed(100 * float(shares[regime]), 0)} %)" for regime in seen}
+    return Table(
+        name,
+        f"RMSE(β) [deg] by regime, of each the seed chosen on validation; in brackets the share of the samples. Straight: yaw rate within "
+        f"±{STRAIGHT_YAW_RATE:g} rad/s. Transient: yaw rate changes by more than {TRANSIENT['yaw_rate']:g} rad/s² or lateral "
+        f"acceleration by more than {TRANSIENT['ay']:g} m/s³. Regimes of less than {LEAST_SECONDS:g} s are left out.",
+        pd.DataFrame(rows),
+        {"title": Column("estimator"), **{regime: Column(headers[regime], decimals=3) for regime in seen}},
+    )
+
+
+def _in_words(regime: str) -> str:
+    if regime not in AY_BANDS:
+        return regime
+    low, high = AY_BANDS[regime]
+    return f"a_y {low:g} to {high:g} m/s²" if high < float("inf") else f"a_y from {low:g} m/s²"

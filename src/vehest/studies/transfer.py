@@ -1,0 +1,163 @@
+"""The study of several vehicles, each tested by estimators that have learnt on others: which family carries over from which cars to which.
+
+A part of the pipeline is a vehicle, or a test of its own. Each is shown by itself: so few vehicles carry no interval over vehicles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import pandas as pd
+
+from vehest.evaluation.ranking import BASELINES, Name, Ranking
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.style import MISSING, decimals_for, fixed, listed
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.drive import budget_sentence, data_sentence, how_it_was_made
+from vehest.studies.kit.runs import by_name
+from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
+from vehest.studies.kit.warnings import warnings_of
+from vehest.studies.transfer_figure import transfer_figure
+
+TAKES = "parts"
+SHOWS_FAILED = True
+REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
+"""Baselines, in the order in which tables show them first."""
+
+
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
+    """The report: what carried over, a table estimator x vehicle with the baselines first, each vehicle by itself, then how it was made.
+
+    Raises:
+        DataError: errors by segment are missing or damaged.
+    """
+    parts = artefacts.parts
+    rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
+    board = overview(parts, rankings)
+    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    blocks.append(carried_over(board))
+    blocks += [_matrix(board), transfer_figure_of(board)]
+    for name, part in parts.items():
+        blocks += _part(name, part, board[board["part"] == name], rankings)
+    for name, part in parts.items():
+        made = how_it_was_made(part)
+        lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
+        blocks += [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
+    if (board["estimator"] == "ksnn").any():
+        blocks.append(PATENT_NOTE)
+    return {REPORT: Document(artefacts.title, blocks)}
+
+
+def overview(parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]) -> pd.DataFrame:
+    """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its interval [deg], and what it beats."""
+    rows = []
+    for (part, test_set), ranking in rankings.items():
+        titles = {name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()}
+        order = [name for baseline in REFERENCES for name in titles if name[0] == baseline]
+        order += [name for name in ranking.order if name not in order] + [name for name in titles if name not in ranking.order]
+        for name in dict.fromkeys(order):
+            row: dict[str, Any] = {"part": part, "title": as_text(parts[part].title), "test_set": test_set}
+            row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
+            row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
+            row |= standing_columns(ranking, name) if name in ranking.rmse else _nothing()
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _nothing() -> dict[str, Any]:
+    missing = dict.fromkeys((*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING)
+    return {"rmse_sideslip_low": math.nan, "rmse_sideslip_high": math.nan, **missing}
+
+
+def carried_over(board: pd.DataFrame) -> str:
+    """Sentences: on which vehicles an estimator beats v = 0 and the static map, each by more than chance."""
+    places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
+    tested = board[~board["estimator"].isin(BASELINES)]
+    beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
+    lines = []
+    for title, own in tested.groupby("estimator_title", sort=False):
+        names = beaten[beaten["estimator_title"] == title]
+        where = [_place(row, board) for row in names.to_dict("records")]
+        lines.append(f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}")
+    everywhere = [str(title) for title, own in tested.groupby("estimator_title", sort=False) if _all_beaten(own, beaten, len(places))]
+    if everywhere:
+        first = f"On every one of {len(places)} tests {listed(everywhere)} beat v = 0 and the static map, each by more than chance."
+    else:
+        first = f"**No estimator beats both v = 0 and the static map on each of the {len(places)} tests.**"
+    return f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten:\n\n" + "\n".join(lines)
+
+
+def _all_beaten(own: pd.DataFrame, beaten: pd.DataFrame, number: int) -> bool:
+    return len(own) == number and len(beaten[beaten["estimator_title"].isin(own["estimator_title"])]) == number
+
+
+def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
+    several = board[board["part"] == row["part"]]["test_set"].nunique() > 1
+    return f"{row['title']}, {row['test_set']}" if several else str(row["title"])
+
+
+def _matrix(board: pd.DataFrame) -> Table:
+    places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
+    titles = list(dict.fromkeys(board["estimator_title"]))
+    rows = []
+    for title in titles:
+        row: dict[str, Any] = {"estimator": title}
+        for place, (part, test_set) in enumerate(places):
+            found = board[(board["estimator_title"] == title) & (board["part"] == part) & (board["test_set"] == test_set)]
+            row[f"place_{place}"] = _cell(found.to_dict("records")[0]) if len(found) else MISSING
+        rows.append(row)
+    firsts = [board[(board["part"] == part) & (board["test_set"] == test_set)].to_dict("records")[0] for part, test_set in places]
+    columns = {"estimator": Column("estimator")}
+    columns |= {f"place_{place}": Column(_place(row, board)) for place, row in enumerate(firsts)}
+    caption = (
+        "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * beats v = 0 and the static map, each "
+        "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error."
+    )
+    return Table("overview", caption, pd.DataFrame(rows), columns)
+
+
+def _cell(row: Mapping[Any, Any]) -> str:
+    if not math.isfinite(row["rmse_sideslip"]):
+        return MISSING
+    decimals = decimals_for([row["rmse_sideslip"]])
+    mark = " *" if row["beats_zero"] == row["beats_static_map"] == "yes" else ""
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    interval = f" [{fixed(low, decimals)}, {fixed(high, decimals)}]" if math.isfinite(low) else ""
+    return f"{fixed(row['rmse_sideslip'], decimals)}{interval}{mark}"
+
+
+def transfer_figure_of(board: pd.DataFrame) -> Figure:
+    """Errors of every estimator on every test over that of v = 0."""
+    caption = (
+        "RMSE(β) over that of v = 0, with 95 % intervals: left of 1, an estimator knows more than nothing. The vertical line in each row "
+        "is the static map, which learns two numbers from the same ranges."
+    )
+    return Figure("transfer", caption, transfer_figure(board))
+
+
+def _part(name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping[tuple[str, str], Ranking]) -> list[Block]:
+    titles: dict[Name, str] = {own: as_text(models[0].title) for own, models in by_name(part.models).items()}
+    blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
+    for test_set in part.split.tests:
+        kinds = " and ".join(sorted({part.kinds[span.dataset] for span in part.split.tests[test_set]}))
+        blocks.append(verdict_sentences(rankings[name, test_set], titles, f"test set `{test_set}` ({kinds})"))
+    warned = warnings_of(part)
+    if warned:
+        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
+    blocks.append(budget_sentence(part))
+    decimals = decimals_for(board["rmse_sideslip"].tolist())
+    shown = board.assign(interval=[interval_in_words(row, decimals) for row in board.to_dict("records")])
+    columns: dict[str, Column] = {"test_set": Column("test set")} if board["test_set"].nunique() > 1 else {}
+    columns |= {
+        "estimator_title": Column("estimator"),
+        "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
+        "interval": Column("95 % interval [deg]"),
+        "against_best": Column("to the lowest [deg]"),
+        "beats_zero": Column("beats v = 0"),
+        "beats_static_map": Column("beats static map"),
+    }
+    caption = f"{as_text(part.title)}: baselines first, then by error. Differences are paired over blocks and seeds, corrected by Holm."
+    return [*blocks, Table(f"leaderboard_{name}", caption, shown, columns)]

@@ -1,0 +1,1 @@
+"""Every real recording with its checks, delays, reference point and floors."""

@@ -1,0 +1,157 @@
+"""Faults that are planted into a recording, to see which the checks find and whether they accuse a channel that nobody touched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+from scipy import signal
+
+from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.recording import Recording
+
+DELAYS = (0.02, 0.04, 0.1)  # s
+TIME_CONSTANT = 0.4  # s
+HELD_RATE = 10.0  # Hz
+REFERENCE = ("vy_ref", "sideslip_ref")
+COUNTED_NOTES = frozenset({"offset", "held"})
+Change = Callable[[FloatArray, float], FloatArray]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Args:
+        name: what is done.
+        channels: to which channels; those that a recording does not have are left out, at least one must be there.
+        size: how much, with its unit.
+        checks: names of checks of which one must find it; empty where none can.
+        change: samples (T,) and sampling rate [Hz] to samples.
+    """
+
+    name: str
+    channels: tuple[str, ...]
+    size: str
+    checks: frozenset[str]
+    change: Change
+
+    def __call__(self, recording: Recording) -> Recording:
+        """The recording with the fault in it."""
+        changed = {name: self.change(recording[name], recording.rate_hz) for name in self.channels if name in recording}
+        return replace(recording, channels={**recording.channels, **changed})
+
+
+def planted_faults() -> list[Fault]:
+    """All faults: delays, signs, units, offsets, a slow sensor that is held, low-passes."""
+    delayed = [("yaw_rate",), ("ay",), ("ax",), REFERENCE, ("steer",)]
+    faults = [
+        Fault(
+            "late",
+            channels,
+            f"{1e3 * seconds:.0f} ms",
+            frozenset() if channels == ("steer",) else frozenset({"delay"}),
+            partial(_late, seconds),
+        )
+        for channels in delayed
+        for seconds in DELAYS
+    ]
+    faults += [
+        Fault("reversed", channels, "-1", frozenset({"sign"}), partial(_scaled, -1.0))
+        for channels in [("ay",), ("yaw_rate",), ("ax",), ("steer",), ("vy_ref",), ("sideslip_ref",), REFERENCE]
+    ]
+    units = [
+        ("yaw_rate", "deg/s", 180.0 / np.pi),
+        ("sideslip_ref", "deg", 180.0 / np.pi),
+        ("vy_ref", "km/h", 3.6),
+        ("vx", "km/h", 3.6),
+        ("ay", "g", 1.0 / GRAVITY),
+    ]
+    found_by = frozenset({"unit", "impossible"})
+    faults += [Fault("in another unit", (name,), unit, found_by, partial(_scaled, factor)) for name, unit, factor in units]
+    faults += [
+        Fault("offset", ("ay",), "0.3 m/s²", frozenset({"offset"}), partial(_shifted, 0.3)),
+        Fault("offset", ("ay",), "1 m/s²", frozenset({"offset"}), partial(_shifted, 1.0)),
+        Fault("offset", ("steer",), "4 deg", frozenset({"offset"}), partial(_shifted, float(np.radians(4.0)))),
+    ]
+    faults += [Fault("held", (name,), f"{HELD_RATE:g} Hz", frozenset({"held"}), partial(_held, HELD_RATE)) for name in ("yaw_rate", "ay")]
+    slow = partial(_low_passed, TIME_CONSTANT)
+    faults += [Fault("low-passed", (name,), f"{TIME_CONSTANT:g} s", frozenset({"bandwidth"}), slow) for name in ("yaw_rate", "ax")]
+    return faults
+
+
+def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> pd.DataFrame:
+    """Which faults the checks find.
+
+    What they say of the untouched recording does not count. A fault is found where one of its checks names one of its channels, or, where
+    the channels contradict each other undecidedly, tells of it among the alternatives.
+
+    Args:
+        recording: as it was measured.
+        faults: all of `planted_faults` if not given; those whose channels are missing are left out.
+
+    Returns:
+        A row a fault: ``fault``, ``channel``, ``size``, ``decidable``, ``found``, ``reported`` (channels that its checks name),
+        ``message``, ``false_alarms`` (checks and channels that nobody touched, separated by "; ").
+    """
+    own = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
+    rows = []
+    for fault in planted_faults() if faults is None else faults:
+        touched = [name for name in fault.channels if name in recording]
+        if not touched:
+            continue
+        new = [finding for finding in _counted(fault(recording)) if (finding.level, finding.check, finding.channel) not in own]
+        right = [one for one in new if one.check in fault.checks and _names(one, touched)]
+        wrong = [one for one in new if one.channel and not _names(one, touched)]
+        rows.append(
+            {
+                "fault": fault.name,
+                "channel": " and ".join(touched),
+                "size": fault.size,
+                "decidable": bool(fault.checks),
+                "found": bool(right),
+                "reported": ", ".join(dict.fromkeys(one.channel or "undecided" for one in right)),
+                "message": right[0].message if right else "",
+                "false_alarms": "; ".join(f"{one.check}: {one.channel}" for one in wrong),
+            }
+        )
+    columns = ["fault", "channel", "size", "decidable", "found", "reported", "message", "false_alarms"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _counted(recording: Recording) -> list[Finding]:
+    return [finding for finding in checks_of_recording(recording) if finding.level != "note" or finding.check in COUNTED_NOTES]
+
+
+def _names(finding: Finding, touched: Sequence[str]) -> bool:
+    """Whether a finding is about one of the channels; ``kinematics`` is about all those that it compares."""
+    if finding.check == "kinematics":
+        return bool({"ay", "yaw_rate", "vx", "vx_ref", "vy_ref"} & set(touched))
+    return finding.channel in touched or (not finding.channel and any(name in finding.message for name in touched))
+
+
+def _late(seconds: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    places = np.arange(len(samples), dtype=np.float64)
+    return np.interp(places - seconds * rate_hz, places, samples)
+
+
+def _scaled(factor: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    return factor * samples
+
+
+def _shifted(offset: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    return samples + offset
+
+
+def _held(held_rate: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    step = max(round(rate_hz / held_rate), 1)
+    return np.repeat(samples[::step], step)[: len(samples)]
+
+
+def _low_passed(time_constant: float, samples: FloatArray, rate_hz: float) -> FloatArray:
+    keep = float(np.exp(-1.0 / (rate_hz * time_constant)))
+    return np.asarray(signal.lfilter([1.0 - keep], [1.0, -keep], samples, zi=[keep * samples[0]])[0], dtype=np.float64)

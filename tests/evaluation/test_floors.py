@@ -1,0 +1,316 @@
+"""Floors of a drive against closed forms, the information form of the bound, filters at work, and planted noise."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from conftest import planar_drive
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.evaluation import floors
+from vehest.evaluation.floors import (
+    SETS,
+    Noise,
+    cramer_rao_floor,
+    drive_of,
+    gauss_markov,
+    inputs_of,
+    posterior_bound,
+    quantisation_step,
+    reference_floor,
+    reference_spread,
+    split_noise,
+    white_level,
+)
+from vehest.evaluation.metrics import Protocol
+from vehest.filters.kalman import LinearModel
+
+RATE = 20.0
+PROTOCOL = Protocol(RATE, 2.0, 1.5)
+FERRARI = Path(os.environ.get("VEHEST_DATA", "")) / "revs" / "20140222_01_01_03_250lm"
+
+
+def noisy_reference(sigma: float, seconds: float = 400.0, ay_noise: float = 0.0, seed: int = 3) -> Recording:
+    """A drive that obeys planar kinematics, white noise on its reference and its accelerometer."""
+    drive = planar_drive(seconds)
+    generator = np.random.default_rng(seed)
+    channels = dict(drive.channels)
+    channels["vy_ref"] = channels["vy_ref"] + sigma * generator.standard_normal(len(drive))
+    channels["ay"] = channels["ay"] + ay_noise * generator.standard_normal(len(drive))
+    return Recording("drive", "car", RATE, 0.0, channels, "simulated")
+
+
+def single_track_drive(seconds: float = 300.0, seed: int = 0) -> Recording:
+    """A car on its axles: v from yaw rate and the rear axle's slip, with slow errors; ax, ay with offset and noise; steering."""
+    generator = np.random.default_rng(seed)
+    n = round(seconds * RATE)
+    time = np.arange(n) / RATE
+    u = 25.0 + 5.0 * np.sin(0.11 * time)
+    r = 0.25 * np.sin(0.4 * time) + 0.15 * np.sin(1.1 * time + 1.0)
+    a = u * r
+    v = 1.1 * r - u * a / (10.0 * 9.81) + markov(generator, n, 0.08, 3.0)
+    ay = np.gradient(v) * RATE + u * r + markov(generator, n, 0.15, 10.0) + 0.2 * generator.standard_normal(n)
+    ax = np.gradient(u) * RATE - v * r + markov(generator, n, 0.05, 10.0) + 0.2 * generator.standard_normal(n)
+    steer = (v + 1.3 * r) / u + a / (9.0 * 9.81) + markov(generator, n, 0.003, 3.0)
+    channels = {"vx": u + 0.01 * generator.standard_normal(n), "yaw_rate": r, "ay": ay, "ax": ax, "steer": steer, "vy_ref": v}
+    return Recording("track", "car", RATE, 0.0, channels, "simulated")
+
+
+def markov(generator: np.random.Generator, n: int, deviation: float, time_constant: float) -> np.ndarray:
+    decay = math.exp(-1.0 / (RATE * time_constant))
+    values = np.empty(n)
+    values[0] = deviation * generator.standard_normal()
+    for k in range(1, n):
+        values[k] = decay * values[k - 1] + deviation * math.sqrt(1 - decay**2) * generator.standard_normal()
+    return values
+
+
+# Noise of the reference
+
+
+@pytest.mark.parametrize("sigma", [0.003, 0.02, 0.1])
+def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent(sigma):
+    floor = reference_floor([drive_of(noisy_reference(sigma), Span("d", "drive"), PROTOCOL)])
+    assert floor.vy == pytest.approx(sigma, rel=0.04)
+
+
+def test_noise_of_the_accelerometer_is_not_taken_for_that_of_the_reference():
+    floor = reference_floor([drive_of(noisy_reference(0.01, ay_noise=0.5), Span("d", "drive"), PROTOCOL)])
+    assert floor.vy == pytest.approx(0.01, rel=0.06)
+
+
+def test_perfect_estimate_scores_the_floor_of_a_noisy_reference():
+    """In sideslip too: the truth itself, held against the reference."""
+    noisy, drive = noisy_reference(0.05), planar_drive(400.0)
+    floor = reference_floor([drive_of(noisy, Span("d", "drive"), Protocol(RATE, 0.0, 0.0))])
+    error = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]) - np.arctan2(noisy["vy_ref"], noisy["vx"]))
+    assert floor.sideslip == pytest.approx(np.sqrt(np.mean(error**2)), rel=0.04)
+
+
+def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
+    """Swings at 2 Hz have third differences like noise; ay and yaw rate tell that they were driven."""
+    time = np.arange(4000) / RATE
+    v, r, u = 0.2 * np.sin(4 * np.pi * time), 0.1 * np.cos(4 * np.pi * time), np.full(4000, 20.0)
+    ay = 0.8 * np.pi * np.cos(4 * np.pi * time) + u * r
+    generator = np.random.default_rng(0)
+    swings = Recording("d", "car", RATE, 0.0, {"vx": u, "yaw_rate": r, "ay": ay, "vy_ref": v + 0.005 * generator.standard_normal(4000)})
+    drive = drive_of(swings, Span("d", "d"), PROTOCOL)
+    assert white_level([drive.vy_ref]) > 0.009
+    assert reference_floor([drive]).vy == pytest.approx(0.005, rel=0.1)
+
+
+def test_reference_in_coarse_steps_errs_by_at_least_its_step_over_root_twelve():
+    drive = planar_drive(200.0)
+    coarse = Recording("d", "car", RATE, 0.0, {**drive.channels, "vy_ref": 0.1 * np.round(drive["vy_ref"] / 0.1)})
+    assert quantisation_step(coarse["vy_ref"]) == pytest.approx(0.1)
+    assert quantisation_step(drive["vy_ref"]) == 0.0
+    assert reference_floor([drive_of(coarse, Span("d", "d"), PROTOCOL)]).vy >= 0.1 / math.sqrt(12) - 1e-9
+
+
+def test_smoothing_hides_noise_so_that_the_floor_is_a_lower_bound():
+    noisy = noisy_reference(0.05)
+    smooth = np.convolve(noisy["vy_ref"], np.full(5, 0.2), "same")
+    hidden = Recording("d", "car", RATE, 0.0, {**noisy.channels, "vy_ref": smooth})
+    left = np.std((smooth - planar_drive(400.0)["vy_ref"])[10:-10])
+    assert reference_floor([drive_of(hidden, Span("d", "d"), PROTOCOL)]).vy < left
+
+
+def test_drive_of_few_samples_has_no_floor():
+    drive = drive_of(planar_drive(2.0), Span("d", "drive"), PROTOCOL)
+    assert reference_floor([drive]) is None
+    assert cramer_rao_floor([drive], SETS[1]) is None
+
+
+# The bound: its recursion
+
+
+def random_model(steps: int, n: int = 4, m: int = 2, seed: int = 1) -> tuple[LinearModel, np.ndarray]:
+    generator = np.random.default_rng(seed)
+    A = np.eye(n) * 0.95 + 0.1 * generator.standard_normal((steps, n, n))
+    roots = [generator.standard_normal((size, size)) for size in (n, m, n)]
+    Q, R, P = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
+    return LinearModel(A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R), P
+
+
+def test_bound_is_the_inverse_of_the_information_of_tichavsky_and_others():
+    """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
+    model, prior = random_model(200)
+    bound = posterior_bound(model, prior)
+    inverse_Q, inverse_R = np.linalg.inv(model.process_noise), np.linalg.inv(model.observation_noise)
+    told = [C.T @ inverse_R @ C for C in model.observation]
+    information = np.linalg.inv(prior) + told[0]
+    for k in range(200):
+        assert np.allclose(bound[k], np.linalg.inv(information), rtol=1e-8)
+        if k < 199:
+            A = model.transition[k]
+            D11, D12 = A.T @ inverse_Q @ A, -A.T @ inverse_Q
+            information = inverse_Q + told[k + 1] - D12.T @ np.linalg.solve(information + D11, D12)
+
+
+def test_bound_is_the_covariance_of_another_librarys_kalman_filter():
+    model, prior = random_model(50)
+    other = KalmanFilter(dim_x=4, dim_z=2)
+    other.P, other.Q, other.R = prior.copy(), model.process_noise, model.observation_noise
+    for k, covariance in enumerate(posterior_bound(model, prior)):
+        other.update(np.zeros((2, 1)), H=model.observation[k])
+        assert np.allclose(covariance, other.P, rtol=1e-8)
+        other.predict(F=model.transition[k])
+
+
+def test_long_drives_are_bounded_in_chunks_of_the_same_outcome(monkeypatch):
+    drive = drive_of(single_track_drive(60.0), Span("d", "track"), PROTOCOL)
+    whole = cramer_rao_floor([drive], SETS[-1])
+    monkeypatch.setattr(floors, "CHUNK", 97)
+    chunks = cramer_rao_floor([drive], SETS[-1])
+    assert (chunks.vy, chunks.sideslip) == (pytest.approx(whole.vy, rel=1e-9), pytest.approx(whole.sideslip, rel=1e-9))
+
+
+# The bound: its levels
+
+
+def test_white_and_slow_noise_are_told_apart():
+    """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2 that lasts 8 s."""
+    generator = np.random.default_rng(4)
+    n = 48_000
+    found = split_noise([markov(generator, n, 0.2, 8.0) + 0.3 * generator.standard_normal(n)], RATE)
+    assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
+    assert found.deviation == pytest.approx(0.2, rel=0.1)
+    assert found.time_constant == pytest.approx(8.0, rel=0.35)
+
+
+def test_white_noise_alone_has_no_slow_part_to_speak_of():
+    found = split_noise([0.3 * np.random.default_rng(5).standard_normal(48_000)], RATE)
+    assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
+    assert found.deviation < 0.02
+
+
+def test_spread_and_correlation_time_of_a_process_are_found():
+    found = gauss_markov([markov(np.random.default_rng(6), 48_000, 0.7, 2.5)], RATE)
+    assert found == Noise(0.0, pytest.approx(0.7, rel=0.1), pytest.approx(2.5, rel=0.2))
+
+
+# The bound: of drives
+
+
+def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_reference():
+    drives = [drive_of(single_track_drive(), Span("d", "track"), PROTOCOL)]
+    spread = reference_spread(drives)
+    for car in (False, True):
+        found = {frozenset(inputs): cramer_rao_floor(drives, inputs, car=car) for inputs in SETS}
+        assert all(floor.vy <= spread.vy * (1 + 1e-6) for floor in found.values())
+        same_a = [inputs for inputs in found if "ay" in inputs]
+        for fewer in same_a:
+            for more in same_a:
+                if fewer < more:
+                    assert found[more].vy <= found[fewer].vy * (1 + 1e-9), (fewer, more)
+        if car:
+            assert found[frozenset({"vx", "yaw_rate"})].vy < 0.5 * spread.vy
+
+
+def test_kinematics_alone_tells_nothing_without_accelerations():
+    drives = [drive_of(single_track_drive(), Span("d", "track"), Protocol(RATE, 0.0, 0.0))]
+    assert cramer_rao_floor(drives, SETS[0], car=False).vy == pytest.approx(reference_spread(drives).vy, rel=1e-6)
+
+
+def test_longitudinal_acceleration_tells_v_in_bends_and_not_straight_ahead():
+    bends = single_track_drive()
+    straight = Recording("s", "car", RATE, 0.0, {**bends.channels, "yaw_rate": np.zeros(len(bends))})
+    for recording, helps in ((bends, True), (straight, False)):
+        drives = [drive_of(recording, Span("d", recording.id), PROTOCOL)]
+        without, with_ax = (cramer_rao_floor(drives, inputs, car=False).vy for inputs in SETS[1:3])
+        assert (with_ax < 0.8 * without) is helps
+
+
+def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
+    """Drives drawn from v⁺ = φ v + ξ, ay = dv/dt + uω + offset + noise: an optimal filter's error is the bound's, to a few per cent."""
+    generator, n, step = np.random.default_rng(7), 6000, 1.0 / RATE
+    v, offset, white = markov(generator, n + 1, 0.8, 3.0), markov(generator, n, 0.15, 10.0), 0.3
+    ay = np.diff(v) * RATE - offset - white * generator.standard_normal(n)
+    channels = {"vx": np.full(n, 20.0), "yaw_rate": np.zeros(n), "ay": ay, "vy_ref": v[:-1]}
+    drives = [drive_of(Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), Protocol(RATE, 0.0, 0.0))]
+    decay, slow = math.exp(-step / 3.0), math.exp(-step / 10.0)
+    own = KalmanFilter(dim_x=3, dim_z=1)  # v, v a sample earlier, offset
+    own.x, own.P = np.zeros((3, 1)), np.diag([0.8**2, 0.8**2, 0.15**2])
+    own.F = np.array([[decay, 0, 0], [1, 0, 0], [0, 0, slow]])
+    own.Q = np.diag([0.8**2 * (1 - decay**2), 0.0, 0.15**2 * (1 - slow**2)])
+    own.H, own.R = np.array([[RATE, -RATE, -1.0]]), np.array([[white**2]])
+    errors = []
+    for k in range(n):
+        own.predict()
+        own.update(ay[k])
+        errors.append(own.x[1, 0] - v[k])
+    assert cramer_rao_floor(drives, SETS[1], car=False).vy == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.1)
+
+
+def test_state_that_is_handed_over_lowers_the_bound_of_short_sequences():
+    cold, told = (
+        [drive_of(single_track_drive(12.0), Span("d", "track"), Protocol(RATE, 0.0, 0.0, initial_state=given))] for given in (False, True)
+    )
+    assert cramer_rao_floor(told, SETS[1], car=False).vy < cramer_rao_floor(cold, SETS[1], car=False).vy
+
+
+def test_gaps_and_standstill_leave_the_bound_finite():
+    drive = single_track_drive(60.0)
+    vx, ay = drive["vx"].copy(), drive["ay"].copy()
+    vx[400:600], ay[700:720] = 0.0, np.nan
+    gappy = Recording("d", "car", RATE, 0.0, {**drive.channels, "vx": vx, "ay": ay}, gappy=frozenset({"ay"}))
+    floor = cramer_rao_floor([drive_of(gappy, Span("d", "d"), PROTOCOL)], SETS[-1])
+    assert 0 < floor.vy < 1
+    assert 0 < floor.sideslip < 104
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-6, 1.0])
+def test_drives_without_noise_or_without_motion_leave_every_bound_finite(scale):
+    drive = planar_drive(60.0)
+    for vx in (drive["vx"], np.zeros(len(drive))):
+        channels = {name: scale * samples for name, samples in drive.channels.items()} | {"vx": vx}
+        drives = [drive_of(Recording("d", "car", RATE, 0.0, channels), Span("d", "d"), PROTOCOL)]
+        spread = reference_spread(drives)
+        for inputs in SETS[:3]:
+            for car in (False, True):
+                assert 0 <= cramer_rao_floor(drives, inputs, car=car).vy <= spread.vy + 1e-8
+
+
+# Which bound is whose
+
+
+def test_inputs_of_an_estimator_decide_its_bound():
+    assert inputs_of(("yaw_rate", "vx", "ay", "ax")) == {"yaw_rate", "vx", "ay", "ax"}
+    assert inputs_of(("motor_speed", "motor_current", "yaw_rate", "steer")) == {"vx", "yaw_rate", "steer"}
+    assert inputs_of(("wheel_speed_fl", "yaw_rate", "handwheel")) == {"vx", "yaw_rate", "steer"}
+
+
+def test_no_bound_suits_an_estimator_without_yaw_rate_or_with_measured_tyre_forces():
+    assert inputs_of(("vx",)) is None
+    assert inputs_of(("vx", "yaw_rate", "ay", "fy_front_left")) is None
+
+
+def test_bound_of_inputs_that_a_drive_lacks_is_none_and_of_unknown_ones_refused():
+    drives = [drive_of(single_track_drive(30.0).select(["vx", "yaw_rate", "vy_ref"]), Span("d", "track"), PROTOCOL)]
+    assert cramer_rao_floor(drives, SETS[0]) is not None
+    assert cramer_rao_floor(drives, SETS[1]) is None
+    with pytest.raises(ValueError, match="inputs of a bound are vx, yaw_rate and some of"):
+        cramer_rao_floor(drives, ("vx", "ay"))
+
+
+# A real drive
+
+
+@pytest.mark.skipif(not FERRARI.is_dir(), reason="VEHEST_DATA holds no revs/20140222_01_01_03_250lm")
+def test_ferrari_is_no_silent_drive_and_its_reference_no_limit():
+    """On the validation range: the reference is far better than any estimator, and inputs determine v well below its spread."""
+    samples = {name: np.loadtxt(FERRARI / f"{file}.txt")[::5] for name, file in FILES.items()}
+    drives = [drive_of(Recording("lap", "ferrari", RATE, 149.99, samples), Span("d", "lap", 450.0, 550.0), Protocol())]
+    spread, noise = reference_spread(drives), reference_floor(drives)
+    bound = {inputs: cramer_rao_floor(drives, inputs) for inputs in SETS}
+    assert noise.sideslip < 0.2 * min(own.sideslip for own in bound.values())
+    assert max(own.vy for own in bound.values()) < 0.4 * spread.vy
+
+
+FILES = {"vx": "vx", "vy_ref": "vy", "ax": "axCG", "ay": "ayCG", "yaw_rate": "yawRate", "steer": "delta"}
