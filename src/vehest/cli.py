@@ -580,6 +580,8 @@ def data_show(
             f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
             f"{_stretch(recording['start'], recording['end'])}, {recording['samples']} samples"
         )
+        for line in recording["origin"]:
+            _echo(f"  {line}")
         rows = [[c["name"], c["unit"], *(f"{c[key]:.4g}" for key in ("min", "mean", "max", "std"))] for c in recording["channels"]]
         _table(["channel", "unit", "min", "mean", "max", "std"], rows)
 

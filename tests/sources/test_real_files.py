@@ -71,6 +71,9 @@ def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(
         moving, angle = recording["vx"] > 8.0, "handwheel" if "handwheel" in recording else "steer"
         assert np.corrcoef(recording[angle][moving], recording["yaw_rate"][moving])[0, 1] > 0.5
         assert ("vy_ref" in recording) == ("ay" not in recording) == (dataset == "av21")
+        if dataset == "av21":  # measured by wheels, within half a per cent and their latency
+            assert np.std((recording["vx"] - recording["vx_ref"])[moving]) < 0.25
+            assert np.median((recording["vx"] / recording["vx_ref"])[moving]) == pytest.approx(1.0, abs=0.006)
 
 
 def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
+from vehest.sources.base import origin_in_words
 from vehest.sources.tabular import TabularSource
 
 RATE = 100.0
@@ -200,3 +201,17 @@ def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
 def test_runs_are_told_by_a_column_or_by_time_not_both(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="time_restarts cannot begin runs where a column counts its runs"):
         source(tmp_path, runs="run", time_restarts=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"reference_point": "unknown"}, ["reference measured at a point that is not known"]),
+        ({"reference_point": {"x": 0.0, "y": 0.0}, "imu_point": {"x": -0.2, "y": 0.0}},
+         ["reference measured at the centre of gravity", "inertial unit 0.2 m behind the centre of gravity"]),
+        ({"reference_point": {"x": 0.4, "y": -0.1}},
+         ["reference measured 0.4 m ahead of and 0.1 m to the right of the centre of gravity, moved to it"]),
+    ],
+)  # fmt: skip
+def test_where_channels_were_measured_is_said_in_words(tmp_path: Path, options: dict[str, Any], said: list[str]) -> None:
+    assert origin_in_words(read(circle(), tmp_path, pose=POSE, **options)) == said

@@ -47,6 +47,7 @@ UNITS: dict[str, str] = {
     "floor_reference_vy": "m/s",
     "floor_cramer_rao": "deg",
     "floor_cramer_rao_vy": "m/s",
+    "lever_arm": "m",
     "n_sequences": "1",
     "n_parameters": "1",
     "epochs": "1",

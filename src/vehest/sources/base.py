@@ -78,6 +78,32 @@ class CommonOptions:
     imu_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
 
 
+def origin_in_words(recording: Recording) -> list[str]:
+    """What a data set says of where a recording's channels were measured and what they were made of, a line each."""
+    told = recording.provenance.get(DERIVED) or {}
+    lines = []
+    if "reference_point" in told:
+        moved = ", moved to it" if told.get("moved_to_centre_of_gravity") else ""
+        lines.append(f"reference measured {_point_in_words(told['reference_point'])}{moved}")
+    if "imu_point" in told:
+        lines.append(f"inertial unit {_point_in_words(told['imu_point'])}")
+    if told.get("transforms"):
+        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in told['transforms'])}")
+    held = recording.provenance.get("held")
+    if held:
+        lines.append(f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between")
+    return lines
+
+
+def _point_in_words(point: Any) -> str:
+    if point == UNKNOWN:
+        return "at a point that is not known"
+    x, y = float(point.get("x", 0.0)), float(point.get("y", 0.0))
+    parts = [f"{abs(x):g} m {'ahead of' if x > 0 else 'behind'}"] if x else []
+    parts += [f"{abs(y):g} m to the {'left' if y > 0 else 'right'} of"] if y else []
+    return f"{' and '.join(parts)} the centre of gravity" if parts else "at the centre of gravity"
+
+
 class Source(ABC):
     """Reads one data set.
 

@@ -24,6 +24,7 @@ from vehest.estimators.registry import estimator_module
 from vehest.evaluation.blocks import Segments, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.intervals import figure_intervals
+from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, sequences
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan
@@ -159,7 +160,7 @@ def code_of_evaluation(module: str) -> str:
     Args:
         module: that of the estimator.
     """
-    parts = ("blocks", "floors", "intervals", "metrics", "regimes")
+    parts = ("blocks", "floors", "intervals", "lever_arm", "metrics", "regimes")
     return code_version([module, *(f"vehest.evaluation.{part}" for part in parts), "vehest.estimators.model_files"], own=[__name__])
 
 
@@ -187,6 +188,8 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
             if estimator.causal:
                 figures["step_seconds"] = _step_seconds(estimator, _measured(job, pieces[0]))
         rows += _rows(estimator, about, job, name, spans, figures, figure_intervals(blocks[name]))
+        with_lever = lever_arm_figures(scored, pieces_of(spans, job.reference, job.protocol), job.protocol)
+        rows += _rows(estimator, about, job, name, spans, with_lever, {}, condition=CONDITION)
         if name != VALIDATION:
             masks = [regimes_of(reference, piece, job.protocol) for reference, piece in pieces_of(spans, job.reference, job.protocol)]
             for regime, own in errors_by_regime(scored, masks, job.protocol.rate_hz).items():
@@ -209,13 +212,14 @@ def _rows(
     figures: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]],
     subset: str = "all",
+    condition: str = "nominal",
 ) -> list[tuple[Any, ...]]:
-    """Rows of `COLUMNS` for one set of ranges, or for the samples of it that lie in a regime."""
+    """Rows of `COLUMNS` for one set of ranges, for the samples of it that lie in a regime, or under another condition."""
     trained_on = "+".join(about.datasets)
     datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
     kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
     mode = "causal" if estimator.causal else "offline"
-    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, subset, "nominal", job.protocol.rate_hz, mode)
+    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, subset, condition, job.protocol.rate_hz, mode)
     rows = []
     for metric, value in figures.items():
         ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
-from vehest.sources.base import kind_of, open_source, read_single
+from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.unused import unused_columns
 from vehest.stages.artefacts import find
 from vehest.stages.config import Config, compose_config
@@ -172,6 +172,7 @@ def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]
         "samples": len(recording),
         "channels": channels,
         "provenance": dict(recording.provenance),
+        "origin": origin_in_words(recording),
     }
 
 

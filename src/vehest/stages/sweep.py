@@ -315,7 +315,7 @@ def _figures(member: Member | None, sets: Sequence[str]) -> dict[str, Any]:
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(columns, float("nan"))
     table = read_frame(member.evaluation.folder / METRICS, COLUMNS, numbers=("value",))
-    table = table[table["subset"] == "all"]
+    table = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
     found = {f"{metric}.{name}": value for metric, name, value in zip(table["metric"], table["test_set"], table["value"], strict=True)}
     own = {metric: next(value for name, value in found.items() if name.startswith(f"{metric}.")) for metric in ("n_parameters", "epochs")}
     return {**own, **{column: found.get(column, float("nan")) for column in columns[2:]}, "model": member.model.folder.name}

@@ -330,7 +330,7 @@ class Workshop:
 def test_figures(evaluation: Artefact) -> dict[str, float]:
     """Figures of an evaluation over all samples, ``<metric>.<test set>`` -> value."""
     table = read_metrics(evaluation.folder)
-    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all")]
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all") & (table["condition"] == "nominal")]
     return {
         f"{metric}.{name}": float(value) for metric, name, value in zip(tested["metric"], tested["test_set"], tested["value"], strict=True)
     }

@@ -1,0 +1,89 @@
+"""Errors with the best lever arm, where nobody knows at which point of the car the reference was measured.
+
+Lateral velocity x ahead of a point is v + x·r, and satisfies the kinematics as well for any x: inertial sensors cannot tell an estimate
+at one point from an error at another. Where the reference's point is unknown, the plain error therefore ranks estimators by the point that
+each happened to learn, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
+
+CONDITION = "best_lever_arm"
+"""What rows of such errors say in the column ``condition``."""
+LONGEST = 0.5  # m, ahead of the reference's point or behind it
+METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
+
+
+@dataclass(frozen=True)
+class LeverArm:
+    """A lever arm and what is left with it.
+
+    Args:
+        x: how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way.
+        parts: the estimates at the reference's point.
+    """
+
+    x: float
+    parts: tuple[Scored, ...]
+
+
+def point_is_unknown(reference: Recording) -> bool:
+    """Whether a recording's data set says that nobody knows where its reference was measured."""
+    derived = reference.provenance.get("derived")
+    return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
+
+
+def best_lever_arm(parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray]) -> LeverArm:
+    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
+
+    Args:
+        parts: estimate and reference, of all ranges of a test set.
+        yaw_rates: r [rad/s] at the same samples.
+        speeds: u [m/s], by which sideslip is made of v.
+    """
+    error = np.concatenate([part.vy - part.vy_ref for part in parts])
+    turning = np.concatenate(list(yaw_rates))
+    power = float(turning @ turning)
+    x = float(np.clip(error @ turning / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
+    moved = []
+    for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
+        vy = part.vy - x * yaw_rate
+        moved.append(replace(part, vy=vy, sideslip=np.arctan2(vy, speed)))
+    return LeverArm(x, tuple(moved))
+
+
+def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
+    """Errors with the best lever arm, and the lever arm, of a test set whose references were all measured at unknown points.
+
+    Args:
+        parts: estimate and reference, of each piece.
+        pieces: whole recordings at ``protocol.rate_hz`` and the ranges, or sequences, in them, as `pieces_of` counts them.
+        protocol: see `Protocol`.
+
+    Returns:
+        metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.
+    """
+    yaw_rates, speeds = [], []
+    for reference, span in pieces:
+        turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
+        if turning is None or not point_is_unknown(reference):
+            return {}
+        first, end = scored_range(reference, span, protocol)
+        yaw_rates.append(reference[turning][first:end])
+        speeds.append(reference["vx"][first:end])
+        if not np.isfinite(yaw_rates[-1]).all():
+            return {}
+    if not yaw_rates:
+        return {}
+    best = best_lever_arm(parts, yaw_rates, speeds)
+    figures = accuracy(best.parts)
+    return {**{name: figures[name] for name in METRICS}, "lever_arm": best.x}
