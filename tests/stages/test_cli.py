@@ -194,7 +194,7 @@ def test_check_reports_a_reference_that_points_the_wrong_way(place):
     )
     code, out, _ = place("data", "check", "mirrored")
     assert code == 0
-    assert "disagrees in sign with d(vy_ref)/dt" in out
+    assert "d(vy_ref)/dt and ay - vx·yaw_rate disagree in sign" in out
 
 
 def test_config_prints_what_a_command_would_use(place):

@@ -95,7 +95,7 @@ def relations_of(motion: Motion) -> list[Relation]:
     if motion.speed and "yaw_rate" in motion and motion.steering:
         found += _steered(motion)
     if motion.speed and "ax" in motion and band is not None:
-        found += _filtered(band, motion["ax"], motion.forward, "ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1))
+        found += _longitudinal(motion, band)
     for name in ("yaw_rate", "vx"):
         reference = f"{name}_ref"
         if name in motion and reference in motion:
@@ -128,8 +128,7 @@ def _lateral(motion: Motion, band: _Band | None) -> list[Relation]:
     a, p, d, steep = (band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning)))
     if d.std() < LEAST_SLIDING or p.std() == 0.0:
         return found
-    explained, _ = np.linalg.qr(np.stack([p, steep / motion.rate_hz], axis=1))
-    left, right = (samples - explained @ (explained.T @ samples) for samples in (a, d))
+    left, right = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
     partial = _compared(right, left)
     if partial is not None and abs(partial[1]) >= SIGN_CORRELATION:
         powers = (1, -1, 1) if motion.velocity == "sideslip_ref" else (1, -1)
@@ -154,13 +153,21 @@ def _steered(motion: Motion) -> list[Relation]:
     return [Relation(motion.steering, "yaw_rate", names, (1, -1, 1), *compared, tolerance=np.inf)]
 
 
-def _filtered(
-    band: _Band, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
-) -> list[Relation]:
-    compared = _compared(band(left), band(right))
+def _longitudinal(motion: Motion, band: _Band) -> list[Relation]:
+    """ax against d(vx)/dt, both without vy·yaw_rate, whose sign and unit may be wrong as well."""
+    left, right = band(motion["ax"]), band(motion.derivative(motion.vx))
+    if motion.velocity and "yaw_rate" in motion:
+        left, right = _without(np.stack([band(motion.vy * motion["yaw_rate"])], axis=1), left, right)
+    compared = _compared(left, right)
     if compared is None or abs(compared[1]) < STEADY_CORRELATION:
         return []
-    return [Relation(name, other, channels, powers, *compared, tolerance=LONGITUDINAL_TOLERANCE)]
+    return [Relation("ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1), *compared, tolerance=LONGITUDINAL_TOLERANCE)]
+
+
+def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
+    """What columns (T, C) do not explain of signals (T,)."""
+    basis, _ = np.linalg.qr(columns)
+    return [samples - basis @ (basis.T @ samples) for samples in signals]
 
 
 def _direct(
