@@ -35,7 +35,7 @@ def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too
     late = recording.time >= recording.start_time + 1.5 - 1e-9
     rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
     assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
-    assert [row["rmse_sideslip"] for row in shown["overview"]] == [pytest.approx(nominal["rmse_sideslip"])]
+    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [pytest.approx(nominal["rmse_sideslip"])]
 
 
 @pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
