@@ -300,7 +300,7 @@ def test_transforms_are_built_from_plain_values() -> None:
     assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
     # Those of an alignment are built from plain values in test_alignment.py.
-    of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio"}
+    of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
     others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
     deriving = {"acceleration_from_speed", "velocity_from_sideslip", "sideslip_from_velocity", "scale_to_wheelbase"}

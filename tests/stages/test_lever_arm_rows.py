@@ -1,0 +1,44 @@
+"""Rows of errors with the best lever arm in a study's metrics: where the reference's point is unknown, and nowhere else."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from place import DATASET, Place
+from vehest.data.store import read_recording
+
+
+def run(place: Place, point: object) -> tuple[pd.DataFrame, dict[str, Any]]:
+    declared = DATASET if point is None else {**DATASET, "reference_point": point}
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(declared))
+    pipeline = {"study": "levers", "report": "drive", "split": "mine", "sweeps": [["estimator=zero"]]}
+    (place.folder / "pipelines" / "levers.yaml").write_text(yaml.safe_dump(pipeline))
+    code, out, err = place("run", "levers", "tracking=none", "output=out", "--json")
+    assert code == 0, err
+    metrics = next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv"
+    return pd.read_csv(metrics), json.loads(out)
+
+
+def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place: Place) -> None:
+    table, shown = run(place, "unknown")
+    tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
+    levers, nominal = (tests[tests["condition"] == name].set_index("metric")["value"] for name in ("best_lever_arm", "nominal"))
+    assert set(levers.index) == {"rmse_vy", "rmse_sideslip", "fvu", "lever_arm"}
+    assert levers["lever_arm"] == 0.5  # v is about -2.2 m·r, so v = 0 lies as far ahead as is allowed
+    recording = read_recording(next((place.folder / "out" / "downsample").glob("mine-20hz-*")) / "three.parquet")
+    late = recording.time >= recording.start_time + 1.5 - 1e-9
+    rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
+    assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
+    assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [pytest.approx(nominal["rmse_sideslip"])]
+
+
+@pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
+def test_where_the_point_is_known_or_undeclared_there_are_none(place: Place, point: object) -> None:
+    table, _ = run(place, point)
+    assert set(table["condition"]) == {"nominal"}
