@@ -249,6 +249,8 @@ def sign_findings(relations: Sequence[Relation], motion: Motion) -> list[Finding
     explanations = turned_channels(relations, motion)
     if not explanations:
         return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
+    if (motion.speed,) in explanations:  # only suspected where it is negative, and the check reverse tells of it
+        return []
     best, others = explanations[0], explanations[1:]
     if _decided(relations, explanations):
         alternative = f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
