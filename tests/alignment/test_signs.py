@@ -184,3 +184,9 @@ def test_no_recording_raises_or_warns(seed: int) -> None:
         warnings.simplefilter("error")
         for finding in checks_of_recording(recording):
             assert "\n" not in finding.message
+
+
+def test_a_drive_backwards_is_left_to_the_check_of_it() -> None:
+    drive = without(broadband_drive(), "vx_ref", "vy_ref", "sideslip_ref", "yaw_rate_ref")
+    assert not warned(turned(drive, "vx"))
+    assert [finding.check for finding in checks_of_recording(turned(drive, "vx"))] == ["reverse"]

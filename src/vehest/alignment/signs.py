@@ -99,13 +99,14 @@ def relations_of(motion: Motion) -> list[Relation]:
     for name in ("yaw_rate", "vx"):
         reference = f"{name}_ref"
         if name in motion and reference in motion:
-            found += _direct(motion, motion[name], motion[reference], name, reference, (name, reference), (1, -1))
+            found += _direct(motion.moving, motion[name], motion[reference], name, reference, (name, reference), (1, -1))
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
         expected = np.arctan2(motion.vy, motion.vx)
-        if np.std(expected[motion.moving]) >= LEAST_SIDESLIP:
+        forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
+        if np.count_nonzero(forwards) >= FEWEST_SAMPLES and np.std(expected[forwards]) >= LEAST_SIDESLIP:
             names = ("sideslip_ref", "vy_ref", motion.speed)
             right = f"atan2(vy_ref, {motion.speed})"
-            found += _direct(motion, motion["sideslip_ref"], expected, "sideslip_ref", right, names, (1, -1, 1))
+            found += _direct(forwards, motion["sideslip_ref"], expected, "sideslip_ref", right, names, (1, -1, 1))
     return [relation for relation in found if np.isfinite(relation.scale) and np.isfinite(relation.correlation) and relation.scale != 0.0]
 
 
@@ -171,12 +172,11 @@ def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
 
 
 def _direct(
-    motion: Motion, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
+    used: BoolArray, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
 ) -> list[Relation]:
-    moving = motion.moving
-    if np.count_nonzero(moving) < FEWEST_SAMPLES:
+    if np.count_nonzero(used) < FEWEST_SAMPLES:
         return []
-    compared = _compared(left[moving], right[moving])
+    compared = _compared(left[used], right[used])
     if compared is None or abs(compared[1]) < STEADY_CORRELATION:
         return []
     return [Relation(name, other, channels, powers, *compared, least_correlation=SAME_CORRELATION)]
@@ -249,6 +249,8 @@ def sign_findings(relations: Sequence[Relation], motion: Motion) -> list[Finding
     explanations = turned_channels(relations, motion)
     if not explanations:
         return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
+    if (motion.speed,) in explanations:  # only suspected where it is negative, and the check reverse tells of it
+        return []
     best, others = explanations[0], explanations[1:]
     if _decided(relations, explanations):
         alternative = f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
