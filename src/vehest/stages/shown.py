@@ -76,6 +76,12 @@ def shown_of_pipeline(title: str, outcome: PipelineOutcome) -> Shown:
         given = " (estimates start at the reference state)" if (rows_of_set["start"] == "reference").any() else ""
         board = tuple(_board_row(row) for row in rows_of_set.to_dict("records"))
         boards.append(ShownTable(f"{title}: test set '{test_set}'{given}", BOARD_HEADER, board))
+    short = [
+        f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner"
+        for test_set, rows_of_set in outcome.leaderboard.groupby("test_set", sort=False)
+        if rows_of_set["rmse_sideslip_low"].isna().all()
+    ]
+    note = "\n".join([*short, *([note] if note else [])])
     figures = {"leaderboard": _records(outcome.leaderboard)} | failed
     return Shown(tuple(boards), note, "report.html", json.dumps(figures))
 

@@ -16,6 +16,7 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.errors import printable
 from vehest.data.splits import TRAINING, VALIDATION, Span
+from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
@@ -29,6 +30,7 @@ from vehest.studies.kit.warnings import warnings_of
 TAKES = "split"
 ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
+EARLIEST_UNIX = 1e8  # s, from which on times count from 1970
 
 _ACCURACY = ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip")
 _OF_MODEL = ("n_parameters", "epochs")
@@ -160,7 +162,7 @@ def _headline(artefacts: PartArtefacts) -> list[Block]:
 def _where(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
     kind = " and ".join(sorted({artefacts.kinds[span.dataset] for span in spans}))
-    return f"test set `{test_set}` ({kind}; {_spans_in_words(spans)})"
+    return f"test set `{test_set}` ({kind}; {_spans_in_words(artefacts, spans)})"
 
 
 def data_sentence(artefacts: PartArtefacts) -> str:
@@ -226,7 +228,7 @@ def _ranges(artefacts: PartArtefacts) -> pd.DataFrame:
             "dataset": artefacts.data_titles.get(span.dataset, span.dataset),
             "kind": artefacts.kinds[span.dataset],
             "recording": printable(span.recording),
-            "range": _range_in_words(span),
+            "range": _range_in_words(span, _begin_of(artefacts, span)),
             "seconds": span.stop - span.start if math.isfinite(span.stop - span.start) else math.nan,
         }
         for role, spans in roles
@@ -235,16 +237,27 @@ def _ranges(artefacts: PartArtefacts) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _range_in_words(span: Span) -> str:
+def _range_in_words(span: Span, begin: float = 0.0) -> str:
+    """A range; ``begin`` is where its recording starts if times are unix time, and is taken off [s]."""
+    start, stop, after = span.start - begin, span.stop - begin, " after its start" if begin else ""
     if span.start == -math.inf:
-        return "all of it" if span.stop == math.inf else f"up to {span.stop:g} s"
-    return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
+        return "all of it" if span.stop == math.inf else f"up to {stop:.7g} s{after}"
+    return f"from {start:.7g} s{after}" if span.stop == math.inf else f"{start:.7g} to {stop:.7g} s{after}"
 
 
-def _spans_in_words(spans: Sequence[Span]) -> str:
+def _begin_of(artefacts: PartArtefacts, span: Span) -> float:
+    """Where a recording in unix time starts [s]; 0 where its clock is another one."""
+    file = artefacts.references.get((span.dataset, span.recording))
+    bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
+    if file is None or not bounds or min(bounds) < EARLIEST_UNIX:
+        return 0.0
+    return read_recording(file, ["vx"]).start_time
+
+
+def _spans_in_words(artefacts: PartArtefacts, spans: Sequence[Span]) -> str:
     if len(spans) > 3:
         return f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
-    return "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(span)}" for span in spans)
+    return "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(span, _begin_of(artefacts, span))}" for span in spans)
 
 
 def _plural(word: str, count: int) -> str:
