@@ -77,7 +77,7 @@ def test_errors_of_all_folds_count_together(across) -> None:
 
 def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> None:
     code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
-    assert code == 5
+    assert code == 5, err
     assert "steer" in err
     found = json.loads(out)
     titles = [row["estimator"] for row in found["overview"]]

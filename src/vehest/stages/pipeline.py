@@ -381,8 +381,7 @@ def run_pipeline(
         workshop.tags = {"vehest.study": pipeline.study}
         compared, absent = _run_parts(pipeline, configs, workshop, only_report=only_report)
         failed = failed_in(compared.values(), workshop)
-        shows_failed = not pipeline.in_parts or getattr(study_module(pipeline.report), "SHOWS_FAILED", False)
-        if failed is not None and not (shows_failed and any(own.members for own in compared.values())):
+        if failed is not None and not (_shows_failed(pipeline) and any(own.members for own in compared.values())):
             raise failed
         parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if _has_members(compared, part)}
     job = ReportJob(
@@ -425,7 +424,7 @@ def _run_parts(
         except NotThereYet:
             waits = True
     lacking = [failure.message for own in prepared.values() for failure in own.failures.values()]
-    if pipeline.in_parts and lacking:
+    if lacking and not _shows_failed(pipeline):
         raise DataError(f"a study in parts needs all of its jobs; {'; '.join(dict.fromkeys(lacking))}")
     for name, own in prepared.items():
         try:
@@ -438,6 +437,11 @@ def _run_parts(
     if not compared:
         raise MissingError(f"nothing that '{pipeline.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
     return compared, absent
+
+
+def _shows_failed(pipeline: Pipeline) -> bool:
+    """Whether a study's report can leave out what failed: one that is not in parts, or whose module says so."""
+    return not pipeline.in_parts or bool(getattr(study_module(pipeline.report), "SHOWS_FAILED", False))
 
 
 def _has_members(compared: Mapping[str, Compared], part: Part) -> bool:
