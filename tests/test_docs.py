@@ -22,6 +22,7 @@ from fuzz import case
 from vehest.alignment import checks
 from vehest.cli import app
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
+from vehest.data.recording import Recording
 from vehest.data.split_files import split_from_config
 from vehest.data.transforms import TRANSFORMS, Resample
 from vehest.estimators.model_files import save_model
@@ -135,8 +136,9 @@ def test_example_files_are_valid(workplace):
     assert {"conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_study.yaml"} <= shown
     for file in sorted((workplace / "conf" / "dataset").glob("*.yaml")):
         open_source(compose_config("ingest", [f"dataset={file.stem}"])["dataset"])
+    lap = Recording("lap", "car", 20.0, 0.0, {"vx": np.full(400, 20.0)})
     for file in sorted((workplace / "conf" / "split").glob("*.yaml")):
-        split = split_from_config(compose_config("train", [f"split={file.stem}"])["split"])
+        split = split_from_config(compose_config("train", [f"split={file.stem}"])["split"], lambda _: {"lap": lambda _: lap})
         assert set(split.datasets) <= set(choices("dataset"))
     for file in sorted((workplace / "pipelines").glob("*.yaml")):
         assert pipeline_configs(read_pipeline(str(file)), [])

@@ -1,0 +1,75 @@
+"""What is said of real recordings: statistics against closed forms, and the report on recordings made here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vehest.data.recording import Recording
+from vehest.data.store import write_recording
+from vehest.report.document import Table
+from vehest.studies.artefacts import StoredDataset, StudyArtefacts
+from vehest_papers.real_cars.document import documents
+from vehest_papers.real_cars.statistics import statistics_of
+
+
+def drive(seconds: float = 120.0, size: float = 1.0, noise: float = 0.0, name: str = "lap") -> Recording:
+    """At 20 m/s in a sinusoidal course; v = size·(static part + a part that no static map has) and white noise on its reference."""
+    time = np.arange(round(100.0 * seconds)) / 100.0
+    yaw_rate = 0.3 * np.sin(0.4 * time)
+    vx = np.full_like(time, 20.0)
+    vy = size * (-2.0 * yaw_rate + 0.2 * np.cos(0.4 * time))
+    ay = np.gradient(vy) * 100.0 + vx * yaw_rate
+    vy_ref = vy + noise * np.random.default_rng(0).standard_normal(len(time))
+    channels = {"vx": vx, "yaw_rate": yaw_rate, "ay": ay, "ax": np.zeros_like(time), "vy_ref": vy_ref}
+    return Recording(name, "car", 100.0, 0.0, channels, provenance={"derived": {"reference_point": "unknown"}})
+
+
+def test_statistics_are_those_of_the_closed_form() -> None:
+    """At constant speed a static map is one factor of the yaw rate, and the cosine that it leaves has 1/√2 of its amplitude."""
+    found = statistics_of([drive()])
+    level = math.degrees(0.2 / math.sqrt(2.0) / 20.0)
+    assert found.static_map == pytest.approx(level, rel=0.02)
+    assert found.rms == pytest.approx(math.degrees(math.sqrt(0.6**2 / 2.0 + 0.2**2 / 2.0) / 20.0), rel=0.02)
+    assert found.speed == pytest.approx((20.0, 20.0))
+    assert found.driven == pytest.approx(120.0, abs=0.1)
+    assert found.point == "unknown"
+    assert found.reasons == []
+
+
+@pytest.mark.parametrize(
+    ("recording", "what"),
+    [
+        (drive(seconds=40.0), "40 s of driving"),
+        (drive(size=0.2), "rms) only"),
+        (drive(noise=0.5), "reference's noise is"),
+        (drive().select(["vx", "yaw_rate", "ay"]), "no reference of v"),
+    ],
+    ids=["short", "silent", "noisy", "unlabelled"],
+)
+def test_a_recording_that_cannot_rank_says_why(recording: Recording, what: str) -> None:
+    assert any(what in reason for reason in statistics_of([recording]).reasons)
+
+
+def test_a_standing_car_counts_for_nothing() -> None:
+    moving = drive()
+    speed = np.concatenate([np.zeros(3000), moving["vx"][3000:]])
+    assert statistics_of([replace(moving, channels={**moving.channels, "vx": speed})]).driven == pytest.approx(90.0, abs=1.5)
+    parked = replace(moving, channels={**moving.channels, "vx": np.zeros(12_000)})
+    assert statistics_of([parked]).driven == 0.0
+
+
+def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path) -> None:
+    datasets = []
+    for name, recording in (("long", drive()), ("short", drive(seconds=40.0))):
+        write_recording(recording, tmp_path / f"{name}.parquet")
+        datasets.append(StoredDataset(name, name, "real", {}, {"lap": tmp_path / f"{name}.parquet"}, "none", "nobody"))
+    (report,) = documents(StudyArtefacts("real_cars", "Real cars", "", "vehest run real_cars", datasets=datasets)).values()
+    text = "\n".join(block for block in report.blocks if isinstance(block, str))
+    assert "Of 2 data sets 1 can rank estimators" in text
+    assert "`short` (40 s of driving)" in text
+    tables = {block.name: block for block in report.blocks if isinstance(block, Table)}
+    assert set(tables) == {"overview", "recordings", "findings", "licences"}

@@ -1,0 +1,77 @@
+"""The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like another car's log."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from place import Place
+
+PAGE = Path(__file__).parents[2] / "docs" / "from_a_log.md"
+DRIVE = "revs/20140222_01_01_03_250lm"
+
+
+def log_of(data_root: Path) -> pd.DataFrame:
+    """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed, angles in degrees."""
+
+    def column(name: str) -> np.ndarray:
+        return np.loadtxt(data_root / DRIVE / f"{name}.txt")
+
+    time = column("t")
+    rows = np.flatnonzero((time >= 300.0) & (time < 320.0))[::2]
+    return pd.DataFrame(
+        {
+            "Timestamp": np.round(1393000000.0 + time[rows] - time[rows][0], 3),
+            "Speed": np.round(3.6 * column("vx")[rows], 3),
+            "GyroZ": np.round(np.degrees(column("yawRate")[rows]), 4),
+            "AccY": np.round(-column("ayCG")[rows], 4),
+            "SteerWheel": np.round(16.0 * np.degrees(column("delta")[rows]), 3),
+            "SlipAngle": np.round(np.degrees(column("beta_true")[rows]), 4),
+        }
+    )
+
+
+@pytest.fixture
+def logged(place, data_root) -> Place:
+    """A place with the log, and the files that the page tells to write."""
+    folder = place.folder / "raw" / "my_log"
+    folder.mkdir()
+    log_of(data_root).to_csv(folder / "lap.csv", index=False)
+    page = PAGE.read_text(encoding="utf-8")
+    for name, content in re.findall(r"```yaml\n# ((?:conf|pipelines)/\S+)\n(.*?)```", page, re.DOTALL):
+        (place.folder / name).write_text(content, encoding="utf-8")
+    return place
+
+
+def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged) -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    code, out, err = logged("data", "check", "my_log")
+    assert (code, err) == (0, "")
+    (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
+    assert said in out.splitlines()
+    code, out, _ = logged("data", "usable", "my_log")
+    assert code == 0
+    for line in ("ax: transforms: [{name: acceleration_from_speed}] of vx", "vy_ref: transforms: [{name: velocity_from_sideslip}]"):
+        assert line in page
+        assert line in out
+    (transforms,) = re.findall(r"```yaml\n(transforms:.*?)```", page, re.DOTALL)
+    file = logged.folder / "conf" / "dataset" / "my_log.yaml"
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("{column: AccY, unit: m/s²}", "{column: AccY, unit: m/s², sign: -1}") + transforms
+    )
+    code, out, err = logged("data", "check", "my_log")
+    assert code == 0
+    assert "ay points the other way" not in out
+    code, out, err = logged("run", "my_log", "tracking=none")
+    assert code == 0, err
+    assert "luenberger runs at 50 Hz instead of its 100 Hz" in err
+    assert "test set 'test' is too short to tell estimators apart: no interval, no winner" in out
+    report = next((logged.folder / "outputs" / "report").glob("my_log-*")) / "report.md"
+    text = report.read_text(encoding="utf-8")
+    assert "but the test is too short to tell estimators apart" in text
+    assert "from 14 s after its start" in text
+    assert "1.393e+09" not in text
