@@ -165,6 +165,51 @@ def splits(case: Case) -> Command:
     return Command(("train", *KSNN, "--dry-run") if case.rng.random() < 0.6 and not case.honest else ("eval", *KSNN, "--dry-run"))
 
 
+@generator("drives", weight=3)
+def splits_in_portions(case: Case) -> Command:
+    """Percentages, laps and folds; honest drives of half a minute have no laps."""
+    case.copy("drives")
+    honest = [
+        {"name": "mine", "dataset": "mine", "train": "60 %", "validation": "20%", "tests": {"test": "20 %"}},
+        {"name": "mine", "dataset": "mine", "folds": {"number": 3, "of": "recordings"}, "fold": 1},
+        {"name": "mine", "dataset": "mine", "folds": {"number": 4, "of": "seconds", "block_seconds": 5.0, "gap_seconds": 0.5}},
+    ]
+    laps = {"name": "mine", "dataset": "mine", "train": "50 %", "validation": [{"recording": "one", "laps": "2 to 3"}]}
+    tree = case.rng.choice(honest if case.honest else [*honest, laps])
+    if not case.honest and case.rng.random() < 0.3:
+        words = ["101 %", "-5 %", "1e999 %", "last 0 laps", "first 99999999999999999999", "0", "9 to 3", "last\nlap", "%", "NaN %"]
+        tree |= {"train": [{"recordings": "*", case.rng.choice(["start", "stop", "laps"]): case.rng.choice(words)}]}
+    _spoilt_file(case, "conf/split/mine.yaml", tree)
+    return Command(("eval", *KSNN, "--dry-run"))
+
+
+@generator("drives", weight=3)
+def derived_channels(case: Case) -> Command:
+    """Transforms of a data set, points, poses, held channels, rows that are dropped, time that restarts."""
+    case.copy("drives")
+    derived: dict[str, Any] = {
+        "transforms": [
+            {"name": "acceleration_from_speed", "cutoff_hz": 5.0},
+            {"name": "sideslip_from_velocity"},
+            {"name": "velocity_from_sideslip"},
+            {"name": "scale_to_wheelbase", "wheelbase": 2.5, "to": 2.5},
+        ],
+        "reference_point": {"x": 0.4, "y": -0.1},
+        "imu_point": "unknown",
+        "drop_rows": {"one": ["1490-"]},
+        "time_restarts": True,
+    }
+    held = {"held": {"channels": ["ay", "ax"], "updated": "Time", "delay": 0.01}}
+    position = {"x": {"column": "Speed", "unit": "m"}, "y": {"column": "Vy", "unit": "m"}, "yaw": {"column": "Yaw", "unit": "deg"}}
+    pose = {"pose": {**position, "window": 9, "order": 2, "channels": ["vx_ref", "yaw_rate_ref"]}}
+    tree = DATASET | derived
+    if not case.honest:
+        tree |= case.rng.choice([{}, held, pose, held | pose, {"exclude": ["t*", "nobody*"]}])
+        tree = DATASET | {key: spoil_tree(value, case.rng) if case.rng.random() < 0.3 else value for key, value in tree.items()}
+    (case.place / "conf/dataset/mine.yaml").write_bytes(yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "replace"))
+    return Command(case.rng.choice([("ingest", "mine"), ("data", "check", "mine"), ("data", "usable", "mine"), ("data", "show", "mine")]))
+
+
 @generator("drives", "steered", weight=5)
 def estimators(case: Case) -> Command:
     """conf/estimator and conf/training of every method."""
