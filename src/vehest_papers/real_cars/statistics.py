@@ -21,7 +21,7 @@ DRIVEN = 0.2
 """Share of its 99th percentile that a recording's speed has to reach to count as driving; sideslip of a car that stands says nothing."""
 QUANTILES = (0.5, 0.9, 0.99)
 
-# Rules by which a recording can rank estimators, fixed before any estimator was looked at.
+# Rules by which a recording can rank estimators, set before the table was first drawn.
 LEAST_SECONDS = 60.0
 LEAST_SIDESLIP = 0.5  # deg, root mean square, as the warning of a comparison has it
 LEAST_OVER_NOISE = 2.0  # what a static map leaves over the noise of the reference
