@@ -85,12 +85,20 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
         return _read_table(path, config["dataset"], references)
 
 
+def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
+    """A data set's options for a new drive, which needs no reference channels, whatever is declared; not validated yet."""
+    channels, transforms = dataset.get("channels"), dataset.get("transforms")
+    if isinstance(channels, dict):
+        channels = {name: entry for name, entry in channels.items() if not str(name).endswith(REFERENCE_SUFFIX)}
+    if isinstance(transforms, list | tuple):
+        transforms = [entry for entry in transforms if not (isinstance(entry, dict) and str(entry.get("name")) in OF_REFERENCES)]
+    changed = {"channels": channels or None, "transforms": transforms or None, "reference_point": None, "pose": None}
+    return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
+
+
 def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Recording:
-    if not references:  # a new drive needs no reference channels, whatever the data set declares
-        channels = {name: entry for name, entry in (dataset.get("channels") or {}).items() if not name.endswith(REFERENCE_SUFFIX)}
-        transforms = [entry for entry in dataset.get("transforms") or [] if entry.get("name") not in OF_REFERENCES]
-        changed = {"channels": channels or None, "transforms": transforms or None, "reference_point": None, "pose": None}
-        dataset = {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
+    if not references:
+        dataset = _without_references(dataset)
     recording = read_single(dataset, path)
     accepted = set(dataset.get("accept") or [])
     for finding in checks_of_recording(recording):
