@@ -497,3 +497,25 @@ def test_portions_that_make_no_sense_are_refused_in_one_line(changes: dict[str, 
     assert what in str(error.value)
     assert "split 's'" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_no_fold_is_a_scrap_and_gaps_are_kept_whole() -> None:
+    """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
+    recording, _ = circuit(laps=6.5)
+    for number in (3, 5):
+        config = {"name": "s", "dataset": "d", "folds": {"number": number, "of": "laps", "gap_seconds": 3.0}}
+        for fold in range(number):
+            split = split_from_config({**config, "fold": fold}, catalogue_of(recording))
+            assert min(span.stop - span.start for span in split.tests["test"]) > 30.0
+    short = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": "seconds", "block_seconds": 1.0, "gap_seconds": 2.0}}
+    split = split_from_config(short, catalogue_of(Recording("a", "car", 10.0, 0.0, {"vx": np.ones(300)})))
+    assert (split.tests["test"], split.validation) == ((Span("d", "a", 0.0, 10.0),), (Span("d", "a", 12.0, 18.0),))
+
+
+@pytest.mark.parametrize("laps", [2.3, 2.5, 3.3, 3.97])
+def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(laps: float) -> None:
+    time = np.arange(int(laps * 60.0 * 20.0)) / 20.0
+    yaw_rate = 0.2 + 0.2 * np.sin(2.0 * np.pi * time / 60.0) + 0.3 * np.sin(6.0 * np.pi * time / 60.0 + 1.0) - (0.2 - 2.0 * np.pi / 60.0)
+    found = laps_of(Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate}))
+    assert len(found) == int(laps)
+    np.testing.assert_allclose([stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3)

@@ -36,7 +36,7 @@ def test_statistics_are_those_of_the_closed_form() -> None:
     assert found.rms == pytest.approx(math.degrees(math.sqrt(0.6**2 / 2.0 + 0.2**2 / 2.0) / 20.0), rel=0.02)
     assert found.speed == pytest.approx((20.0, 20.0))
     assert found.driven == pytest.approx(120.0, abs=0.1)
-    assert found.point == "unknown"
+    assert found.point == "at a point that is not known"
     assert found.reasons == []
 
 

@@ -27,6 +27,7 @@ from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
 from vehest.sources import text_tables
+from vehest.sources.held import between_samples, with_repeats
 from vehest.sources.tabular import TabularSource
 from vehest.sources.text_tables import check_size
 
@@ -625,3 +626,17 @@ def test_an_hour_at_1_khz_with_55_channels_passes_all_limits(tmp_path: Path, end
     recording = source(tmp_path, channels=declared).read_file(file)
     assert (len(recording), recording.rate_hz) == (3_600_000, 1000.0)
     assert checks_of_recording(recording) is not None
+
+
+def test_a_held_value_that_stays_is_no_ramp() -> None:
+    """10 Hz held at 100 Hz: at rest until 8 s, then rising; without a column that tells of updates, rest stays rest."""
+    times = np.concatenate([[0.5, 0.6, 0.7, 0.8, 0.9, 1.0], np.arange(8.0, 10.0, 0.1)])
+    samples = np.concatenate([[5.0, 4.0, 3.0, 2.0, 1.0, 0.0], np.arange(20) + 1.0])
+    grid = np.array([1.5, 4.5, 7.8, 8.0, 8.05])
+    np.testing.assert_allclose(between_samples(*with_repeats(samples, times), 0.0, grid), [0.0, 0.0, 0.0, 1.0, 1.5], atol=1e-9)
+
+
+def test_a_reference_point_of_a_scaled_car_is_refused(tmp_path: Path) -> None:
+    transforms = [{"name": "scale_to_wheelbase", "wheelbase": 0.3, "to": 2.4}]
+    message = refusal(lambda: source(tmp_path, transforms=transforms, reference_point={"x": 0.1}), ConfigurationError)
+    assert "by the transform reference_lever, before scale_to_wheelbase" in message

@@ -46,7 +46,7 @@ class FoldsFile:
 
 
 def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str] | None], Recording]]) -> list[Span]:
-    """The blocks of recordings in order, each with its start and stop; what is before the first lap or after the last is a block too.
+    """The blocks of recordings in order, each with its start and stop.
 
     Args:
         folds: what is never cut in two.
@@ -59,10 +59,11 @@ def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str
     for whole, read in recordings.items():
         recording = read(None)
         bounds = [recording.start_time, recording.end_time]
-        if folds.of == "laps":
-            bounds += [time for lap in laps_of(recording) for time in lap]
-        elif folds.of == "seconds":
-            bounds += (recording.start_time + np.arange(folds.block_seconds, recording.duration, folds.block_seconds)).tolist()
+        if folds.of == "laps":  # what is before the first or after the last belongs to that lap
+            bounds += [stop for _, stop in laps_of(recording)[:-1]]
+        elif folds.of == "seconds":  # a rest of less than half a block belongs to the one before
+            number = max(round(recording.duration / folds.block_seconds), 1)
+            bounds += [recording.start_time + block * folds.block_seconds for block in range(1, number)]
         edges = sorted(set(bounds))
         blocks += [replace(whole, start=start, stop=stop) for start, stop in pairwise(edges)]
     return blocks
@@ -101,19 +102,20 @@ def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> 
 
 
 def _joined(blocks: Sequence[Span], roles: Sequence[int], role: int, gap: float) -> tuple[Span, ...]:
-    """Blocks of a role, neighbours as one, shortened by the gap where they border on blocks of another role."""
+    """Blocks of a role, neighbours as one, shortened by the gap where they border on what has another role; dropped where that is all."""
+    joined: list[tuple[Span, int]] = []
+    for block, own in zip(blocks, roles, strict=True):
+        if joined and own == joined[-1][1] and _touch(joined[-1][0], block):
+            joined[-1] = (replace(joined[-1][0], stop=block.stop), own)
+        else:
+            joined.append((block, own))
     spans: list[Span] = []
-    for place, block in enumerate(blocks):
-        if roles[place] != role:
-            continue
-        before = place > 0 and _touch(blocks[place - 1], block)
-        after = place + 1 < len(blocks) and _touch(block, blocks[place + 1])
-        start = block.start + (gap if before and roles[place - 1] != role else 0.0)
-        stop = block.stop - (gap if after and roles[place + 1] != role else 0.0)
-        if before and roles[place - 1] == role and spans and math.isclose(spans[-1].stop, block.start):
-            spans[-1] = replace(spans[-1], stop=stop)
-        elif start < stop:
-            spans.append(replace(block, start=start, stop=stop))
+    for place, (span, own) in enumerate(joined):
+        before = place > 0 and _touch(joined[place - 1][0], span)
+        after = place + 1 < len(joined) and _touch(span, joined[place + 1][0])
+        start, stop = span.start + gap * before, span.stop - gap * after
+        if own == role and start < stop:
+            spans.append(replace(span, start=start, stop=stop))
     return tuple(spans)
 
 

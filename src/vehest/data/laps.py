@@ -20,6 +20,8 @@ LEAST_SHARE_OF_BEST = 0.9
 MOST_TURN_OFF = 0.8  # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
 STEADY = 0.2
 """Spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn."""
+INCOMPLETE = 0.005
+"""Share of a lap that a last one may lack and count as complete."""
 SEARCH = 0.04
 """Share of a lap by which the next boundary is looked for before and after where it is expected."""
 
@@ -104,14 +106,14 @@ def _boundaries(curvature: FloatArray, period: int) -> list[int]:
     bounds, reach = [0], max(round(SEARCH * period), 1)
     while bounds[-1] + period < len(curvature):
         last = bounds[-1]
-        length = min(period, len(curvature) - last - period)
-        template = curvature[last : last + length]
-        moves = [move for move in range(-reach, reach + 1) if last + period + move + length <= len(curvature)]
-        if length < period // 4 or not moves:
+        length = min(period, len(curvature) - last - period - reach)  # so that every move has as many points to fit
+        if length < period // 4:
             bounds.append(last + period)
             continue
-        fits = [float(np.dot(template, curvature[last + period + move : last + period + move + length])) for move in moves]
-        bounds.append(last + period + moves[int(np.argmax(fits))])
-    if len(curvature) - bounds[-1] >= period - reach and len(bounds) > 1:
+        template = curvature[last : last + length]
+        starts = last + period + np.arange(-reach, reach + 1)
+        misfits = [float(np.sum(np.square(template - curvature[start : start + length]))) for start in starts]
+        bounds.append(int(starts[int(np.argmin(misfits))]))
+    if len(bounds) > 1 and len(curvature) - bounds[-1] >= period - max(round(INCOMPLETE * period), 2):
         bounds.append(len(curvature))
     return bounds

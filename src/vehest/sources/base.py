@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import vehest.sources as package
+from vehest.data.derived import ScaleToWheelbase
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
@@ -137,6 +138,9 @@ class Source(ABC):
         common = validated(CommonOptions, told, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
         self.reference_point, self.imu_point = common.reference_point, common.imu_point
         self.transforms = self._transforms(common.transforms or ())
+        if isinstance(self.reference_point, Point) and any(isinstance(transform, ScaleToWheelbase) for transform in self.transforms):
+            what = "a reference point is in metres of the car as it is; move the reference by the transform reference_lever, before"
+            raise ConfigurationError(f"data set '{self.name}': {what} scale_to_wheelbase")
         if dataset.get("source") == SIMULATED and dataset.get("kind", "simulated") != "simulated":
             raise ConfigurationError(f"data set '{self.name}': what source '{SIMULATED}' makes is simulated; leave kind out")
         if self.options_type is not None:

@@ -81,3 +81,14 @@ def new_samples(columns: Sequence[FloatArray], where: str) -> NDArray[np.int64]:
 def between_samples(samples: FloatArray, times: FloatArray, delay: float, grid: FloatArray) -> FloatArray:
     """A held channel on another clock: straight lines between its samples, which look ahead by up to one interval; NaN outside."""
     return np.interp(grid, times - delay, samples, left=np.nan, right=np.nan)
+
+
+def with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Samples and times where no column tells of an update: a value that stays was sampled again, up to an interval before the next change.
+
+    The interval is the median one between changes. Without this a straight line would be drawn through all of a standstill.
+    """
+    intervals = np.diff(times)
+    typical = float(np.median(intervals))
+    late = np.flatnonzero(intervals > 1.5 * typical)
+    return np.insert(samples, late + 1, samples[late]), np.insert(times, late + 1, times[late + 1] - typical)

@@ -105,7 +105,7 @@ def _refuse_missing(
     """A lost sample shifts all later stamps by an interval; so does a clock that drifts, little by little."""
     block = max(round(BLOCK_SECONDS * rate_hz), FEWEST // 2)
     edges = np.arange(0, len(residual), block)
-    shifts = np.array([np.median(residual[edge : edge + block]) for edge in edges if len(residual) - edge >= block // 2])
+    shifts = np.array([np.median(residual[edge : edge + block]) for edge in edges if not edge or len(residual) - edge >= block // 2])
     limit = max(MOST_WANDERING * interval, tolerated)
     worst = int(np.argmax(np.abs(shifts)))
     if abs(shifts[worst]) > limit:

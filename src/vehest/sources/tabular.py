@@ -33,7 +33,7 @@ from vehest.sources.columns import (
     time_column_from_config,
     uniform_clock,
 )
-from vehest.sources.held import Held, between_samples, held_from_config, new_samples
+from vehest.sources.held import Held, between_samples, held_from_config, new_samples, with_repeats
 from vehest.sources.table_pose import TablePose, table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
 from vehest.sources.text_tables import check_header, check_size, table_stream
@@ -230,10 +230,12 @@ class TabularSource(Source):
         markers = [held.updated] if held.updated is not None else list(dict.fromkeys(column.column for column in declared.values()))
         rows = new_samples([values[name] for name in markers], where)
         times, ticks = clock.times_of_rows()[rows], clock.ticks()
-        found = {
-            name: between_samples(column.to_si(values[column.column], channel(name).unit)[rows], times, held.delay[name], ticks)
-            for name, column in declared.items()
-        }
+        found = {}
+        for name, column in declared.items():
+            samples, taken = column.to_si(values[column.column], channel(name).unit)[rows], times
+            if held.updated is None:
+                samples, taken = with_repeats(samples, times)
+            found[name] = between_samples(samples, taken, held.delay[name], ticks)
         begin, end = (times[edge] - np.array([held.delay[name] for name in declared]) for edge in (0, -1))
         inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
         if not len(inside):

@@ -40,15 +40,17 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     first = next(iter(parts.values()))
     ranking = rank({name: [joined(own) for own in seeds] for name, seeds in folds.items()}, first.protocol.rate_hz)
     titles = {(model.estimator, model.variant): as_text(model.title) for part in parts.values() for model in part.models}
-    where = (
-        f"all {len(parts)} folds ({' and '.join(sorted(set(first.kinds.values())))} data), each estimated by models that had not seen it"
-    )
+    kinds = " and ".join(sorted(set(first.kinds.values())))
+    number = f"all {len(parts)} folds" if set(artefacts.titles) <= set(parts) else f"{len(parts)} of {len(artefacts.titles)} folds"
+    where = f"{number} ({kinds} data), each estimated by models that had not seen it"
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
     blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), budget_sentence(first)]))
     left_out = _left_out(parts, folds, titles)
+    lost = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
+    left_out += [f"{title} is not here: nothing could be trained or scored on it." for title in lost]
     if left_out:
         blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in left_out))
-    board = overview(ranking, folds, titles)
+    board = overview(ranking, folds, titles, list(parts))
     blocks += ["## All folds", _table(board, list(parts)), _figure(board, list(parts)), *how_it_was_made(first)[:1]]
     for name, part in parts.items():
         warned = [line for line in warnings_of(part) if "is left out" not in line]
@@ -78,16 +80,18 @@ def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[lis
     return found
 
 
-def overview(ranking: Ranking, folds: Mapping[Name, Sequence[Sequence[Segments]]], titles: Mapping[Name, str]) -> pd.DataFrame:
+def overview(
+    ranking: Ranking, folds: Mapping[Name, Sequence[Sequence[Segments]]], titles: Mapping[Name, str], parts: Sequence[str]
+) -> pd.DataFrame:
     """One row an estimator, the lowest RMSE(β) over all folds first: its interval, how it stands, and its error in each fold [deg]."""
     rows = []
     for name in ranking.order:
         seeds = folds[name]
         row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": titles[name], "n_seeds": len(seeds)}
         row |= {"rmse_sideslip": ranking.rmse[name], **standing_columns(ranking, name)}
-        for fold in range(len(seeds[0])):
+        for fold, part in enumerate(parts):
             square = np.mean([own[fold].squared_error_sideslip.sum() / own[fold].samples.sum() for own in seeds])
-            row[f"fold_{fold + 1}"] = float(np.sqrt(square))
+            row[part] = float(np.sqrt(square))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -110,7 +114,7 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "against_best": Column("to the lowest [deg]"),
         "beats_zero": Column("beats v = 0"),
         "beats_static_map": Column("beats static map"),
-        **{f"fold_{fold + 1}": Column(f"fold {fold + 1}", decimals=decimals) for fold in range(len(parts))},
+        **{part: Column(part.replace("_", " "), decimals=decimals) for part in parts},
     }
     caption = (
         "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
@@ -125,7 +129,7 @@ def _figure(board: pd.DataFrame, parts: Sequence[str]) -> Figure:
         figures.Spread(
             row["title"],
             lines[row["estimator"], row["variant"]],
-            np.array([row["rmse_sideslip"], *(row[f"fold_{fold + 1}"] for fold in range(len(parts)))]),
+            np.array([row["rmse_sideslip"], *(row[part] for part in parts)]),
             row["rmse_sideslip"],
         )
         for row in board.to_dict("records")

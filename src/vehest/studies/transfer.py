@@ -39,7 +39,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
     board = overview(parts, rankings)
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append(carried_over(board))
+    absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
+    blocks.append(carried_over(board) + (f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}." if absent else ""))
     blocks += [_matrix(board), transfer_figure_of(board)]
     for name, part in parts.items():
         blocks += _part(name, part, board[board["part"] == name], rankings)
@@ -127,7 +128,8 @@ def _matrix(board: pd.DataFrame) -> Table:
     columns |= {f"place_{place}": Column(_place(row, board)) for place, row in enumerate(firsts)}
     caption = (
         "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * beats v = 0 and the static map, each "
-        "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error."
+        "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
+        "vehicle to vehicle under one name; they stand in the pipeline's file."
     )
     return Table("overview", caption, pd.DataFrame(rows), columns)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from vehest.data.splits import Span
 from vehest.data.transforms import Resample
 from vehest.evaluation.floors import INPUTS, Drive, cramer_rao_floor, drive_of, reference_floor
 from vehest.evaluation.metrics import Protocol
-from vehest.sources.base import DERIVED
+from vehest.sources.base import origin_in_words
 
 RATE = 20.0  # Hz, at which everything here is read
 DRIVEN = 0.2
@@ -46,6 +46,7 @@ class Statistics:
         bound: posterior Cramér-Rao bound with every input that was measured, axles known [deg].
         kinematic_bound: the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg].
         point: where the reference was measured, in words.
+        missing: the channel without which nothing can be said; empty where there are all.
     """
 
     seconds: float
@@ -61,12 +62,15 @@ class Statistics:
     bound: float
     kinematic_bound: float
     point: str
+    missing: str = ""
 
     @property
     def reasons(self) -> list[str]:
         """Why it cannot rank estimators; empty where it can."""
-        if math.isnan(self.rms):
-            return ["no reference of v"]
+        if self.missing:
+            return [f"no {self.missing}"]
+        if not self.driven > 0.0:
+            return ["the car stands, or drives for moments only"]
         found = []
         if self.driven < LEAST_SECONDS:
             found.append(f"{self.driven:.0f} s of driving")
@@ -78,7 +82,11 @@ class Statistics:
 
 
 def statistics_of(recordings: Sequence[Recording]) -> Statistics:
-    """Statistics of recordings as ingested, taken together."""
+    """Statistics of recordings as ingested, taken together; of several, those with a reference where any has one."""
+    labelled = [recording for recording in recordings if "vy_ref" in recording]
+    recordings = labelled or recordings
+    names = {"vx": "speed", "yaw_rate": "yaw rate", "vy_ref": "reference of v"}
+    missing = next((word for name, word in names.items() if any(name not in recording for recording in recordings)), "")
     pieces = [piece for recording in recordings for piece in _driven(recording)]
     native = recordings[0].rate_hz
     seconds = sum(recording.duration for recording in recordings)
@@ -89,9 +97,9 @@ def statistics_of(recordings: Sequence[Recording]) -> Statistics:
     speed = tuple(np.quantile(vx, (0.01, 0.99)).tolist()) if len(vx) else (math.nan, math.nan)
     ay = _joined(pieces, "ay")
     bands = tuple(np.quantile(np.abs(ay), QUANTILES).tolist()) if len(ay) else nothing
-    plain = Statistics(seconds, driven, native, speed, bands, nothing, *(math.nan,) * 6, point=point)
+    plain = Statistics(seconds, driven, native, speed, bands, nothing, *(math.nan,) * 6, point=point, missing=missing)
     vy = _joined(pieces, "vy_ref")
-    if not len(vy):
+    if missing or not len(vy):
         return plain
     yaw_rate = _joined(pieces, "yaw_rate")
     beta = np.degrees(np.arctan2(vy, vx))
@@ -153,12 +161,8 @@ def _drive(piece: Recording) -> Drive:
 
 
 def _point(recording: Recording) -> str:
-    told: Mapping[str, object] = dict(recording.provenance.get(DERIVED) or {})
-    point = told.get("reference_point")
-    if isinstance(point, Mapping):
-        x, y = float(point.get("x", 0.0)), float(point.get("y", 0.0))
-        return "centre of gravity" if x == y == 0.0 else f"{x:g} m ahead, {y:g} m left of it; moved to the centre of gravity"
-    return "unknown" if point is not None else "not said"
+    said = next((line for line in origin_in_words(recording) if line.startswith("reference measured ")), "")
+    return said.removeprefix("reference measured ") or "not said"
 
 
 def _joined(pieces: Sequence[Recording], name: str) -> FloatArray:
