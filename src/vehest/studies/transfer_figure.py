@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from typing import TYPE_CHECKING
 
 import pandas as pd
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
 COLUMNS = 4
+TITLE_WIDTH = 24
 ROW = 0.16  # in, height of an estimator
 
 
@@ -28,8 +30,10 @@ def transfer_figure(board: pd.DataFrame) -> MatplotlibFigure:
     lines = lines_of([name[:2] for name in names])
     columns = min(COLUMNS, len(places))
     rows = -(-len(places) // columns)
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, rows * (0.55 + ROW * len(names)))
+        figure = new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names)))
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)
@@ -50,13 +54,16 @@ def transfer_figure(board: pd.DataFrame) -> MatplotlibFigure:
                 axes.axvline(static, color="#999999", linewidth=0.7, linestyle=(0, (3, 2)))
             title = str(own["title"].iloc[0])
             several = board[board["part"] == part]["test_set"].nunique() > 1
-            axes.set_title(f"{title}\n{test_set}" if several else title, fontsize=7.0, loc="left")
+            lines_of_title = [*textwrap.wrap(title, TITLE_WIDTH), *([test_set.replace("_", " ")] if several else [])]
+            axes.set_title("\n".join(lines_of_title), fontsize=6.5, loc="left")
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(NullFormatter())
         for axes in grid[:, 0]:
             axes.set_yticks(range(len(names)), [name[2] for name in names])
             axes.set_ylim(len(names) - 0.5, -0.5)
-        for axes in grid[-1]:
-            axes.set_xlabel("RMSE(β) over that of v = 0")
+        figure.supxlabel("RMSE(β) over that of v = 0", fontsize=7.5)
     return figure
 
 
