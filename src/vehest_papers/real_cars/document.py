@@ -72,7 +72,7 @@ def _headline(artefacts: StudyArtefacts, together: Mapping[str, Statistics]) -> 
     kinds = {dataset.name: dataset.kind for dataset in artefacts.datasets}
     able = [name for name, found in together.items() if not found.reasons]
     unable = [f"{as_code(name)} ({'; '.join(found.reasons)})" for name, found in together.items() if found.reasons]
-    hidden = [name for name, found in together.items() if (not found.reasons and "not known" in found.point) or found.point == "not said"]
+    hidden = [name for name, found in together.items() if not found.reasons and ("not known" in found.point or found.point == "not said")]
     text = (
         f"**Of {len(together)} data sets {len(able)} can rank estimators** by the rules below: "
         f"{listed([f'{as_code(name)} ({kinds[name]})' for name in able])}."
