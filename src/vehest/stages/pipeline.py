@@ -289,10 +289,11 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
             f"the split belongs to the study; copy '{pipeline.file.name}' to pipelines/ under another name and change it there"
         )
     used: set[str] = set()
+    composed: dict[tuple[str, ...], Config] = {}
     sweeps = [sweep for part in pipeline.parts for sweep in part.sweeps]
     with use_limits(limits_of([*(override for sweep in sweeps for override in sweep), *overrides])):
         check_jobs(sum(count(sweep) for sweep in sweeps), f"the sweeps of '{pipeline.file.name}' stand")
-        configs = {part.name: _part_configs(part, pipeline.evaluation, overrides, used) for part in pipeline.parts}
+        configs = {part.name: _part_configs(part, pipeline.evaluation, overrides, used, composed) for part in pipeline.parts}
     for override in overrides:
         if override not in used:
             key = key_of(override)
@@ -301,14 +302,19 @@ def pipeline_configs(pipeline: Pipeline, overrides: Sequence[str]) -> Configs:
     return configs
 
 
-def _part_configs(part: Part, evaluation: Sequence[str], overrides: Sequence[str], used: set[str]) -> list[Config]:
-    """The configuration of every job of a part; the overrides that suit any of them join ``used``."""
-    composed: dict[tuple[str, ...], Config] = {}
+def _part_configs(
+    part: Part, evaluation: Sequence[str], overrides: Sequence[str], used: set[str], composed: dict[tuple[str, ...], Config]
+) -> list[Config]:
+    """The configuration of every job of a part; the overrides that suit any of them join ``used``, what was composed joins ``composed``."""
 
     def config_of(job: tuple[str, ...]) -> Config:
-        if job not in composed:
-            composed[job] = compose_config("eval", job)
-        return composed[job]
+        """Composed without its split, which other jobs share, as other parts share the rest."""
+        own = tuple(override for override in job if key_of(override).split(".")[0] == "split")
+        rest = tuple(override for override in job if override not in own)
+        for overrides_of in (own, rest):
+            if overrides_of not in composed:
+                composed[overrides_of] = compose_config("eval", overrides_of)
+        return {**composed[rest], "split": composed[own]["split"]}
 
     configs: dict[str, Config] = {}
     for sweep in part.sweeps:

@@ -192,7 +192,6 @@ def derived_channels(case: Case) -> Command:
             {"name": "acceleration_from_speed", "cutoff_hz": 5.0},
             {"name": "sideslip_from_velocity"},
             {"name": "velocity_from_sideslip"},
-            {"name": "scale_to_wheelbase", "wheelbase": 2.5, "to": 2.5},
         ],
         "reference_point": {"x": 0.4, "y": -0.1},
         "imu_point": "unknown",
@@ -202,9 +201,10 @@ def derived_channels(case: Case) -> Command:
     held = {"held": {"channels": ["ay", "ax"], "updated": "Time", "delay": 0.01}}
     position = {"x": {"column": "Speed", "unit": "m"}, "y": {"column": "Vy", "unit": "m"}, "yaw": {"column": "Yaw", "unit": "deg"}}
     pose = {"pose": {**position, "window": 9, "order": 2, "channels": ["vx_ref", "yaw_rate_ref"]}}
+    scaled = {"transforms": [{"name": "scale_to_wheelbase", "wheelbase": 2.5, "to": 2.5}]}
     tree = DATASET | derived
     if not case.honest:
-        tree |= case.rng.choice([{}, held, pose, held | pose, {"exclude": ["t*", "nobody*"]}])
+        tree |= case.rng.choice([{}, held, pose, held | pose, {"exclude": ["t*", "nobody*"]}, scaled])
         tree = DATASET | {key: spoil_tree(value, case.rng) if case.rng.random() < 0.3 else value for key, value in tree.items()}
     (case.place / "conf/dataset/mine.yaml").write_bytes(yaml.safe_dump(tree, allow_unicode=True).encode("utf-8", "replace"))
     return Command(case.rng.choice([("ingest", "mine"), ("data", "check", "mine"), ("data", "usable", "mine"), ("data", "show", "mine")]))

@@ -207,6 +207,8 @@ def environments(case: Case) -> Command:
     command = case.rng.choice([("ingest", "mine"), ("data", "show", "mine"), ("train", *KSNN, "--dry-run"), ("data", "channels")])
     if variable == "MLFLOW_TRACKING_URI":
         command = ("config", "train")
+    if variable == "VEHEST_OUTPUT" and value == "/nothing":  # told to write there, it would, and nobody could call that wrong
+        value = "nothing"
     return Command(
         command,
         environment={} if case.honest else {variable: value},
