@@ -40,7 +40,7 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) lint ## lint, types, layers, tests (some 6 minutes)
+test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart"
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
@@ -81,7 +81,7 @@ ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VE
 ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: an hour or more
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
-learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and an hour or two
+learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and half an hour or two
 	$(BIN)/vehest run pipelines/learned_ukf.yaml
 
 learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with smaller budgets
@@ -99,7 +99,7 @@ proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real reco
 real_cars: $(INSTALLED) ## what the real recordings hold, and which can rank estimators; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/real_cars.yaml
 
-leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that learnt on others; needs VEHEST_DATA, and an hour
+leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that learnt on others; needs VEHEST_DATA, and half an hour
 	$(BIN)/vehest run pipelines/leave_one_out.yaml
 
 sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHEST_DATA

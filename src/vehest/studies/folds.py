@@ -44,7 +44,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     number = f"all {len(parts)} folds" if set(artefacts.titles) <= set(parts) else f"{len(parts)} of {len(artefacts.titles)} folds"
     where = f"{number} ({kinds} data), each estimated by models that had not seen it"
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), budget_sentence(first)]))
+    blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), f"In each fold: {budget_sentence(first)}"]))
     left_out = _left_out(parts, folds, titles)
     lost = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     left_out += [f"{title} is not here: nothing could be trained or scored on it." for title in lost]

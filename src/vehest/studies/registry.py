@@ -3,7 +3,7 @@
 A study called ``name`` is the module ``vehest.studies.name``, or an entry point of another package in the group ``vehest.studies``;
 those that re-create papers come so, from ``vehest_papers``. Such a module has
 
-- ``TAKES``: what its pipelines name, ``split``, ``parts`` or ``datasets``;
+- ``TAKES``: what its pipelines name, ``split``, ``parts`` or ``datasets``, or ``folds`` for a split that is cross-validated;
 - ``documents(artefacts: StudyArtefacts) -> {name: Document}``, of which one starts with ``report``;
 - ``SHOWS_FAILED = True``, if its report can leave out what failed and say so;
 - ``leaderboard(artefacts: PartArtefacts) -> DataFrame``, if it takes a split, or a table ``overview`` in its report, for the terminal.
