@@ -101,6 +101,10 @@ def _complete_model_or_file(incomplete: str) -> list[str]:
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would run and what would be skipped; run nothing.")]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome is there already.")]
+DatasetOrFile = Annotated[
+    str,
+    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and the outcome.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes that run side by side; by default one a core.")]
@@ -595,10 +599,7 @@ def _stretch(start: float, end: float) -> str:
 
 @data_app.command("check")
 def data_check(
-    source: Annotated[
-        str,
-        typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
-    ],
+    source: DatasetOrFile,
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -620,10 +621,7 @@ def data_check(
 
 @data_app.command("usable")
 def data_usable(
-    source: Annotated[
-        str,
-        typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
-    ],
+    source: DatasetOrFile,
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -92,6 +92,19 @@ def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> Non
     assert math.isclose(board.loc[board["estimator"] == "zero", "rmse_sideslip"].item(), board["rmse_sideslip"].max(), rel_tol=0.2)
 
 
+def test_missing_files_are_said_before_anything_is_made(across) -> None:
+    dataset = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
+    elsewhere = {**dataset, "name": "elsewhere", "path": "${root}/elsewhere"}
+    (across.folder / "conf" / "dataset" / "elsewhere.yaml").write_text(yaml.safe_dump(elsewhere, allow_unicode=True), encoding="utf-8")
+    split = yaml.safe_load((across.folder / "conf" / "split" / "back.yaml").read_text())
+    (across.folder / "conf" / "split" / "back.yaml").write_text(yaml.safe_dump({**split, "dataset": "elsewhere"}))
+    code, out, err = across("run", "vehicles", "tracking=none", "output=out")
+    assert (code, out) == (4, "")
+    assert err.startswith("error: data set 'elsewhere': there is no folder")
+    assert len(err.strip().splitlines()) == 1
+    assert not (across.folder / "out" / "ingest").exists()
+
+
 def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
     parts = read_pipeline("folds_of_mine").parts
     assert [(part.name, part.overrides) for part in parts] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]

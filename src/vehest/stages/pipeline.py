@@ -418,13 +418,16 @@ def _run_parts(
     absent: list[AbsentPart] = []
     waits = False
     for part in pipeline.parts:
-        if part.optional:
-            try:
-                workshop.look_for_files(configs[part.name][0])
-            except MissingError as error:
-                workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
-                absent.append(AbsentPart(part.name, part.title))
-                continue
+        try:
+            workshop.look_for_files(configs[part.name][0])
+        except MissingError as error:
+            if not part.optional:
+                raise
+            workshop.messages.warn(f"{error}; the study goes on without part '{part.name}'")
+            absent.append(AbsentPart(part.name, part.title))
+    for part in pipeline.parts:
+        if any(part.name == missing.name for missing in absent):
+            continue
         try:
             prepared[part.name] = prepare(configs[part.name], workshop)
         except NotThereYet:

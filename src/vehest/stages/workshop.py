@@ -17,10 +17,10 @@ from vehest.data.split_files import Catalogue, Reader, dataset_names, split_from
 from vehest.data.splits import TRAINING, VALIDATION, Split
 from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
-from vehest.sources.base import kind_of
+from vehest.sources.base import kind_of, open_source
 from vehest.stages.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.stages.compiling import has_to_compile
-from vehest.stages.config import Config, compose_config
+from vehest.stages.config import Config, compose_config, missing_keys
 from vehest.stages.console import Messages
 from vehest.stages.downsample import plan_downsample, write_downsample
 from vehest.stages.evaluate import read_metrics, read_scored
@@ -136,7 +136,9 @@ class Workshop:
             MissingError: some are not.
         """
         for name in dataset_names(config["split"]):
-            plan_ingest(self.dataset_config(name, config))
+            dataset = self.dataset_config(name, config)["dataset"]
+            if not missing_keys(dict(dataset)):  # which its ingest tells of
+                open_source(dataset).inputs()
 
     def _catalogue(self, config: Config) -> Catalogue:
         def recordings_of(name: str) -> Mapping[str, Reader]:
