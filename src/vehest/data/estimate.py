@@ -28,10 +28,16 @@ QUANTITIES: dict[str, str] = {
     "tyre_c1_rear": "rad²",
     "nis": "1",
     "nis_dof": "1",
+    "band_vy": "m/s",
+    "band_sideslip": "rad",
+    "health": "1",
+    "health_reason": "1",
 }
 """What an estimate may hold, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
 axle's force per slip angle where there is none, ``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
-innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it."""
+innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it. ``band_vy`` and ``band_sideslip`` are
+half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number
+(`vehest.trust`)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,1 @@
+"""How far an estimate can be trusted: a contract for running online, calibrated bands, health, and faults to try them with."""
