@@ -1,0 +1,379 @@
+"""Faults of sensors, injected into the channels of any recording: 16 kinds at three severities.
+
+What a channel would have held goes in, what a broken sensor, its wiring or its decoding makes of it comes out. Everything that is drawn
+comes from the fault's seed. Sizes are round numbers of engineering judgement, from what a driver would not notice to what no car does, and
+were set before the error of any estimator under them was looked at.
+
+| kind | what becomes of the channel while the fault lasts | a severity, or a size of one's own, says |
+| `bias` | a constant is added | the constant [unit] |
+| `drift` | a ramp is added that starts at 0 | its slope [unit/s] |
+| `scale` | multiplied by 1 + size | the size |
+| `frozen` | stays at its last value | for which share of the duration, from its start on |
+| `dropout` | 0 | for which share, in pieces of 0.2 s |
+| `spikes` | a constant is added to, or taken from, 2 % of the samples, one at a time | the constant [unit] |
+| `noise` | white Gaussian noise is added | its standard deviation [unit] |
+| `delay` | comes late | how late [s], at least one sample |
+| `saturation` | clipped | at which share of the largest size that it would have had meanwhile |
+| `sign` | of the wrong sign | for which share of the duration, from its start on |
+| `unit` | in another unit, `UNIT_FACTORS` | the factor |
+| `nan` | NaN | for which share, in pieces of 0.2 s |
+| `inf` | infinite, of either sign | for which share of the samples, at least one |
+| `huge` | finite and beyond physics, of either sign, in 5 % of the samples | how many times its physical range |
+| `held` | sampled and held | for how long [s], at least two samples |
+| `lost_wheel` | drops out (NaN), spins up or locks within 0.2 s | by which factor the speed changes |
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import GRAVITY, FloatArray
+from vehest.data.channels import CHANNELS, Channel
+from vehest.data.errors import ConfigurationError
+
+Severity = Literal["mild", "medium", "severe"]
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)
+
+Sizes = tuple[float, float, float]
+
+DEGREE = math.pi / 180.0
+PIECE_SECONDS = 0.2  # of what is lost in pieces
+LOSS_SECONDS = 0.2  # until a wheel is locked or spins
+SPIKE_SHARE, HUGE_SHARE = 0.02, 0.05  # of the samples
+STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
+
+OFFSETS: dict[str, Sizes] = {
+    "vx": (0.5, 2.0, 5.0),
+    "yaw_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
+    "roll_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
+    "pitch_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
+    "ax": (0.3, 1.0, 3.0),
+    "ay": (0.3, 1.0, 3.0),
+    "steer": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
+    "handwheel": (0.5 * DEGREE * STEERING_RATIO, 2.0 * DEGREE * STEERING_RATIO, 6.0 * DEGREE * STEERING_RATIO),
+    "roll": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
+    "pitch": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
+}
+"""Channel -> mild, medium and severe offset [unit of the channel]."""
+
+OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
+"""Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples: their radii differ by a factor of ten."""
+
+OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)
+"""Offsets of all other channels, as shares of the largest size that `CHANNELS` allows."""
+
+TIMES_OFFSET: dict[str, float] = {"bias": 1.0, "drift": 0.1, "spikes": 10.0, "noise": 1.0}
+"""Kind whose size goes by the channel's offsets -> multiple of them; a drift reaches the offset in 10 s."""
+
+SIZES: dict[str, Sizes] = {
+    "scale": (0.05, 0.2, 0.5),
+    "frozen": (0.1, 0.5, 1.0),
+    "dropout": (0.1, 0.5, 1.0),
+    "delay": (0.05, 0.2, 0.5),
+    "saturation": (0.8, 0.5, 0.2),
+    "sign": (0.1, 0.5, 1.0),
+    "nan": (0.1, 0.5, 1.0),
+    "inf": (0.01, 0.1, 1.0),
+    "huge": (10.0, 1e4, 1e200),
+    "held": (0.1, 0.25, 0.5),
+    "lost_wheel": (math.nan, 1.5, 0.0),
+}
+"""Kind -> mild, medium and severe size, for every channel."""
+
+UNIT_FACTORS: dict[str, Sizes] = {
+    "m/s": (2.236936, 1.0 / 3.6, 3.6),
+    "m/s²": (1.0 / 0.3048, 1.0 / GRAVITY, GRAVITY),
+    "rad": (1.0 / math.tau, DEGREE, 1.0 / DEGREE),
+    "rad/s": (1.0 / math.tau, DEGREE, 1.0 / DEGREE),
+    "Pa": (1e-3, 1e-5, 1e5),
+}
+"""Unit -> factors of a wrong one: miles an hour, km/h converted once too often, km/h; ft/s², g for m/s² and the inverse; turns, degrees
+converted once too often, degrees; kPa, bar, and bar converted once too often."""
+
+WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
+"""The same of wheels and motor: turns a second, turns a minute converted once too often, turns a minute."""
+
+KINDS = (
+    "bias",
+    "drift",
+    "scale",
+    "frozen",
+    "dropout",
+    "spikes",
+    "noise",
+    "delay",
+    "saturation",
+    "sign",
+    "unit",
+    "nan",
+    "inf",
+    "huge",
+    "held",
+    "lost_wheel",
+)
+
+SHARES = ("frozen", "dropout", "sign", "nan", "inf", "saturation")
+POSITIVE = ("noise", "delay", "huge", "held")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong with one channel, and when.
+
+    Args:
+        kind: one of `KINDS`.
+        channel: that it befalls; never a reference.
+        severity: which of the sizes in this module.
+        onset: time of its start after the first sample [s].
+        duration: how long it lasts [s]; ``inf``: to the end.
+        seed: of everything that is drawn.
+        size: instead of the severity's, in what the kind's sizes are in; its sign is kept, that of a severity is drawn.
+
+    Raises:
+        ConfigurationError: an unknown kind, channel or severity, a kind that makes no sense for the channel, or a number that makes none.
+    """
+
+    kind: str
+    channel: str
+    severity: Severity = "medium"
+    onset: float = 0.0
+    duration: float = math.inf
+    seed: int = 0
+    size: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_choice("kind", self.kind, KINDS)
+        _check_choice("channel", self.channel, tuple(CHANNELS))
+        _check_choice("severity", self.severity, SEVERITIES)
+        if CHANNELS[self.channel].is_reference:
+            raise ConfigurationError(f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel")
+        if not applies(self.kind, self.channel):
+            fitting = ", ".join(name for name in CHANNELS if applies(self.kind, name))
+            raise ConfigurationError(f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}")
+        if not (math.isfinite(self.onset) and self.onset >= 0):
+            raise ConfigurationError(f"fault.start must be a time from 0 s on, not {self.onset:g}")
+        if not self.duration > 0:
+            raise ConfigurationError(f"fault.duration must be positive, not {self.duration:g}")
+        if not 0 <= self.seed < 2**63:
+            raise ConfigurationError(f"fault.seed must be a whole number from 0 to 2^63 - 1, not {self.seed}")
+        if self.size is not None:
+            _check_size(self.kind, self.size)
+
+    @property
+    def condition(self) -> str:
+        """``bias:ay:mild``; a size of one's own stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``."""
+        level = self.severity if self.size is None else f"{self.size:.12g}"
+        return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
+
+
+def parse_condition(condition: str, onset: float = 0.0, duration: float = math.inf) -> Fault:
+    """The fault that a condition names, as `Fault.condition` writes it.
+
+    Raises:
+        ConfigurationError: it names none.
+    """
+    parts = condition.split(":")
+    wanted = f"condition '{condition}' names no fault; write KIND:CHANNEL:SEVERITY, for example bias:ay:mild"
+    if len(parts) not in (3, 4):
+        raise ConfigurationError(wanted)
+    kind, channel, level = parts[:3]
+    try:
+        seed = int(parts[3]) if len(parts) == 4 else 0
+        size = None if level in SEVERITIES or level.isalpha() else float(level)
+    except ValueError:
+        raise ConfigurationError(wanted) from None
+    severity: Severity = level if size is None else "medium"  # type: ignore[assignment]
+    return Fault(kind, channel, severity, onset, duration, seed, size)
+
+
+def is_fault(condition: str) -> bool:
+    """Whether a condition of an evaluation is a fault, rather than ``nominal`` or the like."""
+    return ":" in condition
+
+
+def applies(kind: str, channel: str) -> bool:
+    """Whether a kind of fault makes sense for a channel.
+
+    None does for a reference; a wrong sign for what has one by convention, not for speeds and pressures; a wrong unit for what is written
+    in several; a lost wheel for wheel speeds, and for the forward velocity, which a single wheel may stand for.
+    """
+    own = CHANNELS[channel]
+    if own.is_reference:
+        return False
+    if kind == "sign":
+        return own.low == -own.high
+    if kind == "unit":
+        return own.unit in UNIT_FACTORS
+    if kind == "lost_wheel":
+        return channel == "vx" or channel.startswith("wheel_speed")
+    return True
+
+
+def size_of(kind: str, channel: str, severity: Severity) -> float:
+    """Size of a fault, in what the module's table says; of wheels and motor, sizes that are offsets are shares of the largest speed."""
+    own, at = CHANNELS[channel], SEVERITIES.index(severity)
+    if kind in SIZES:
+        return SIZES[kind][at]
+    if kind == "unit":
+        return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[own.unit])[at]
+    if channel in OFFSETS:
+        return TIMES_OFFSET[kind] * OFFSETS[channel][at]
+    return TIMES_OFFSET[kind] * (OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(own))
+
+
+def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
+    """The same samples with a fault in one channel.
+
+    Args:
+        samples: channel -> (T,), SI units; stays as it is.
+        rate_hz: of the samples [Hz].
+        fault: what goes wrong.
+
+    Returns:
+        Channel -> (T,); the faulted one may hold NaN and infinite values, all others are those that were given.
+
+    Raises:
+        ConfigurationError: there is no such channel.
+    """
+    if fault.channel not in samples:
+        raise ConfigurationError(f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}")
+    values = np.array(samples[fault.channel], dtype=np.float64)
+    first, end = window(fault, len(values), rate_hz)
+    if first < end:
+        values[first:end] = _EFFECTS[fault.kind](_Struck(fault, values.copy(), first, end, rate_hz))
+    return {**samples, fault.channel: values}
+
+
+def window(fault: Fault, n_samples: int, rate_hz: float) -> tuple[int, int]:
+    """First index and end index of the samples while a fault lasts."""
+    ends = (fault.onset * rate_hz, (fault.onset + fault.duration) * rate_hz)
+    first, end = (min(math.ceil(at - 1e-6) if math.isfinite(at) else n_samples, n_samples) for at in ends)
+    return first, end
+
+
+class _Struck:
+    """A channel while its fault lasts, and what is drawn for it."""
+
+    def __init__(self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float) -> None:
+        self.values, self.first, self.end, self.rate_hz = values, first, end, rate_hz
+        self.inside = values[first:end]
+        self.seconds = np.arange(end - first) / rate_hz
+        self.reach = _reach(values)
+        self.range = _range(CHANNELS[fault.channel])
+        self.random = np.random.default_rng([fault.seed, zlib.crc32(f"{fault.kind}:{fault.channel}".encode())])
+        self.size = fault.size if fault.size is not None else self._drawn_size(fault)
+        if fault.kind in TIMES_OFFSET and _turns(fault.channel):
+            self.size *= self.reach
+
+    def _drawn_size(self, fault: Fault) -> float:
+        size = size_of(fault.kind, fault.channel, fault.severity)
+        return size * float(self.random.choice([-1.0, 1.0])) if fault.kind in ("bias", "drift", "scale") else size
+
+    def signs(self) -> FloatArray:
+        """-1 or 1 for each sample."""
+        return self.random.choice([-1.0, 1.0], len(self.inside))
+
+    def share(self) -> NDArray[np.bool_]:
+        """The first samples, as many as the size says."""
+        return np.arange(len(self.inside)) < max(round(self.size * len(self.inside)), 1)
+
+    def singles(self, share: float) -> NDArray[np.bool_]:
+        """Single samples, at least one."""
+        return self._drawn(len(self.inside), share)
+
+    def pieces(self) -> NDArray[np.bool_]:
+        """Pieces of `PIECE_SECONDS`, at least one."""
+        length = max(round(PIECE_SECONDS * self.rate_hz), 1)
+        return np.repeat(self._drawn(math.ceil(len(self.inside) / length), self.size), length)[: len(self.inside)]
+
+    def _drawn(self, number: int, share: float) -> NDArray[np.bool_]:
+        drawn = np.zeros(number, np.bool_)
+        drawn[self.random.permutation(number)[: max(round(share * number), 1)]] = True
+        return drawn
+
+    def earlier(self, samples: int) -> FloatArray:
+        """What the channel was so many samples before; its first value before there was one."""
+        return self.values[np.maximum(np.arange(self.first, self.end) - samples, 0)]
+
+
+def _frozen(at: _Struck) -> FloatArray:
+    return np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)
+
+
+def _held(at: _Struck) -> FloatArray:
+    samples = max(round(at.size * at.rate_hz), 2)
+    return at.inside[np.arange(len(at.inside)) // samples * samples]
+
+
+def _saturation(at: _Struck) -> FloatArray:
+    limit = at.size * _reach(at.inside)
+    return np.clip(at.inside, -limit, limit)
+
+
+def _lost_wheel(at: _Struck) -> FloatArray:
+    if math.isnan(at.size):
+        return np.full_like(at.inside, np.nan)
+    return at.inside * (1.0 + (at.size - 1.0) * np.minimum(at.seconds / LOSS_SECONDS, 1.0))
+
+
+_EFFECTS: dict[str, Callable[[_Struck], FloatArray]] = {
+    "bias": lambda at: at.inside + at.size,
+    "drift": lambda at: at.inside + at.size * at.seconds,
+    "scale": lambda at: at.inside * (1.0 + at.size),
+    "frozen": _frozen,
+    "dropout": lambda at: np.where(at.pieces(), 0.0, at.inside),
+    "spikes": lambda at: at.inside + at.size * at.signs() * at.singles(SPIKE_SHARE),
+    "noise": lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside)),
+    "delay": lambda at: at.earlier(max(round(at.size * at.rate_hz), 1)),
+    "saturation": _saturation,
+    "sign": lambda at: np.where(at.share(), -at.inside, at.inside),
+    "unit": lambda at: at.inside * at.size,
+    "nan": lambda at: np.where(at.pieces(), np.nan, at.inside),
+    "inf": lambda at: np.where(at.singles(at.size), at.signs() * np.inf, at.inside),
+    "huge": lambda at: np.where(at.singles(HUGE_SHARE), at.signs() * at.size * at.range, at.inside),
+    "held": _held,
+    "lost_wheel": _lost_wheel,
+}
+
+
+def _turns(channel: str) -> bool:
+    """Whether a channel is the angular speed of a wheel or of the motor."""
+    return channel.startswith("wheel_speed") or channel == "motor_speed"
+
+
+def _reach(values: FloatArray) -> float:
+    """Largest size among finite values; 0 where there are none."""
+    return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+
+
+def _range(channel: Channel) -> float:
+    """Largest size that a channel can have."""
+    return max(abs(channel.low), abs(channel.high))
+
+
+def _check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        close = difflib.get_close_matches(value, known, n=1)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise ConfigurationError(f"fault.{what} '{value}' is not there; {hint}there are: {', '.join(known)}")
+
+
+def _check_size(kind: str, size: float) -> None:
+    wanted = "a number other than 0"
+    fits = math.isfinite(size) and size != 0
+    if kind in SHARES:
+        wanted, fits = "a share above 0, up to 1", 0 < size <= 1
+    elif kind in POSITIVE:
+        wanted, fits = "a positive number", math.isfinite(size) and size > 0
+    elif kind == "lost_wheel":
+        wanted, fits = "a factor from 0 on", math.isfinite(size) and size >= 0
+    if not fits:
+        raise ConfigurationError(f"fault.size of a fault '{kind}' must be {wanted}, not {size:g}")
