@@ -24,6 +24,7 @@ from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar
 from vehest.estimators.rational_ekf import KINDS
 from vehest.filters.extended_scan import extended_scan
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import kalman_filter
 from vehest.filters.kalman_scan import kalman_scan
@@ -32,6 +33,7 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, unscented_scan
 
 STEPS = 60
+GATE = Gate(4.0, 5)
 Forms = tuple[list[Tensor], list[Tensor]]
 """What the readable form gives, and what the compiled one does."""
 
@@ -41,6 +43,14 @@ def with_gaps(measurements: Tensor) -> Tensor:
     y[..., 5:9, 0] = torch.nan
     y[..., 12:15, :] = torch.nan
     y[..., 20:40, :] = torch.nan
+    return y
+
+
+def with_outliers(measurements: Tensor, size: float = 1e3) -> Tensor:
+    """Gaps, one outlier, and at the end more of them than a gate is patient."""
+    y = with_gaps(measurements)
+    y[..., 10, 1] += size
+    y[..., 45:, 0] -= size
     return y
 
 
@@ -56,6 +66,13 @@ def kalman() -> Forms:
     )
 
 
+def gated_kalman() -> Forms:
+    model, measurements, initial = example(STEPS, seed=1)
+    y = with_outliers(measurements)
+    compiled = kalman_scan(arrays(model), y.numpy(), arrays(initial), GATE)
+    return list(kalman_filter(model, y, initial, GATE).filtered), of_the_same_numbers(compiled.filtered)
+
+
 def extended() -> Forms:
     measurements, inputs, initial = measured_pendulum(STEPS)
     y = with_gaps(measurements[0])
@@ -64,27 +81,36 @@ def extended() -> Forms:
     return list(readable.filtered), of_the_same_numbers(compiled.filtered)
 
 
-def rational_with(**config: object) -> Callable[[], Forms]:
+def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Forms]:
     def forms() -> Forms:
         estimator = rational(**config)
+        spoilt = with_gaps if gate is None else with_outliers
         samples = rational_drive(STEPS / 20.0, seed=1).stack(estimator.channels)
-        samples[:, [0, 2]] = with_gaps(torch.as_tensor(samples[:, [0, 2]])).numpy()
+        samples[:, [0, 2]] = spoilt(torch.as_tensor(samples[:, [0, 2]])).numpy()
         first = Gaussian(*map(torch.as_tensor, estimator.start(samples[0])))
         y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-        readable = extended_filter(estimator.nonlinear_model(), y, u, first).steps.filtered
-        compiled = estimator.filter_samples(samples)
+        readable = extended_filter(estimator.nonlinear_model(), y, u, first, gate=gate).steps.filtered
+        compiled = estimator.filter_samples(samples, gate=gate)
         variances = readable.covariance.diagonal(dim1=-2, dim2=-1)
         return [readable.mean, variances.clamp(min=0.0).sqrt()], of_the_same_numbers([compiled.mean, compiled.deviation])
 
     return forms
 
 
-def unscented(readable: NonlinearModel, compiled: PointModel, y: Tensor, u: Tensor, first: Gaussian[Tensor], noises: list[Tensor]) -> Forms:
+def unscented(
+    readable: NonlinearModel,
+    compiled: PointModel,
+    y: Tensor,
+    u: Tensor,
+    first: Gaussian[Tensor],
+    noises: list[Tensor],
+    gate: Gate | None = None,
+) -> Forms:
     n = first.mean.shape[-1]
     rule = symmetric_rule(n, 3.0 - n)
     with torch.no_grad():
-        theirs = unscented_filter(readable, y, u, first, rule).steps.filtered
-        ours = unscented_scan(compiled, y, u, first, *noises, rule).steps.filtered
+        theirs = unscented_filter(readable, y, u, first, rule, gate=gate).steps.filtered
+        ours = unscented_scan(compiled, y, u, first, *noises, rule, gate=gate).steps.filtered
     return list(theirs), list(ours)
 
 
@@ -96,7 +122,7 @@ def diagonal(*deviations: float) -> Tensor:
     return torch.tensor(deviations, dtype=torch.float64).square().diag()
 
 
-def planar(kind: str) -> Callable[[], Forms]:
+def planar(kind: str, gate: Gate | None = None) -> Callable[[], Forms]:
     def forms() -> Forms:
         car, lower = a_car(kind), torch.tensor(LOWER, dtype=torch.float64)
         noises = [diagonal(0.03, 0.03, 0.1, 0.1, 0.01), diagonal(7.0, 7.0, 0.3, 0.3)]
@@ -105,12 +131,13 @@ def planar(kind: str) -> Callable[[], Forms]:
         generator = torch.Generator().manual_seed(1)
         y = torch.randn(1, STEPS, 4, generator=generator, dtype=torch.float64) + torch.tensor([0.0, 0.0, 1.0, 3.0])
         first = Gaussian(torch.tensor([3.0, 0.2, 1.0, 3.0, 0.6]).double(), diagonal(0.03, 0.03, 0.03, 0.03, 0.01))
-        return unscented(model, CompiledPlanarCar(car, CAR_STEP, LOWER, torch.float64), with_gaps(y), driven(STEPS)[1][None], first, noises)
+        y = with_gaps(y) if gate is None else with_outliers(y)
+        return unscented(model, CompiledPlanarCar(car, CAR_STEP, LOWER, torch.float64), y, driven(STEPS)[1][None], first, noises, gate)
 
     return forms
 
 
-def dugoff(tyres: str) -> Callable[[], Forms]:
+def dugoff(tyres: str, gate: Gate | None = None) -> Callable[[], Forms]:
     def forms() -> Forms:
         track = dugoff_track(tyres, sees_sideslip=True)
         sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
@@ -120,7 +147,8 @@ def dugoff(tyres: str) -> Callable[[], Forms]:
         y = torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + sizes * torch.randn(1, STEPS, 5, generator=generator, dtype=torch.float64)
         u = torch.tensor([20.0, 0.05, 0.0], dtype=torch.float64).expand(1, STEPS, 3).contiguous()
         first = Gaussian(torch.tensor([0.0, 0.1], dtype=torch.float64), diagonal(0.3, 0.1))
-        return unscented(model, CompiledDugoffTrack(track), with_gaps(y), u, first, noises)
+        y = with_gaps(y) if gate is None else with_outliers(y, 10.0)
+        return unscented(model, CompiledDugoffTrack(track), y, u, first, noises, gate)
 
     return forms
 
@@ -140,6 +168,10 @@ PAIRS: dict[str, Callable[[], Forms]] = {
     "rational_ekf held straight ahead": rational_with(adapt_above=2.0),
     **{f"learned_ukf {kind}": planar(kind) for kind in CARS},
     **{f"dugoff_ukf {tyres}": dugoff(tyres) for tyres in ("plain", "smooth")},
+    "Kalman gated": gated_kalman,
+    "rational_ekf gated": rational_with(GATE, tyres="rational_adaptive"),
+    "learned_ukf gated": planar("PC", GATE),
+    "dugoff_ukf gated": dugoff("plain", GATE),
     **{f"{estimator.name} {estimator.variant}": network(estimator) for estimator in STRUCTURES},
 }
 

@@ -23,6 +23,7 @@ from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.filtering.single_track import checked_sample, require_positive
 from vehest.estimators.filtering.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
 from vehest.estimators.references import reference_sideslip
+from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
@@ -116,6 +117,7 @@ class DugoffUkfSettings(EstimatorSettings):
         minimum_speed: speed below which wheels roll without slip, and nothing counts as measured [m/s].
         nonlinear_from: |ay| from which the car behaves non-linearly, so that forces are trusted [m/s²].
         linear_below: |ay| down to which it then stays so [m/s²].
+        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
         noise: levels of noise.
         tyres: of both axles.
         car: the car.
@@ -127,6 +129,7 @@ class DugoffUkfSettings(EstimatorSettings):
     minimum_speed: float = 3.0
     nonlinear_from: float = 4.0
     linear_below: float = 3.0
+    gate: float | None = None
     noise: TrackLevels = TrackLevels()
     tyres: AxleTyres = AxleTyres()
     car: LoadedCar = BMW_545I
@@ -136,7 +139,7 @@ class DugoffUkfSettings(EstimatorSettings):
         for name, options in (("inputs", tuple(CHANNELS)), ("curve", ("plain", "smooth"))):
             if getattr(self, name) not in options:
                 raise ConfigurationError(f"estimator.{name} '{getattr(self, name)}' is not one of: {', '.join(options)}")
-        require_positive("estimator", {"minimum_speed": self.minimum_speed})
+        require_positive("estimator", {"minimum_speed": self.minimum_speed, "gate": self.gate})
         if not 0.0 <= self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
                 f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
@@ -174,13 +177,14 @@ class DugoffUkf(Estimator):
 
     @property
     def variant(self) -> str:
-        """What is measured, and the curve."""
-        return f"dugoff_{self.settings.inputs}" + ("_smooth" if self.settings.curve == "smooth" else "")
+        """What is measured, the curve, and the gate."""
+        s = self.settings
+        return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + suffix(s.gate)
 
     @property
     def full_title(self) -> str:
-        """Title with what is measured."""
-        return f"{self.title}, {'with' if self.settings.inputs == 'full' else 'without'} tyre forces"
+        """Title with what is measured, and the gate."""
+        return f"{self.title}, {'with' if self.settings.inputs == 'full' else 'without'} tyre forces{in_words(self.settings.gate)}"
 
     @property
     def learns(self) -> bool:
@@ -325,7 +329,7 @@ class DugoffUkf(Estimator):
     def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
         """Recordings of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
-        for rows, steps in self._filtered(recordings, states):
+        for rows, steps in self._filtered(recordings, states, gate=self.gate()):
             mean, covariance = (part.numpy() for part in steps.filtered)
             nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1).numpy()
             dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
@@ -341,8 +345,12 @@ class DugoffUkf(Estimator):
         recordings: Sequence[Recording],
         states: Sequence[Mapping[str, float] | None] | None = None,
         levels: Mapping[str, float] | None = None,
+        gate: Gate | None = None,
     ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
-        """Rows of recordings that were filtered together, padded to the longest, and what came of them."""
+        """Rows of recordings that were filtered together, padded to the longest, and what came of them.
+
+        Levels are found without a gate, which noise that is too small would close.
+        """
         model = TrackFilter(self.track())
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
@@ -352,8 +360,13 @@ class DugoffUkf(Estimator):
             trusted = torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
-                outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], model.start(inputs[:, 0], given))
+                initial = model.start(inputs[:, 0], given)
+                outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], initial, gate)
             yield rows, outcome.steps
+
+    def gate(self) -> Gate | None:
+        """That of the filter in use."""
+        return Gate.of(self.settings.gate, self.settings.rate_hz)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
@@ -394,7 +407,7 @@ class DugoffUkfStepper(Stepper):
 
     def __init__(self, estimator: DugoffUkf) -> None:
         self._estimator = estimator
-        self._filter = TrackStepper(TrackFilter(estimator.track()))
+        self._filter = TrackStepper(TrackFilter(estimator.track()), estimator.gate())
         self._process, self._sensors = (noise.numpy() for noise in estimator.noise_covariances(estimator.levels))
         self._trusts = False
 

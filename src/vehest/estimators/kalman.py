@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -16,6 +17,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.filtering.single_track import SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
+from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
@@ -66,14 +68,16 @@ class KalmanSettings(SingleTrackSettings):
     Args:
         noise: levels of the sensors' noise.
         initial_deviation: standard deviation of β and r before the first sample [rad, rad/s].
+        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
     """
 
     noise: SensorNoise = SensorNoise()
     initial_deviation: float = 100.0
+    gate: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require_positive("estimator", {"initial_deviation": self.initial_deviation})
+        require_positive("estimator", {"initial_deviation": self.initial_deviation, "gate": self.gate})
 
 
 class KalmanFilter(SingleTrackEstimator):
@@ -107,17 +111,15 @@ class KalmanFilter(SingleTrackEstimator):
 
     @property
     def variant(self) -> str:
-        """Where the noise levels come from, unless it is the training."""
-        if self.learns:
-            return self.name
-        return "kalman_given_noise" if self.causal else "kalman_own_noise"
+        """Where the noise levels come from, unless it is the training; and the gate."""
+        noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
+        return self.name + noise + suffix(self.settings.gate)
 
     @property
     def full_title(self) -> str:
-        """Title with where the noise levels come from."""
-        if self.learns:
-            return self.title
-        return f"{self.title}, noise {'given' if self.causal else 'read off the recording itself'}"
+        """Title with where the noise levels come from, and the gate."""
+        noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
+        return self.title + noise + in_words(self.settings.gate)
 
     @property
     def n_parameters(self) -> int:
@@ -161,8 +163,14 @@ class KalmanFilter(SingleTrackEstimator):
         n_measured: FloatArray = np.sum(np.asarray(result.measured), axis=1, dtype=np.float64)
         return self.wrapped_state(recording, result.filtered.mean, result.filtered.covariance, nis=nis, nis_dof=n_measured)
 
-    def filter_samples(self, samples: FloatArray, levels: Mapping[str, float], first: Gaussian[FloatArray]) -> Filtered[FloatArray]:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement."""
+    def filter_samples(
+        self,
+        samples: FloatArray,
+        levels: Mapping[str, float],
+        first: Gaussian[FloatArray],
+        refused: NDArray[np.int64] | None = None,
+    ) -> Filtered[FloatArray]:
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement; ``refused``: see `kalman_scan`."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         observation = np.zeros((len(samples), 2, 2))
@@ -176,7 +184,8 @@ class KalmanFilter(SingleTrackEstimator):
             observation_offset=np.stack([D * steer, np.zeros_like(steer)], axis=1),
             observation_noise=np.diag([levels["ay"] ** 2, levels["yaw_rate"] ** 2]),
         )
-        return kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first)
+        gate = Gate.of(self.settings.gate, self.settings.rate_hz)
+        return kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
 
     def online(self) -> KalmanStepper:
         """A stepper that knows nothing of the state yet."""
@@ -207,8 +216,10 @@ class KalmanStepper(SingleTrackStepper):
     def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
         return self._estimator.first_state(row[1], self._estimator.settings.initial_deviation, None)
 
-    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
-        filtered = self._estimator.filter_samples(rows, self._estimator.levels, state).filtered
+    def _filtered(
+        self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]
+    ) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        filtered = self._estimator.filter_samples(rows, self._estimator.levels, state, refused).filtered
         return Gaussian(filtered.mean[-1], filtered.covariance[-1]), {}
 
 

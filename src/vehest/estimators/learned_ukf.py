@@ -18,6 +18,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
 from vehest.estimators.filtering.car_filter import CarFilter
 from vehest.estimators.phase_records import record_of_phases
+from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
@@ -109,6 +110,7 @@ class LearnedUkfSettings(EstimatorSettings):
         repair: whether covariances that are not positive definite are repaired; otherwise an estimate that loses one is NaN from there on.
         least_speed: smallest forward speed that the state may have [m/s].
         least_friction: smallest friction that the state may have.
+        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
         car: what is known of the car, and where learning starts.
     """
 
@@ -123,6 +125,7 @@ class LearnedUkfSettings(EstimatorSettings):
     repair: bool = True
     least_speed: float = 0.05
     least_friction: float = 0.05
+    gate: float | None = None
     car: CarSettings = CarSettings()
 
     def __post_init__(self) -> None:
@@ -134,6 +137,8 @@ class LearnedUkfSettings(EstimatorSettings):
         for name in ("friction", "least_speed", "least_friction"):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"estimator.{name} must be positive, not {getattr(self, name)}")
+        if self.gate is not None and not self.gate > 0:
+            raise ConfigurationError(f"estimator.gate must be positive, not {self.gate}")
         if self.start_friction is not None and not self.start_friction > self.least_friction:
             raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
         if self.width < 0:
@@ -170,7 +175,7 @@ class LearnedUkf(Estimator):
         subscript = ("u" if s.through_filter else "") + ("h" if s.noise == "state_dependent" else "")
         name = SHORT[s.dynamics] + (f"_{subscript}" if subscript else "")
         name += "" if s.start_friction in (None, s.friction) else f"_mu{s.start_friction:g}"
-        return name + ("" if s.repair else "_unrepaired") + ("" if s.scaled else "_si")
+        return name + ("" if s.repair else "_unrepaired") + ("" if s.scaled else "_si") + suffix(s.gate)
 
     @property
     def full_title(self) -> str:
@@ -180,16 +185,16 @@ class LearnedUkf(Estimator):
         if s.start_friction not in (None, s.friction):
             how.append(f"friction from {s.start_friction:g}")
         how += ["no repair"] * (not s.repair)
-        return f"{self.title}, {', '.join(how)}"
+        return f"{self.title}, {', '.join(how)}{in_words(s.gate)}"
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
-        """Members that differ in seed, in where friction starts in use, and in repairs in use share their training."""
+        """Members that differ in seed, and in where friction starts, in repairs and in the gate in use share their training."""
         return (self.name, self._trained)
 
     @property
     def _trained(self) -> LearnedUkfSettings:
-        return replace(self.settings, start_friction=None, repair=True)
+        return replace(self.settings, start_friction=None, repair=True, gate=None)
 
     @property
     def n_parameters(self) -> int:
@@ -329,7 +334,7 @@ class LearnedUkf(Estimator):
         starts = [self._start(own[0][0], state) for own, state in zip(samples, states, strict=True)]
         initial = Gaussian(torch.stack([mean for mean, _ in starts]), torch.stack([covariance for _, covariance in starts]))
         with torch.no_grad():
-            steps = self.filter.filtered(measurements, inputs, initial).steps
+            steps = self.filter.filtered(measurements, inputs, initial, gate=self.gate()).steps
             nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
         mean, covariance, dof = steps.filtered.mean.double().numpy(), steps.filtered.covariance.double().numpy(), steps.measured.sum(-1)
         estimates = []
@@ -340,6 +345,10 @@ class LearnedUkf(Estimator):
             extra = {"nis": nis[row].double().numpy(), "nis_dof": dof[row].double().numpy()}
             estimates.append(self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra))
         return estimates
+
+    def gate(self) -> Gate | None:
+        """That of the filter in use; it learns without."""
+        return Gate.of(self.settings.gate, self.settings.rate_hz)
 
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
         """A recording as its filter takes it: true states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
@@ -399,7 +408,9 @@ class LearnedUkfStepper(Stepper):
         if self._filter is None:
             own = self._estimator.filter
             mean, covariance = (part.numpy() for part in self._estimator._start(row[:4], None))
-            self._filter = UnscentedStepper(self._model, mean, covariance, len(MEASURED), own.rule, repair=own.repair)
+            self._filter = UnscentedStepper(
+                self._model, mean, covariance, len(MEASURED), own.rule, repair=own.repair, gate=self._estimator.gate()
+            )
         dtype = self._filter.mean.dtype
         estimated = self._filter.step(row[:4].astype(dtype), self._inputs.astype(dtype), *self._noises)
         return dict(zip(STATES, estimated.tolist(), strict=True))

@@ -22,6 +22,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.filtering.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
 from vehest.estimators.filtering.tyre_fit import fit_tyres
+from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.nonlinear import NonlinearModel, unscented_filter
@@ -111,6 +112,8 @@ class RationalSettings(SingleTrackSettings):
             offsets of sensors are all that there is to adapt to.
         noise: levels of noise.
         curves: axle curves.
+        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
+            Of the extended filter.
     """
 
     rate_hz: float = 20.0
@@ -120,6 +123,7 @@ class RationalSettings(SingleTrackSettings):
     adapt_above: float = 0.0
     noise: TrackNoise = TrackNoise()
     curves: AxleCurves = AxleCurves()
+    gate: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -127,6 +131,11 @@ class RationalSettings(SingleTrackSettings):
             raise ConfigurationError(f"estimator.tyres '{self.tyres}' is not one of: {', '.join(KINDS)}")
         if self.filter not in ("extended", "unscented"):
             raise ConfigurationError(f"estimator.filter '{self.filter}' is not one of: extended, unscented")
+        require_positive("estimator", {"gate": self.gate})
+        if self.gate is not None and self.filter != "extended":
+            raise ConfigurationError(
+                "estimator.gate is there for estimator.filter=extended only; set gate to null, or the filter to extended"
+            )
         if not self.bound > 1.0:
             raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
         if not self.adapt_above >= 0.0:
@@ -206,15 +215,15 @@ class RationalFilter(SingleTrackEstimator):
 
     @property
     def variant(self) -> str:
-        """The paper's name for these tyres, and whether the filter is another one or holds them straight ahead."""
+        """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")
-        return kind + ("_held" if self._holds else "")
+        return kind + ("_held" if self._holds else "") + suffix(self.settings.gate)
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
         held = ", tyres held straight ahead" if self._holds else ""
-        return f"{KINDS[self.settings.tyres][1]}, {self.settings.filter} Kalman filter{held}"
+        return f"{KINDS[self.settings.tyres][1]}, {self.settings.filter} Kalman filter{held}{in_words(self.settings.gate)}"
 
     @property
     def _holds(self) -> bool:
@@ -394,14 +403,26 @@ class RationalFilter(SingleTrackEstimator):
             covariance[4:, 4:] = self.curve_covariance[np.ix_(rows, rows)]
         return Gaussian(mean, covariance)
 
+    def gate(self) -> Gate | None:
+        """That of filters in use."""
+        return Gate.of(self.settings.gate, self.settings.rate_hz)
+
     def bounds(self) -> FloatArray:
         """Largest absolute value of each state, (n,)."""
         return np.array([*LARGEST, *[math.log(self.settings.bound)] * len(self.settings.adapted)])
 
     def filter_samples(
-        self, samples: FloatArray, first: Gaussian[FloatArray] | None = None, levels: Mapping[str, float] | None = None
+        self,
+        samples: FloatArray,
+        first: Gaussian[FloatArray] | None = None,
+        levels: Mapping[str, float] | None = None,
+        gate: Gate | None = None,
+        refused: NDArray[np.int64] | None = None,
     ) -> FilteredDrive:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
+
+        ``gate`` and ``refused`` (how often on end yaw rate and ay were before the first sample, after the last one on return): see `Gate`.
+        Levels are found without a gate, which noise that is too small would close.
 
         Raises:
             ConfigurationError: curves or levels are neither given nor fitted.
@@ -429,6 +450,9 @@ class RationalFilter(SingleTrackEstimator):
             1.0 / self.settings.rate_hz,
             self.settings.minimum_speed,
             self.settings.adapt_above,
+            math.inf if gate is None else gate.deviations**2,
+            0 if gate is None else gate.patience,
+            np.zeros(2, np.int64) if refused is None else refused,
             mean,
             covariance,
             *out,
@@ -524,7 +548,7 @@ class RationalFilter(SingleTrackEstimator):
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         samples = _samples(recording)
-        filtered = self.filter_samples(samples, self.start(samples[0], initial_state))
+        filtered = self.filter_samples(samples, self.start(samples[0], initial_state), gate=self.gate())
         nis, n_measured = filtered.nis()
         others = {**self._quantities(filtered.mean), "nis": nis, "nis_dof": n_measured}
         return self.wrapped_state(recording, filtered.mean[:, :2], filtered.sideslip_covariance, **others)
@@ -579,8 +603,10 @@ class RationalStepper(SingleTrackStepper):
     def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
         return self._estimator.start(row)
 
-    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
-        filtered = self._estimator.filter_samples(rows, state)
+    def _filtered(
+        self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]
+    ) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        filtered = self._estimator.filter_samples(rows, state, gate=self._estimator.gate(), refused=refused)
         tyres = self._estimator._quantities(filtered.mean[-1:])
         return filtered.last, {name: float(values[-1]) for name, values in tyres.items()}
 

@@ -8,6 +8,7 @@ from typing import Generic, NamedTuple
 import torch
 from torch import Tensor
 
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Array, Filtered, Gaussian, stacked, symmetric
 
 
@@ -37,13 +38,16 @@ class LinearModel(NamedTuple, Generic[Array]):
     observation_noise: Array
 
 
-def kalman_filter(model: LinearModel[Tensor], measurements: Tensor, initial: Gaussian[Tensor]) -> Filtered[Tensor]:
+def kalman_filter(
+    model: LinearModel[Tensor], measurements: Tensor, initial: Gaussian[Tensor], gate: Gate | None = None
+) -> Filtered[Tensor]:
     """Filter sequences; what is NaN was not measured and is skipped, and gradients stay finite.
 
     Args:
         model: see `LinearModel`.
         measurements: y, (..., T, m).
         initial: state at the first sample before its measurement, mean (..., n).
+        gate: which measurements are refused; none: all are taken.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -54,7 +58,8 @@ def kalman_filter(model: LinearModel[Tensor], measurements: Tensor, initial: Gau
     model = _expanded(model, measurements)
     batch, n = measurements.shape[:-2], model.transition.shape[-1]
     state = Gaussian(_expand("initial.mean", initial.mean, (*batch, n)), _expand("initial.covariance", initial.covariance, (*batch, n, n)))
-    predicted, updates = [], []
+    predicted, updates, taken = [], [], []
+    refused = torch.zeros_like(measurements[..., 0, :], dtype=torch.int64)
     for k in range(measurements.shape[-2]):
         if k > 0:
             state = predict(
@@ -64,13 +69,14 @@ def kalman_filter(model: LinearModel[Tensor], measurements: Tensor, initial: Gau
                 model.process_noise[..., k - 1, :, :],
             )
         predicted.append(state)
-        update = condition_on(
-            state,
-            measurements[..., k, :],
-            model.observation[..., k, :, :],
-            model.observation_offset[..., k, :],
-            model.observation_noise[..., k, :, :],
-        )
+        y = measurements[..., k, :]
+        observation = model.observation[..., k, :, :]
+        offset, noise = model.observation_offset[..., k, :], model.observation_noise[..., k, :, :]
+        if gate is not None:
+            variance = (observation @ state.covariance @ observation.mT + noise).diagonal(dim1=-2, dim2=-1)
+            y, refused = gate.apply(y, _times(observation, state.mean) + offset, variance, refused)
+        taken.append(y)
+        update = condition_on(state, y, observation, offset, noise)
         updates.append(update)
         state = update.state
     axis = len(batch)
@@ -79,7 +85,7 @@ def kalman_filter(model: LinearModel[Tensor], measurements: Tensor, initial: Gau
         stacked([update.state for update in updates], axis),
         torch.stack([update.innovation for update in updates], axis),
         torch.stack([update.innovation_covariance for update in updates], axis),
-        ~torch.isnan(measurements),
+        ~torch.isnan(torch.stack(taken, axis)),
         torch.stack([update.log_likelihood for update in updates], axis),
     )
 

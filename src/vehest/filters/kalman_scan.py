@@ -6,19 +6,29 @@ import math
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.filters.gating import Gate, refuses
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel, shapes_of
 
 
-def kalman_scan(model: LinearModel[FloatArray], measurements: FloatArray, initial: Gaussian[FloatArray]) -> Filtered[FloatArray]:
+def kalman_scan(
+    model: LinearModel[FloatArray],
+    measurements: FloatArray,
+    initial: Gaussian[FloatArray],
+    gate: Gate | None = None,
+    refused: NDArray[np.int64] | None = None,
+) -> Filtered[FloatArray]:
     """Filter one sequence in float64; what is NaN was not measured and is skipped.
 
     Args:
         model: as for `kalman_filter`, without a batch; what is constant over time needs no dimension for it.
         measurements: y, (T, m).
         initial: state at the first sample before its measurement, mean (n,).
+        gate: which measurements are refused; none: all are taken.
+        refused: how often on end each measurement was before the first sample, (m,); after the last one on return. None: never.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -34,9 +44,10 @@ def kalman_scan(model: LinearModel[FloatArray], measurements: FloatArray, initia
     predicted = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
     filtered = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
     innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
+    taken = _contiguous(measurements, (steps, m), "measurements").copy()
     failed = _scan(
         *parts,
-        _contiguous(measurements, (steps, m), "measurements"),
+        taken,
         _contiguous(initial.mean, (n,), "initial.mean"),
         _contiguous(initial.covariance, (n, n), "initial.covariance"),
         *predicted,
@@ -44,10 +55,13 @@ def kalman_scan(model: LinearModel[FloatArray], measurements: FloatArray, initia
         innovation,
         covariance,
         likelihood,
+        math.inf if gate is None else gate.deviations**2,
+        0 if gate is None else gate.patience,
+        np.zeros(m, np.int64) if refused is None else refused,
     )
     if failed >= 0:
         raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
-    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(measurements), likelihood)
+    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(taken), likelihood)
 
 
 def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
@@ -58,8 +72,31 @@ def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatA
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post_cov, innovation, innovation_cov, likelihood):  # type: ignore[no-untyped-def]
-    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1."""
+def _scan(  # type: ignore[no-untyped-def]
+    A,
+    b,
+    Q,
+    C,
+    d,
+    R,
+    y,
+    mean,
+    cov,
+    prior_mean,
+    prior_cov,
+    post_mean,
+    post_cov,
+    innovation,
+    innovation_cov,
+    likelihood,
+    limit,
+    patience,
+    refused,
+):
+    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
+
+    With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
+    """
     steps, m = y.shape
     n = len(mean)
     seen_C, seen_R = np.empty((m, n)), np.empty((m, m))
@@ -79,6 +116,8 @@ def _scan(A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post
                     prior_cov[k, i, j] = right[i, j] + Q[k - 1, i, j]
                 prior_mean[k, i] = total
             _make_symmetric(prior_cov[k])
+        if limit < math.inf:
+            _gate(y[k], C[k], d[k], R[k], prior_mean[k], prior_cov[k], limit, patience, refused)
         count = 0
         for i in range(m):
             known = not math.isnan(y[k, i])
@@ -135,6 +174,21 @@ def _scan(A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post
             total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
         likelihood[k] = -0.5 * total
     return -1
+
+
+@numba.njit(inline="always")
+def _gate(y, C, d, R, mean, cov, limit, patience, refused):  # type: ignore[no-untyped-def]
+    n = len(mean)
+    for i in range(len(y)):
+        if math.isnan(y[i]):
+            continue
+        error, variance = y[i] - d[i], R[i, i]
+        for j in range(n):
+            error -= C[i, j] * mean[j]
+            for c in range(n):
+                variance += C[i, j] * cov[j, c] * C[i, c]
+        if refuses(error, variance, limit, patience, refused, i):
+            y[i] = math.nan
 
 
 @numba.njit(inline="always")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from vehest.filters.definiteness import factorised
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian, stacked, symmetric
 from vehest.filters.sigma_points import SigmaRule
 
@@ -77,7 +78,14 @@ class _Updated(NamedTuple):
 
 
 def unscented_filter(
-    model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], rule: SigmaRule, *, repair: bool = True
+    model: NonlinearModel,
+    measurements: Tensor,
+    inputs: Tensor,
+    initial: Gaussian[Tensor],
+    rule: SigmaRule,
+    *,
+    repair: bool = True,
+    gate: Gate | None = None,
 ) -> NonlinearFiltered:
     """The unscented Kalman filter with additive noise; sigma points are drawn again before each update.
 
@@ -89,6 +97,7 @@ def unscented_filter(
         rule: which sigma points.
         repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN. Where a negative
             weight of the mean point is what takes the definiteness of an update, the update goes without it; everything else is lifted.
+        gate: which measurements are refused; none: all are taken.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -104,6 +113,13 @@ def unscented_filter(
         deviations = after - mean.unsqueeze(-2)
         covariance = symmetric(rule.covariance(deviations, deviations) + model.process_noise(state.mean, u))
         return _Predicted(Gaussian(model.possible(mean), covariance), repaired)
+
+    def foreseen(state: Gaussian[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
+        points = model.possible(rule.points(state.mean, factorised(state.covariance, repair=repair)[1]))
+        expected = model.observation(points, u.unsqueeze(-2))
+        mean = rule.mean(expected)
+        spread = expected - mean.unsqueeze(-2)
+        return mean, rule.covariance(spread, spread).diagonal(dim1=-2, dim2=-1)
 
     def update(state: Gaussian[Tensor], y: Tensor, u: Tensor) -> _Updated:
         prior, factor, repaired = factorised(state.covariance, repair=repair)
@@ -127,11 +143,17 @@ def unscented_filter(
             return updated
         return _either(lost, conditioned(replace(rule, centre_covariance=0.0)), updated)
 
-    return _filtered(model, measurements, inputs, initial, predict, update)
+    return _filtered(model, measurements, inputs, initial, predict, update, foreseen, gate)
 
 
 def extended_filter(
-    model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], *, repair: bool = True
+    model: NonlinearModel,
+    measurements: Tensor,
+    inputs: Tensor,
+    initial: Gaussian[Tensor],
+    *,
+    repair: bool = True,
+    gate: Gate | None = None,
 ) -> NonlinearFiltered:
     """The extended Kalman filter; Jacobians by automatic differentiation.
 
@@ -141,6 +163,7 @@ def extended_filter(
         inputs: u, (..., T, p).
         initial: state at the first sample before its measurement, mean (..., n).
         repair: as for `unscented_filter`.
+        gate: likewise.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -153,6 +176,10 @@ def extended_filter(
         covariance = symmetric(slope @ state.covariance @ slope.mT + model.process_noise(state.mean, u))
         return _Predicted(Gaussian(model.possible(mean), covariance), torch.zeros_like(mean[..., 0], dtype=torch.bool))
 
+    def foreseen(state: Gaussian[Tensor], u: Tensor) -> tuple[Tensor, Tensor]:
+        mean, slope = _linearised(model.observation, state.mean, u)
+        return mean, (slope @ state.covariance @ slope.mT).diagonal(dim1=-2, dim2=-1)
+
     def update(state: Gaussian[Tensor], y: Tensor, u: Tensor) -> _Updated:
         mean, slope = _linearised(model.observation, state.mean, u)
         measured = ~torch.isnan(y)
@@ -162,7 +189,7 @@ def extended_filter(
         nothing = torch.zeros_like(mean[..., 0], dtype=torch.bool)
         return _conditioned(model, state, mean, slope @ cross, cross, y, u, nothing, repair)
 
-    return _filtered(model, measurements, inputs, initial, predict, update)
+    return _filtered(model, measurements, inputs, initial, predict, update, foreseen, gate)
 
 
 def _conditioned(
@@ -217,7 +244,10 @@ def _filtered(
     initial: Gaussian[Tensor],
     predict: Callable[[Gaussian[Tensor], Tensor], _Predicted],
     update: Callable[[Gaussian[Tensor], Tensor, Tensor], _Updated],
+    foreseen: Callable[[Gaussian[Tensor], Tensor], tuple[Tensor, Tensor]],
+    gate: Gate | None,
 ) -> NonlinearFiltered:
+    """Go through sequences; ``foreseen`` gives what a gate needs: mean and variance, without noise, of what is expected."""
     if measurements.dim() < 2 or measurements.shape[-2] == 0:
         raise ValueError(f"measurements must be of shape (..., T, m) with T > 0, not {tuple(measurements.shape)}")
     if inputs.shape[:-1] != measurements.shape[:-1]:
@@ -230,14 +260,21 @@ def _filtered(
             f"the initial state, mean {tuple(initial.mean.shape)} and covariance {tuple(initial.covariance.shape)}, does not fit "
             f"{tuple(batch)} sequences"
         ) from None
-    predictions, updates, lost = [], [], []
+    predictions, updates, taken, lost = [], [], [], []
+    refused = torch.zeros_like(measurements[..., 0, :], dtype=torch.int64)
     for k in range(measurements.shape[-2]):
         repaired = torch.zeros(batch, dtype=torch.bool, device=measurements.device)
         if k > 0:
             state, repaired = predict(state, inputs[..., k - 1, :])
             state = state if model.restart is None else model.restart(state, inputs[..., k, :])
         predictions.append(state)
-        own = update(state, measurements[..., k, :], inputs[..., k, :])
+        y, u = measurements[..., k, :], inputs[..., k, :]
+        if gate is not None:
+            expected, variance = foreseen(state, u)
+            noise = model.observation_noise(state.mean, u).diagonal(dim1=-2, dim2=-1)
+            y, refused = gate.apply(y, expected, variance.clamp(min=0.0) + noise, refused)
+        taken.append(y)
+        own = update(state, y, u)
         updates.append(own)
         lost.append(repaired | own.repaired)
         state = own.state
@@ -247,7 +284,7 @@ def _filtered(
         stacked([own.state for own in updates], axis),
         torch.stack([own.innovation for own in updates], axis),
         torch.stack([own.innovation_covariance for own in updates], axis),
-        ~torch.isnan(measurements),
+        ~torch.isnan(torch.stack(taken, axis)),
         torch.stack([own.log_likelihood for own in updates], axis),
     )
     return NonlinearFiltered(steps, torch.stack(lost, axis))

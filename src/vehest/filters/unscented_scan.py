@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.filters.definiteness import MARGIN
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.nonlinear import Function, NonlinearFiltered
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_steps import moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
+from vehest.filters.unscented_steps import gate_of, moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
 
 Array = NDArray[Any]
 NoiseAt = Callable[[Array, Array], Array]
@@ -114,12 +115,15 @@ class _Setting:
     lower: Array
     margin: Any
     repair: bool
+    gate: Gate | None
+    limit: Any
 
     @classmethod
-    def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool) -> _Setting:
+    def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> _Setting:
         row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], dtype)
         lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
-        return cls(model, row, lower, dtype(MARGIN), repair)
+        limit = None if gate is None else dtype(gate.deviations**2)
+        return cls(model, row, lower, dtype(MARGIN), repair, gate, limit)
 
 
 class _Points:
@@ -161,7 +165,7 @@ class _Tape:
         self.post_mean, self.post_covariance = empty(n), empty(n, n)
         self.moved, self.expected = empty(points, n), empty(points, m)
         self.innovation, self.own, self.gain, self.likelihood, self.centre = empty(m), empty(m, m), empty(n, m), empty(), empty()
-        self.repaired = np.zeros((steps, sequences), np.bool_)
+        self.repaired, self.gone = np.zeros((steps, sequences), np.bool_), np.zeros((steps, sequences, m), np.bool_)
 
     def slice(self, first: int, end: int) -> _Tape:
         """The same of some sequences, copied to lie together."""
@@ -187,6 +191,8 @@ def unscented_scan(
     *,
     repair: bool = True,
     share: Share | None = None,
+    gate: Gate | None = None,
+    refused: NDArray[np.int64] | None = None,
 ) -> NonlinearFiltered:
     """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
 
@@ -200,6 +206,8 @@ def unscented_scan(
         rule: which sigma points.
         repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
         share: how sequences are shared out over threads; none: one thread.
+        gate: which measurements are refused; none: all are taken. The decision itself has no gradient.
+        refused: how often on end each measurement was before the first sample, (B, m); after the last one on return. None: never.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -218,7 +226,8 @@ def unscented_scan(
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    setting = _Setting.of(model, rule, n, numpy_dtype, repair)
+    setting = _Setting.of(model, rule, n, numpy_dtype, repair, gate)
+    refused = np.zeros((sequences, m), np.int64) if refused is None else refused
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
@@ -227,7 +236,7 @@ def unscented_scan(
     ]
     tape = _Tape(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        setting, share or _alone, tape, functions, refused, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
     outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
@@ -235,7 +244,7 @@ def unscented_scan(
         Gaussian(post_mean.transpose(0, 1), post_covariance.transpose(0, 1)),
         outside[2],
         outside[3],
-        ~torch.isnan(measurements),
+        ~(torch.isnan(measurements) | torch.from_numpy(tape.gone.swapaxes(0, 1))),
         torch.from_numpy(tape.likelihood.swapaxes(0, 1)),
     )
     return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
@@ -249,17 +258,26 @@ class UnscentedStepper:
         mean, covariance: of the state at the first sample before its measurement, (n,) and (n, n), of the model's precision.
         measurements: how many there are, m.
         rule: which sigma points.
-        repair: see `unscented_scan`.
+        repair, gate: see `unscented_scan`.
 
     Attributes:
         mean, covariance: of the state, filtered, (n,) and (n, n).
     """
 
     def __init__(
-        self, model: PointModel, mean: Array, covariance: Array, measurements: int, rule: SigmaRule, *, repair: bool = True
+        self,
+        model: PointModel,
+        mean: Array,
+        covariance: Array,
+        measurements: int,
+        rule: SigmaRule,
+        *,
+        repair: bool = True,
+        gate: Gate | None = None,
     ) -> None:
         n, dtype = len(mean), mean.dtype.type
-        self._setting = _Setting.of(model, rule, n, dtype, repair)
+        self._setting = _Setting.of(model, rule, n, dtype, repair, gate)
+        self._refused = np.zeros((1, measurements), np.int64)
         self._tape, self._points = _Tape(1, 1, n, measurements, dtype), _Points(self._setting, 1, n, dtype)
         self._tape.prior_mean[0], self._tape.prior_covariance[0] = mean, covariance
         self._inputs: Array | None = None
@@ -278,7 +296,8 @@ class UnscentedStepper:
         if self._inputs is not None:
             before = tape.post_mean[0].copy(), tape.post_covariance[0].copy()
             _predict(self._setting, tape, 0, self._points, *before, self._inputs, process_noise)
-        _update(self._setting, tape, 0, self._points, measurement[None], now, observation_noise)
+        seen = measurement[None] if self._setting.gate is None else measurement[None].copy()
+        _update(self._setting, tape, 0, self._points, seen, now, observation_noise, self._refused)
         self._inputs = now
         return self.mean
 
@@ -311,6 +330,7 @@ class _Scan(torch.autograd.Function):
         share: Share,
         tape: _Tape,
         functions: Sequence[NoiseAt | None],
+        refused: NDArray[np.int64],
         measurements: Tensor,
         inputs: Tensor,
         mean: Tensor,
@@ -320,6 +340,8 @@ class _Scan(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         y, u = _by_time(measurements), _by_time(inputs)
+        if setting.gate is not None:
+            y = y.copy()  # what is refused becomes NaN in it, and so is never measured for the adjoint either
         first = [tensor.detach().contiguous().numpy() for tensor in (mean, covariance)]
         noises: list[Any] = [
             _by_time(noise) if function is None else function for noise, function in zip((process, observation), functions, strict=True)
@@ -328,7 +350,7 @@ class _Scan(torch.autograd.Function):
         def work(start: int, end: int) -> None:
             part = tape if end - start == y.shape[1] else tape.slice(start, end)
             own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
-            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
+            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own, refused[start:end])
             if part is not tape:
                 tape.put(start, end, part)
 
@@ -366,10 +388,19 @@ class _Scan(torch.autograd.Function):
         share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
         y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        return (None, None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
 
 
-def _forward(setting: _Setting, tape: _Tape, y: Array, u: Array, mean: Array, covariance: Array, noises: Sequence[Any]) -> None:
+def _forward(
+    setting: _Setting,
+    tape: _Tape,
+    y: Array,
+    u: Array,
+    mean: Array,
+    covariance: Array,
+    noises: Sequence[Any],
+    refused: NDArray[np.int64],
+) -> None:
     points = _Points(setting, len(mean), mean.shape[1], y.dtype)
     for k in range(len(y)):
         now = np.ascontiguousarray(u[k])
@@ -378,7 +409,10 @@ def _forward(setting: _Setting, tape: _Tape, y: Array, u: Array, mean: Array, co
         else:
             before = np.ascontiguousarray(u[k - 1])
             _predict(setting, tape, k, points, tape.post_mean[k - 1], tape.post_covariance[k - 1], before, _noise(noises[0], k - 1))
-        _update(setting, tape, k, points, np.ascontiguousarray(y[k]), now, _noise(noises[1], k))
+        seen = np.ascontiguousarray(y[k])
+        _update(setting, tape, k, points, seen, now, _noise(noises[1], k), refused)
+        if setting.gate is not None:
+            y[k] = seen
 
 
 def _predict(
@@ -391,18 +425,31 @@ def _predict(
     moments_of(tape.moved[k], added, setting.rule, setting.lower, tape.prior_mean[k], tape.prior_covariance[k])
 
 
-def _update(setting: _Setting, tape: _Tape, k: int, points: _Points, y: Array, inputs: Array, noise: Array | NoiseAt) -> None:
-    """Take in the measurement at sample ``k`` of the tape."""
+def _update(
+    setting: _Setting,
+    tape: _Tape,
+    k: int,
+    points: _Points,
+    y: Array,
+    inputs: Array,
+    noise: Array | NoiseAt,
+    refused: NDArray[np.int64],
+) -> None:
+    """Take in the measurement at sample ``k`` of the tape; what a gate refuses becomes NaN in ``y``."""
     mean = tape.prior_mean[k]
     tape.expected[k] = setting.model.observation(points.draw(mean, tape.prior_covariance[k]), inputs)
     tape.repaired[k] |= points.lost
+    spread = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
+    if setting.gate is not None:
+        tape.gone[k] = False
+        gate_of(tape.expected[k], spread, setting.rule, setting.limit, setting.gate.patience, y, refused, tape.gone[k])
     update_of(
         mean,
         points.covariance,
         points.values,
         tape.expected[k],
         y,
-        noise if isinstance(noise, np.ndarray) else noise(mean, inputs),
+        spread,
         setting.rule,
         setting.lower,
         setting.margin,

@@ -10,6 +10,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from vehest.filters.gating import refuses
+
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
 
 
@@ -120,6 +122,31 @@ def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, n
             values_bar[b, 0, i] += centre_mean * total
             for s in range(1, count):
                 values_bar[b, s, i] += other * total
+
+
+@compiled
+def gate_of(expected, noise, rule, limit, patience, y, refused, gone):  # type: ignore[no-untyped-def]
+    """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (B, m); counts in ``refused``, (B, m); see `Gate`.
+
+    A negative weight of the mean point cannot make a variance smaller than that of the noise.
+    """
+    sequences, count, m = expected.shape
+    _, centre_mean, centre_covariance, other = rule
+    for b in range(sequences):
+        for i in range(m):
+            if y[b, i] != y[b, i]:
+                continue
+            total = expected[b, 0, i] * 0
+            for s in range(1, count):
+                total += expected[b, s, i]
+            centre = centre_mean * expected[b, 0, i] + other * total
+            total = centre * 0
+            for s in range(1, count):
+                total += (expected[b, s, i] - centre) * (expected[b, s, i] - centre)
+            total = other * total + centre_covariance * (expected[b, 0, i] - centre) * (expected[b, 0, i] - centre)
+            if refuses(y[b, i] - centre, max(total, centre * 0) + noise[b, i, i], limit, patience, refused[b], i):
+                y[b, i] = np.nan
+                gone[b, i] = True
 
 
 @compiled

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
 from vehest.filters.compiled_noise import compiled_noise
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
 from vehest.filters.nonlinear import NonlinearFiltered
@@ -98,7 +99,13 @@ class CarFilter(nn.Module):
         return covariance
 
     def filtered(
-        self, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], states: Tensor | None = None, model: PointModel | None = None
+        self,
+        measurements: Tensor,
+        inputs: Tensor,
+        initial: Gaussian[Tensor],
+        states: Tensor | None = None,
+        model: PointModel | None = None,
+        gate: Gate | None = None,
     ) -> NonlinearFiltered:
         """Filter sequences.
 
@@ -108,6 +115,7 @@ class CarFilter(nn.Module):
             initial: at the first sample, mean (B, 5).
             states: true ones, (B, T, 5), that the noise then depends on; none: it depends on the estimate, and has no gradients.
             model: what `point_model` returned, to use it again.
+            gate: which measurements are refused; none: all are taken.
         """
         if states is not None or isinstance(self.process_noise, ConstantNoise):
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
@@ -124,6 +132,7 @@ class CarFilter(nn.Module):
             self.rule,
             repair=self.repair,
             share=partial(over_members, pieces=1),
+            gate=gate,
         )
 
     def noise_at(self) -> tuple[NoiseAt, NoiseAt]:

@@ -22,6 +22,7 @@ from vehest.estimators.filtering.single_track import checked_sample
 from vehest.estimators.filtering.track_filter import TrackFilter, groups_of, padded
 from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork, checked_layers, network_with_weights
 from vehest.estimators.references import reference_sideslip
+from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.vehicle.dugoff import TRACK_STATES
@@ -102,13 +103,13 @@ class NetworkUkf(Estimator):
 
     @property
     def variant(self) -> str:
-        """Which inputs it sees."""
-        return self.settings.inputs
+        """Which inputs it sees, and the gate."""
+        return self.settings.inputs + suffix(self.settings.gate)
 
     @property
     def full_title(self) -> str:
-        """With its inputs."""
-        return f"{self.title}, {'with' if self.settings.inputs == 'full' else 'without'} tyre forces"
+        """With its inputs, and the gate."""
+        return f"{self.title}, {'with' if self.settings.inputs == 'full' else 'without'} tyre forces{in_words(self.settings.gate)}"
 
     @property
     def n_parameters(self) -> int:
@@ -163,7 +164,7 @@ class NetworkUkf(Estimator):
         """Recordings of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
         words = [self.word(self.seen(recording.stack(self.channels))) for recording in recordings]
-        for rows, (mean, covariance, nis, dof) in self.filtered(recordings, words, states):
+        for rows, (mean, covariance, nis, dof) in self.filtered(recordings, words, states, self.model.gate()):
             for place, row in enumerate(rows):
                 n = len(recordings[row])
                 others = {"yaw_rate": mean[place, :n, 1].copy(), "nis": nis[place, :n].copy(), "nis_dof": dof[place, :n].copy()}
@@ -177,8 +178,9 @@ class NetworkUkf(Estimator):
         recordings: Sequence[Recording],
         words: Sequence[Word],
         states: Sequence[Mapping[str, float] | None] | None = None,
+        gate: Gate | None = None,
     ) -> Iterator[tuple[list[int], tuple[FloatArray, FloatArray, FloatArray, FloatArray]]]:
-        """Filter recordings given what the network says of each.
+        """Filter recordings given what the network says of each; networks learn, and are judged meanwhile, without a gate.
 
         Returns:
             Rows of recordings, and their means (B, T, 2), covariances (B, T, 2, 2), normalised innovations squared (B, T) and how many
@@ -200,7 +202,7 @@ class NetworkUkf(Estimator):
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 initial = model.start(inputs[:, 0], given)
-                steps = model.filtered(torch.as_tensor(measurements), inputs, steps_noise, noise, initial).steps
+                steps = model.filtered(torch.as_tensor(measurements), inputs, steps_noise, noise, initial, gate).steps
                 nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
             outcome = (*steps.filtered, nis, steps.measured.sum(-1).double())
             yield rows, tuple(part.numpy() for part in outcome)  # type: ignore[misc]
@@ -249,6 +251,7 @@ class NetworkUkfStepper(Stepper):
         self._trusts = False
         self._before: tuple[Tensor, Tensor] | None = None
         self._state: Gaussian[Tensor] | None = None
+        self._gate, self._refused = estimator.model.gate(), np.zeros((1, 5), np.int64)
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample."""
@@ -258,10 +261,10 @@ class NetworkUkfStepper(Stepper):
             raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         word = estimator.word(estimator.seen(row))
         measurements, inputs = estimator.taken(row)
-        self._trusts = bool(estimator.trusts(measurements[:, 0], self._trusts)[0])
+        trusts = bool(estimator.trusts(measurements[:, 0], self._trusts)[0])
         y = torch.as_tensor(np.column_stack([measurements, word.sideslip]))[None]
         u = torch.as_tensor(inputs)[None]
-        noise = observation_noise(self._sensors, torch.tensor([self._trusts]), torch.as_tensor(word.variance))
+        noise = observation_noise(self._sensors, torch.tensor([trusts]), torch.as_tensor(word.variance))
         process = self._process if word.process is None else torch.as_tensor(word.process[0]).diag()
         if self._state is None or self._before is None:
             state, before = self._filter.start(u[:, 0]), process
@@ -269,7 +272,9 @@ class NetworkUkfStepper(Stepper):
             y, state = torch.cat([torch.full_like(y, torch.nan), y], 1), self._state
             u, before = torch.cat([self._before[0], u], 1), self._before[1]
         with torch.no_grad():
-            filtered = self._filter.filtered(y, u, before, noise, state).steps.filtered
+            refused = self._refused.copy()
+            filtered = self._filter.filtered(y, u, before, noise, state, self._gate, refused).steps.filtered
+        self._trusts, self._refused = trusts, refused
         self._before, self._state = (u[:, -1:], process), Gaussian(filtered.mean[:, -1], filtered.covariance[:, -1])
         return dict(zip(TRACK_STATES, self._state.mean[0].tolist(), strict=True))
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -102,6 +103,7 @@ class SingleTrackStepper(Stepper):
         self._estimator = estimator
         self._last: FloatArray | None = None
         self._state: Gaussian[FloatArray] | None = None
+        self._refused = np.zeros(len(estimator.skippable), np.int64)
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """Lateral velocity [m/s], yaw rate [rad/s] and what else the filter knows; NaN in yaw_rate or ay is skipped."""
@@ -112,8 +114,9 @@ class SingleTrackStepper(Stepper):
         else:  # the last sample's measurements are part of the state already
             rows, state = np.stack([self._last, row]), self._state
             rows[0, [channels.index(name) for name in skippable]] = np.nan
-        self._state, others = self._filtered(rows, state)
-        self._last = row
+        refused = self._refused.copy()
+        self._state, others = self._filtered(rows, state, refused)
+        self._last, self._refused = row, refused
         return {"vy": float(row[1] * math.tan(self._state.mean[0])), "yaw_rate": float(self._state.mean[1]), **others}
 
     @abstractmethod
@@ -121,8 +124,10 @@ class SingleTrackStepper(Stepper):
         """State before the first sample, (4,)."""
 
     @abstractmethod
-    def _filtered(self, rows: FloatArray, state: Gaussian[FloatArray]) -> tuple[Gaussian[FloatArray], dict[str, float]]:
-        """State after the last of the samples, (N, 4), and other quantities at its time."""
+    def _filtered(
+        self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]
+    ) -> tuple[Gaussian[FloatArray], dict[str, float]]:
+        """State after the last of the samples, (N, 4), and other quantities at its time; ``refused`` is counted on, see `Gate`."""
 
 
 def checked_sample(sample: Mapping[str, float], channels: Sequence[str], skippable: Sequence[str]) -> FloatArray:

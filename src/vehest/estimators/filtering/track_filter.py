@@ -13,6 +13,7 @@ from torch import Tensor
 from vehest.constants import FloatArray
 from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.estimators.kernels.threads import over_members
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
@@ -48,6 +49,8 @@ class TrackFilter:
         process_noise: Tensor,
         observation_noise: Tensor,
         initial: Gaussian[Tensor] | None = None,
+        gate: Gate | None = None,
+        refused: NDArray[np.int64] | None = None,
     ) -> NonlinearFiltered:
         """Filter sequences of one length; means and covariances are differentiable in measurements and noise.
 
@@ -57,6 +60,8 @@ class TrackFilter:
             process_noise: covariance of each sample's step, (B, T, 2, 2) or what broadcasts to it.
             observation_noise: (B, T, m, m) or what broadcasts to it.
             initial: state before the first measurement, mean (2,) or (B, 2); none: `start` of every sequence.
+            gate: which measurements are refused; none: all are taken.
+            refused: see `unscented_scan`.
 
         Raises:
             ValueError: shapes do not fit each other.
@@ -75,6 +80,8 @@ class TrackFilter:
             observation_noise,
             self.rule,
             share=partial(over_members, pieces=1),
+            gate=gate,
+            refused=refused,
         )
 
     def start(self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None) -> Gaussian[Tensor]:
@@ -106,10 +113,11 @@ class TrackStepper:
 
     Args:
         own: the filter.
+        gate: which measurements are refused; none: all are taken.
     """
 
-    def __init__(self, own: TrackFilter) -> None:
-        self._own, self._model = own, own.model(torch.float64)
+    def __init__(self, own: TrackFilter, gate: Gate | None = None) -> None:
+        self._own, self._model, self._gate = own, own.model(torch.float64), gate
         self._filter: UnscentedStepper | None = None
         self._rolled = False
 
@@ -125,7 +133,7 @@ class TrackStepper:
         slow = bool(inputs[0] < self._own.track.minimum_speed)
         if self._filter is None:
             mean, covariance = (part[0].numpy() for part in self._own.start(torch.as_tensor(inputs)[None]))
-            self._filter = UnscentedStepper(self._model, mean, covariance, len(measurement), self._own.rule)
+            self._filter = UnscentedStepper(self._model, mean, covariance, len(measurement), self._own.rule, gate=self._gate)
         seen = np.full_like(measurement, np.nan) if slow else measurement
         noise, self._rolled = ROLLING if self._rolled else process_noise, slow
         return self._filter.step(seen, inputs, noise[None], observation_noise[None])

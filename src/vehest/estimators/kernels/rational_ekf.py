@@ -11,6 +11,7 @@ import math
 import numba
 import numpy as np
 
+from vehest.filters.gating import refuses
 from vehest.vehicle.rational_tyres import rational_axle
 
 _axle = numba.njit(rational_axle)
@@ -30,6 +31,9 @@ def scan(  # type: ignore[no-untyped-def]
     step,
     minimum_speed,
     adapt_above,
+    limit,
+    patience,
+    refused,
     mean,
     cov,
     means,
@@ -57,6 +61,9 @@ def scan(  # type: ignore[no-untyped-def]
         step: Δt [s].
         minimum_speed: [m/s].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
+        limit: square of the gate's deviations, inf: no gate; see `Gate`.
+        patience: of the gate, in samples.
+        refused: how often on end yaw rate and ay were refused before the first sample, (2,); after the last one on return.
         mean: at the first sample before its measurement, (n,); at the last sample after it on return.
         cov: likewise, (n, n).
         means: out, (T, n).
@@ -89,7 +96,7 @@ def scan(  # type: ignore[no-untyped-def]
             if not (cov[0, 0] < lost and abs(mean[0]) < upper[0]):
                 _roll(mean, cov, rolling, car, vx, steer)
         held = abs(vx * mean[1]) < adapt_above
-        _innovate(mean, cov, samples[k], variances, cross, innovation[k], innovation_cov[k], measured[k])
+        _innovate(mean, cov, samples[k], variances, limit, patience, refused, cross, innovation[k], innovation_cov[k], measured[k])
         _gain(cross, innovation_cov[k], held, gain)
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
@@ -174,8 +181,11 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
 
 
 @numba.njit(inline="always")
-def _innovate(mean, cov, sample, variances, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
-    """Innovations of yaw rate and ay = u (β' + r), their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0."""
+def _innovate(mean, cov, sample, variances, limit, patience, refused, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
+    """Innovations of yaw rate and ay = u (β' + r), their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0.
+
+    What is refused counts as not measured.
+    """
     vx = sample[1]
     for i in range(len(mean)):
         cross[i, 0] = cov[i, 1]
@@ -184,6 +194,9 @@ def _innovate(mean, cov, sample, variances, cross, innovation, S, measured):  # 
         value = sample[0] if j == 0 else sample[2]
         measured[j] = not math.isnan(value)
         expected = mean[1] if j == 0 else vx * (mean[2] + mean[1])
+        if measured[j] and limit < math.inf:
+            spread = cross[1, 0] if j == 0 else vx * (cross[2, 1] + cross[1, 1])
+            measured[j] = not refuses(value - expected, spread + variances[j], limit, patience, refused, j)
         innovation[j] = value - expected if measured[j] else 0.0
         if not measured[j]:
             cross[:, j] = 0.0

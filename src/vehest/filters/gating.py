@@ -1,0 +1,74 @@
+"""Gates: a measurement too far from what a filter expects is refused, unless it has been for so long that the filter must be wrong."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import torch
+from torch import Tensor
+
+PATIENCE = 0.5  # s
+
+
+class Gate(NamedTuple):
+    """When a measurement is refused: (y - ŷ)² > deviations² S, with S the variance of y - ŷ.
+
+    That is the chi-square test of the normalised innovation squared with one degree of freedom, measurement by measurement, so that a
+    sensor that fails takes no other one with it. What is refused counts as not measured. A contradiction longer than ``patience`` says that
+    the filter is lost: the gate opens, until the measurement has agreed as long as it was open, half a second at most. Samples without it
+    count neither way.
+
+    Attributes:
+        deviations: standard deviations of the innovation [1].
+        patience: samples, 1 at least.
+
+    Source: Bar-Shalom, Li & Kirubarajan 2001 (validation gate).
+    """
+
+    deviations: float
+    patience: int
+
+    @classmethod
+    def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:
+        """A gate that opens again after 0.5 s; none: no gate."""
+        return None if deviations is None else cls(deviations, max(1, round(PATIENCE * rate_hz)))
+
+    def apply(self, y: Tensor, expected: Tensor, variance: Tensor, refused: Tensor) -> tuple[Tensor, Tensor]:
+        """Measurements with NaN where they are refused; the decision has no gradient.
+
+        Args:
+            y: (..., m), NaN where nothing was measured.
+            expected: ŷ, (..., m).
+            variance: of y - ŷ, (..., m).
+            refused: how often on end each one was too far off, before this sample, int64 (..., m).
+
+        Returns:
+            What is left of y, and ``refused`` after this sample.
+        """
+        with torch.no_grad():
+            far = (y - expected).square() > self.deviations**2 * variance
+            agreed = torch.where(refused > self.patience, refused - 1, 0)
+            count = torch.where(far, (refused + 1).clamp(max=2 * self.patience), torch.where(torch.isnan(y), refused, agreed))
+            gone = far & (count <= self.patience)
+        return torch.where(gone, torch.nan, y), count
+
+
+@numba.njit(inline="always")
+def refuses(error, variance, limit, patience, refused, i):  # type: ignore[no-untyped-def]
+    """Whether measurement i is refused, given its innovation, its variance and ``limit``, deviations²; counts in ``refused``, (m,)."""
+    if not error * error > limit * variance:
+        refused[i] = refused[i] - 1 if refused[i] > patience else 0
+        return False
+    refused[i] = min(refused[i] + 1, 2 * patience)
+    return refused[i] <= patience
+
+
+def suffix(gate: float | None) -> str:
+    """Of the name of a filter's variant."""
+    return "" if gate is None else f"_gate{gate:g}"
+
+
+def in_words(gate: float | None) -> str:
+    """Of a filter's title."""
+    return "" if gate is None else f", innovations gated at {gate:g} sigma"

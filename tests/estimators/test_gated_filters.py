@@ -1,0 +1,148 @@
+"""Every filter with a gate: one spike does no harm, a jump of the truth is followed, online is batch, and nothing changes without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from dugoff_drive import TYRES, dugoff_drive
+from rational_drive import CURVES, rational_drive
+from single_track_drive import NOISE, linear_drive
+from small_car_drive import small_car_drive
+from vehest.data.errors import ConfigurationError
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.estimators.filtering.network_ukf import Word
+from vehest.estimators.registry import estimator_class
+
+SPIKE, JUMP = 6.0, 8.0  # s
+DUGOFF = {
+    "inputs": "imu",
+    "tyres": TYRES,
+    "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002},
+}
+CONFIGS: dict[str, dict[str, object]] = {
+    "kalman": {"noise": {**NOISE, "steer_factor": 1.0}},
+    "rational_ekf": {"tyres": "rational", "curves": CURVES, "noise": {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003}},
+    "dugoff_ukf": DUGOFF,
+    "cnn_ukf": {**DUGOFF, "hidden": [8, 4]},
+    "learned_ukf": {"dynamics": "pacejka", "noise": "constant"},
+}
+DRIVES: dict[str, Callable[[int], Recording]] = {
+    "kalman": lambda seed: linear_drive(JUMP, seed=seed)[0],
+    "rational_ekf": lambda seed: rational_drive(JUMP, seed=seed),
+    "dugoff_ukf": lambda seed: dugoff_drive(JUMP, seed),
+    "cnn_ukf": lambda seed: dugoff_drive(JUMP, seed),
+    "learned_ukf": lambda seed: small_car_drive(JUMP, seed),
+}
+EVERY = pytest.mark.parametrize("name", CONFIGS)
+
+
+def estimator(name: str, gate: float | None = None) -> Estimator:
+    """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
+    made = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
+    made.seed(0)
+    network = getattr(made, "network", None)
+    if network is not None:
+        network.double().reset([torch.Generator().manual_seed(0)])
+        with torch.no_grad():
+            network.get_parameter("bias_3")[0, 1:] = torch.tensor([0.0, -6.0, -6.0])
+    if name == "learned_ukf":
+        made.filter.reset(torch.Generator().manual_seed(0))  # type: ignore[attr-defined]
+    return made
+
+
+@cache
+def drive(name: str) -> Recording:
+    """Two drives one after the other, as if the car had jumped from the one motion into the other."""
+    first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
+    return replace(first, channels={channel: np.concatenate([values, second[channel]]) for channel, values in first.channels.items()})
+
+
+def spoilt(name: str, value: float) -> Recording:
+    """The drive with one wild sample of ay."""
+    own = drive(name)
+    ay = own["ay"].copy()
+    ay[round(SPIKE * own.rate_hz)] = value
+    return replace(own, channels={**own.channels, "ay": ay})
+
+
+def vy(made: Estimator, recording: Recording) -> np.ndarray:
+    return made.estimate([recording])[0]["vy"]
+
+
+@pytest.mark.parametrize("name", [name for name in CONFIGS if name != "cnn_ukf"])  # whose network sees the spike, too
+@pytest.mark.parametrize("size", [1e6, -1e3])
+def test_a_spike_is_as_good_as_a_sample_that_is_missing(name: str, size: float) -> None:
+    gated, free = estimator(name, 6.0), estimator(name)
+    at = round(SPIKE * drive(name).rate_hz)
+    clean, spike = vy(gated, drive(name)), vy(gated, spoilt(name, size))
+    harm = np.abs(spike - clean)[at : at + 20].max()
+    assert harm < 0.2
+    believed = np.abs(vy(free, spoilt(name, size)) - vy(free, drive(name)))[at : at + 20]
+    assert not (believed <= 5.0 * harm).all(), "a free filter believes it"
+
+
+def test_a_wild_angle_of_a_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = estimator("cnn_ukf", 6.0)
+    own, at = made.word, round(SPIKE * 100.0)  # type: ignore[attr-defined]
+    sure = lambda inputs: own(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
+    monkeypatch.setattr(made, "word", sure)
+    clean = vy(made, drive("cnn_ukf"))
+
+    def wild(inputs: np.ndarray) -> Word:
+        said = sure(inputs)
+        angle = said.sideslip.copy()
+        angle[at] += 1.0
+        return said._replace(sideslip=angle)
+
+    monkeypatch.setattr(made, "word", wild)
+    assert np.abs(vy(made, drive("cnn_ukf")) - clean).max() < 0.1
+    made.settings = replace(made.settings, gate=None)
+    made.model.settings = replace(made.model.settings, gate=None)  # type: ignore[attr-defined]
+    assert np.abs(vy(made, drive("cnn_ukf")) - clean).max() > 0.5
+
+
+@EVERY
+def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name: str) -> None:
+    gated, free = vy(estimator(name, 6.0), drive(name)), vy(estimator(name), drive(name))
+    back = round((JUMP + 3.0) * drive(name).rate_hz)
+    size = np.sqrt(np.mean(free[back:] ** 2))
+    assert np.sqrt(np.mean((gated - free)[back:] ** 2)) < 0.02 * max(size, 1.0)
+
+
+@EVERY
+def test_a_gate_that_refuses_nothing_changes_no_bit(name: str) -> None:
+    assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
+
+
+@EVERY
+def test_online_with_a_gate_is_batch_with_a_gate(name: str) -> None:
+    recording, made = spoilt(name, 1e4), estimator(name, 4.0)
+    batch, stepper = vy(made, recording), made.online()
+    online = [stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"] for k in range(len(recording))]
+    assert np.abs(np.array(online) - batch).max() < (1e-6 if name == "learned_ukf" else 1e-9)
+    refused = made.estimate([recording])[0]["nis_dof"]
+    assert refused[round(SPIKE * recording.rate_hz)] < refused.max()
+
+
+@EVERY
+def test_a_variant_with_a_gate_is_called_another(name: str) -> None:
+    assert estimator(name, 5.0).variant == estimator(name).variant + "_gate5"
+    assert estimator(name, 5.0).full_title.endswith("gated at 5 sigma")
+
+
+@EVERY
+def test_a_gate_of_nothing_is_refused(name: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"estimator\.gate must be positive"):
+        estimator(name, 0.0)
+
+
+def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
+        estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})

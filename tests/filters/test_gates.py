@@ -1,0 +1,210 @@
+"""Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2, norm
+from test_filters_kalman import arrays, example
+from test_filters_nonlinear import RULES, measured_pendulum, pendulum_with_radar
+from torch import Tensor
+
+from vehest.filters.gating import Gate
+from vehest.filters.gaussian import Gaussian
+from vehest.filters.kalman import LinearModel, kalman_filter
+from vehest.filters.kalman_scan import kalman_scan
+from vehest.filters.nonlinear import unscented_filter
+from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
+
+PATIENCE = 5
+NOTHING = torch.zeros(3, dtype=torch.float64)
+
+
+def walk(steps: int) -> tuple[LinearModel[np.ndarray], Gaussian[np.ndarray]]:
+    """A position that wanders by 0.1 a sample, measured to 1 by two sensors."""
+    model = LinearModel(np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.eye(2))
+    return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(np.zeros(1), np.eye(1))
+
+
+def pendulum(y: Tensor, u: Tensor, first: Gaussian[Tensor], gate: Gate | None, refused: np.ndarray | None = None):
+    model = pendulum_with_radar()
+    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
+    return unscented_scan(
+        TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate, refused=refused
+    )
+
+
+def test_the_limit_is_that_of_the_chi_square_distribution() -> None:
+    limit = Gate(3.0, PATIENCE).deviations ** 2
+    assert chi2.sf(limit, 1) == pytest.approx(2.0 * norm.sf(3.0))
+
+
+def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says() -> None:
+    steps, generator = 50_000, np.random.default_rng(0)
+    model, first = walk(steps)
+    truth = np.cumsum(0.1 * generator.standard_normal(steps))
+    y = truth[:, None] + generator.standard_normal((steps, 2))
+    taken = kalman_scan(model, y, first, Gate(2.0, 10**9)).measured
+    share = 2.0 * norm.sf(2.0)
+    assert 1.0 - taken.mean() == pytest.approx(share, abs=5.0 * math.sqrt(share / (2 * steps)) + 0.002)
+
+
+def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it() -> None:
+    model, first = walk(40)
+    y = np.random.default_rng(1).standard_normal((40, 2))
+    missing = y.copy()
+    missing[20, 0] = np.nan
+    for size in (60.0, -1e6, np.inf):
+        y[20, 0] = size
+        gated = kalman_scan(model, y, first, Gate(5.0, PATIENCE))
+        known = kalman_scan(model, missing, first)
+        assert np.argwhere(~gated.measured).tolist() == [[20, 0]]
+        for name in ("filtered", "predicted"):
+            for a, b in zip(getattr(gated, name), getattr(known, name), strict=True):
+                assert np.array_equal(a, b)
+        assert np.array_equal(gated.log_likelihood, known.log_likelihood)
+
+
+def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back() -> None:
+    model, first = walk(100)
+    y = np.random.default_rng(2).standard_normal((100, 2))
+    y[50:] += 1000.0
+    gated = kalman_scan(model, y, first, Gate(5.0, PATIENCE))
+    assert not gated.measured[50 : 50 + PATIENCE].any()
+    assert gated.measured[50 + PATIENCE :].all()
+    free = kalman_scan(model, y, first)
+    assert abs(gated.filtered.mean[49 + PATIENCE, 0]) < 5.0, "shut, it stays where it was"
+    assert gated.filtered.mean[-1] == pytest.approx(free.filtered.mean[-1], abs=1.0), "open, it goes where the free one goes"
+
+
+def test_a_gate_that_refuses_nothing_changes_no_bit() -> None:
+    model, measurements, first = example(60, seed=3, missing=0.2)
+    plain = kalman_scan(arrays(model), measurements.numpy(), arrays(first))
+    wide = kalman_scan(arrays(model), measurements.numpy(), arrays(first), Gate(1e9, PATIENCE))
+    assert np.array_equal(plain.filtered.mean, wide.filtered.mean)
+    assert np.array_equal(plain.filtered.covariance, wide.filtered.covariance)
+    y, u, start = measured_pendulum(60, 3)
+    without, within = (pendulum(y, u, start, gate).steps.filtered for gate in (None, Gate(1e9, PATIENCE)))
+    assert torch.equal(without.mean, within.mean)
+    assert torch.equal(without.covariance, within.covariance)
+
+
+def outliers(steps: int, sequences: int) -> tuple[Tensor, Tensor, Gaussian[Tensor]]:
+    y, u, first = measured_pendulum(steps, sequences)
+    y[0, 5, 0], y[0, 9, 1], y[-1, 12] = 40.0, -40.0, 1e3
+    y[0, 15:, 1] += 30.0  # longer than the gate is patient
+    y[-1, 20, 0] = torch.nan
+    return y, u, first
+
+
+def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule() -> None:
+    y, u, first = outliers(30, 3)
+    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
+    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
+    for name, rule in RULES.items():
+        readable = unscented_filter(model, y, u, first, rule, gate=gate).steps
+        scanned = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate).steps
+        assert torch.equal(readable.measured, scanned.measured), name
+        assert not scanned.measured[0, 15 : 15 + PATIENCE, 1].any(), "shut"
+        assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
+        for a, b in zip(readable.filtered, scanned.filtered, strict=True):
+            assert torch.allclose(a, b, rtol=0, atol=1e-12 * float(a.abs().max())), name
+        assert torch.allclose(readable.log_likelihood, scanned.log_likelihood, rtol=1e-10, atol=1e-10)
+
+
+def test_gradients_through_a_gate_are_those_of_missing_measurements() -> None:
+    y, u, first = outliers(30, 2)
+    model = pendulum_with_radar()
+    weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    taken = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps.measured
+    assert not taken.all()
+    found = []
+    for measurements, gate in ((y, Gate(4.0, PATIENCE)), (torch.where(taken, y, torch.nan), None)):
+        own = [part.clone().requires_grad_() for part in (measurements, *first)]
+        noises = [noise(NOTHING, NOTHING).clone().requires_grad_() for noise in (model.process_noise, model.observation_noise)]
+        points = TorchModel(model.transition, model.observation)
+        scanned = unscented_scan(points, own[0], u, Gaussian(*own[1:]), *noises, RULES["symmetric"], gate=gate)
+        found.append(torch.autograd.grad((scanned.steps.filtered.mean * weights).sum(), (*own, *noises)))
+    for a, b in zip(*found, strict=True):
+        assert torch.isfinite(a).all()
+        assert torch.equal(a, b)
+    assert (found[0][0][~taken] == 0.0).all(), "what is refused teaches nothing"
+    readable = y.clone().requires_grad_()
+    mean = unscented_filter(model, readable, u, first, RULES["symmetric"], gate=Gate(4.0, PATIENCE)).steps.filtered.mean
+    (theirs,) = torch.autograd.grad((mean * weights).sum(), readable)
+    assert torch.allclose(theirs, found[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))
+
+
+def test_measurements_that_are_handed_over_are_left_as_they_are() -> None:
+    y, u, first = outliers(30, 1)
+    before = y.clone()
+    pendulum(y, u, first, Gate(4.0, PATIENCE))
+    assert torch.equal(torch.nan_to_num(y), torch.nan_to_num(before))
+    model, start = walk(30)
+    measured = np.full((30, 2), 1e3)
+    kalman_scan(model, measured, start, Gate(2.0, PATIENCE))
+    assert (measured == 1e3).all()
+
+
+def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence() -> None:
+    y, u, first = outliers(30, 1)
+    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
+    whole = pendulum(y, u, first, gate).steps.filtered.mean[0].numpy()
+    points = TorchModel(model.transition, model.observation)
+    stepper = UnscentedStepper(points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"], gate=gate)
+    process, observation = (noise(NOTHING, NOTHING)[None].numpy() for noise in (model.process_noise, model.observation_noise))
+    for k in range(30):
+        assert stepper.step(y[0, k].numpy(), u[0, k].numpy(), process, observation) == pytest.approx(whole[k], abs=1e-12), k
+
+
+def test_a_count_of_refusals_carries_over_from_one_piece_to_the_next() -> None:
+    y, u, first = outliers(30, 1)
+    gate, refused = Gate(4.0, PATIENCE), np.zeros((1, 2), np.int64)
+    whole = pendulum(y, u, first, gate).steps
+    state = Gaussian(*(part[:, 17] for part in pendulum(y[:, :18], u[:, :18], first, gate, refused).steps.filtered))
+    assert refused[0, 1] == 3, "in the middle of a contradiction"
+    rest = y[:, 17:].clone()
+    rest[:, 0] = torch.nan  # part of the state already
+    later = pendulum(rest, u[:, 17:], state, gate, refused).steps
+    assert torch.equal(later.measured[:, 1:], whole.measured[:, 18:])
+    assert torch.allclose(later.filtered.mean[:, 1:], whole.filtered.mean[:, 18:], rtol=0, atol=1e-12)
+
+
+def test_every_sequence_has_its_own_gate_however_they_are_shared_out() -> None:
+    y, u, first = outliers(30, 4)
+    together = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps
+    for row in range(4):
+        alone = pendulum(y[row : row + 1], u[row : row + 1], first, Gate(4.0, PATIENCE)).steps
+        assert torch.equal(alone.measured[0], together.measured[row])
+    model = pendulum_with_radar()
+    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
+    points = TorchModel(model.transition, model.observation)
+
+    def halves(work, count):
+        work(0, count // 2)
+        work(count // 2, count)
+
+    shared = unscented_scan(points, y, u, first, *noises, RULES["symmetric"], gate=Gate(4.0, PATIENCE), share=halves).steps
+    assert torch.equal(shared.measured, together.measured)
+    assert torch.equal(shared.filtered.mean, together.filtered.mean)
+
+
+def test_the_readable_kalman_filter_has_the_same_gate() -> None:
+    model, measurements, first = example(60, seed=5, missing=0.1)
+    measurements[20, 0], measurements[40:, 1] = 1e3, 1e3
+    gate = Gate(4.0, PATIENCE)
+    readable, compiled = (
+        kalman_filter(model, measurements, first, gate),
+        kalman_scan(arrays(model), measurements.numpy(), arrays(first), gate),
+    )
+    assert np.array_equal(readable.measured.numpy(), compiled.measured)
+    assert not compiled.measured.all()
+    assert readable.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
+
+
+def test_half_a_second_of_patience_is_counted_in_samples() -> None:
+    assert Gate.of(None, 100.0) is None
+    assert Gate.of(5.0, 100.0) == Gate(5.0, 50)
