@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vehest.constants import FloatArray
-from vehest.data.channels import CHANNELS
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span
@@ -29,6 +27,7 @@ from vehest.stages.code_version import code_version
 from vehest.stages.evaluate import COLUMNS, METRICS, EvaluateJob, test_sets, write_evaluation
 from vehest.stages.faults import FaultSettings
 from vehest.stages.train import recording_file
+from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, inject, is_fault
 
 
@@ -56,7 +55,9 @@ class FaultedJob:
 
 def code_of_faults() -> str:
     """Version of what an evaluation under faults runs beyond one without."""
-    return code_version(["vehest.trust.faults", "vehest.evaluation.under_fault"], own=[__name__, "vehest.stages.faults"])
+    return code_version(
+        ["vehest.trust.faults", "vehest.trust.contract", "vehest.evaluation.under_fault"], own=[__name__, "vehest.stages.faults"]
+    )
 
 
 def write_faulted(job: FaultedJob, folder: Path) -> None:
@@ -121,17 +122,9 @@ def _measured(job: EvaluateJob, piece: Span) -> Recording:
 
 
 def _estimated_under_fault(estimator: Estimator, recording: Recording, fault: Fault, state: Mapping[str, float] | None) -> Estimate:
-    """The estimate of a recording one of whose channels is faulty."""
+    """The estimate of a recording one of whose channels is faulty, under the contract that holds online."""
     samples = inject(recording.channels, recording.rate_hz, fault)
-    believed = {**samples, fault.channel: _held(samples[fault.channel], fault.channel)}
-    return estimator.estimate([replace(recording, channels=believed)], state)[0]
-
-
-def _held(values: FloatArray, channel: str) -> FloatArray:
-    """The last value that was finite and within the channel's range, (T,); 0 before the first."""
-    own = CHANNELS[channel]
-    last = np.maximum.accumulate(np.where((values >= own.low) & (values <= own.high), np.arange(len(values)), -1))
-    return np.where(last < 0, 0.0, values[last])
+    return estimate_guarded(estimator, samples, recording, initial_state=state).estimate
 
 
 def _lost_from(onset: float, estimate: Estimate) -> Estimate:
