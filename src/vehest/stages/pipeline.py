@@ -51,6 +51,7 @@ class PartFile:
     sweeps: Sweeps | None = None
     title: str | None = None
     optional: bool = False
+    overrides: Annotated[tuple[str, ...], "a list of overrides"] = ()
 
 
 @dataclass(frozen=True)
@@ -257,13 +258,13 @@ def _form_of(described: PipelineFile, file: Path) -> str:
 def _part(name: str, part: PartFile | None, file: Path) -> Part:
     where = f"'{file}': part '{name}'" if name else f"'{file}'"
     if part is None or part.split is None or part.sweeps is None:
-        raise ConfigurationError(f"{where} needs split and sweeps, and may have title and optional")
+        raise ConfigurationError(f"{where} needs split and sweeps, and may have title, optional and overrides")
     if name:
         check_name(name, f"'{file}': part")
     if not part.sweeps or not all(part.sweeps):
         raise ConfigurationError(f"{where}: sweeps must be a list of lists of overrides")
     title = " ".join((part.title or name).split())
-    return Part(name=name, title=title, split=part.split, sweeps=part.sweeps, optional=part.optional)
+    return Part(name=name, title=title, split=part.split, sweeps=part.sweeps, optional=part.optional, overrides=part.overrides)
 
 
 def _folds_of(part: Part, file: Path) -> tuple[Part, ...]:
