@@ -149,7 +149,7 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
     """Continuous ranked probability score from the quantiles that central intervals end at, and the estimate as the median.
 
     CRPS = 2 ∫ ρ_τ dτ with the pinball loss ρ_τ, each known τ standing for all that are nearest to it. Of a Gaussian, at levels 50, 68,
-    90 and 95 %, that is 2.6 % too low on average: the tails beyond 97.5 % are taken for their end.
+    90 and 95 %, that is 2.6 % too low on average, and within 2 σ off by up to 0.045 σ: the tails beyond 97.5 % are taken for their end.
 
     Args:
         errors: estimate - reference, (N,).

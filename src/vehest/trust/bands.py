@@ -10,7 +10,7 @@ The rule of w was fixed before any of its effects was looked at: with m the 99.9
 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre other than those calibrated on.
 
 Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA 118 (544), 2023 (pooling
-CDFs); Lei et al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
+CDFs); Lee, Barber & Willett, Distribution-free inference with hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
 """
 
 from __future__ import annotations
@@ -456,7 +456,7 @@ def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float)
     Returns:
         The quantile; and whether K is too small for the level, where by rule it is the largest score times 1 + 1/K.
 
-    Source: Dunn, Wasserman & Ramdas 2023, Section 3.1.
+    Source: Dunn, Wasserman & Ramdas 2023; Lee, Barber & Willett 2023.
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
     n_blocks = len(counts)
