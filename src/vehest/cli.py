@@ -206,9 +206,9 @@ def train(
     from vehest.stages.group import Group
 
     config = _compose("train", overrides or [])
-    with _workshop(config, force={"train"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
+    with _workshop(config, force={"train", "calibrate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
         _, job = _train_job(config, workshop)
-        members, failures = workshop.run_groups([Group([job], None, workshop.force)])
+        members, failures = workshop.run_groups([Group([job], None, workshop.force, split=workshop.split(config))])
         _raise_failure(failures)
     from vehest.stages.train import read_fit_metrics
 
@@ -252,7 +252,7 @@ def evaluate(
 
     config = _compose("eval", overrides or [])
     faults = faults_of(config)
-    with _workshop(config, force={"evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
+    with _workshop(config, force={"calibrate", "evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
         split = workshop.split(config)
         if model is not None:
             config = fitted_evaluation(config, workshop)
@@ -271,8 +271,9 @@ def evaluate(
         protocol = protocol_from_config(config["evaluation"])
         data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
         check_channels(faults, split, data)
+        calibration = workshop.calibration(trained, split, data)
         how = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output, faults)
-        scoring = how.of(trained)
+        scoring = how.of(trained, calibration)
         artefact = workshop.ensure(scoring.plan, lambda folder: write_faulted(scoring, folder))
         figures = test_figures(artefact) | fault_figures(artefact.folder)
         workshop.log_evaluation(artefact, trained, how)
@@ -452,7 +453,7 @@ def sweep(
         swept = run_sweep(planned, workshop)
         return workshop.outcome(swept.folder, shown_of_sweep(swept), None, planned.first["tracking"], raw), swept
 
-    forced = {"train", "evaluate", "sweep"} if force else set()
+    forced = {"train", "calibrate", "evaluate", "sweep"} if force else set()
     with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True) as workshop:
         outcome, swept = whole_way(workshop)
         _print_sweep(outcome.shown, as_json, outcome.report.folder, skipped=swept.folder.skipped)
@@ -847,7 +848,7 @@ def _run_pipeline(
         tracking = first.get("tracking", {})
         return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome
 
-    forced = {"report"} if only_report else {"ingest", "downsample", "train", "evaluate", "report"}
+    forced = {"report"} if only_report else {"ingest", "downsample", "train", "calibrate", "evaluate", "report"}
     with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
         outcome, made = whole_way(workshop)
         _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})

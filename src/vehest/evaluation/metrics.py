@@ -42,6 +42,23 @@ UNITS: dict[str, str] = {
     "nis": "1",
     "coverage_1sigma": "1",
     "coverage_2sigma": "1",
+    **{
+        f"{name}{suffix}": unit.format(of)
+        for suffix, of in (("", "deg"), ("_vy", "m/s"))
+        for name, unit in {
+            "coverage_50": "1",
+            "coverage_68": "1",
+            "coverage_90": "1",
+            "coverage_95": "1",
+            "coverage_90_p10": "1",
+            "coverage_90_p90": "1",
+            "width_90": "{}",
+            "interval_score": "{}",
+            "crps": "{}",
+            "error_icc": "1",
+            "band_blocks": "1",
+        }.items()
+    },
     "share": "1",
     "floor_reference": "deg",
     "floor_reference_vy": "m/s",
@@ -67,6 +84,8 @@ class Protocol:
         sequence_seconds: ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate
             starts anew; a remainder is left out [s]. None leaves ranges whole.
         initial_state: whether estimates start at the reference state of the first sample.
+        elsewhere: test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by
+            their vehicle: bands are wider there by their rule.
     """
 
     rate_hz: float = 20.0
@@ -74,6 +93,12 @@ class Protocol:
     skip_seconds: float = 1.5
     sequence_seconds: float | None = None
     initial_state: bool = False
+    elsewhere: str | None = None
+
+    @property
+    def sets_elsewhere(self) -> frozenset[str]:
+        """Names in ``elsewhere``."""
+        return frozenset(name.strip() for name in (self.elsewhere or "").split(",")) - {""}
 
     @property
     def piece(self) -> str:
@@ -113,6 +138,7 @@ class Scored:
         covariance_of: those quantities among `errors` that the covariance is of.
         nis: normalised innovation squared of the filter's update, where the method gives it.
         nis_dof: numbers measured at each update.
+        bands: ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one.
     """
 
     time: FloatArray
@@ -126,6 +152,7 @@ class Scored:
     covariance_of: tuple[str, ...] = ()
     nis: FloatArray | None = None
     nis_dof: FloatArray | None = None
+    bands: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
     def errors(self) -> dict[str, FloatArray]:
@@ -255,6 +282,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
     if covariance is not None:
         _require_all(covariance.sum(axis=(1, 2)), f"estimator '{estimate.estimator}' has no covariance", span)
+    bands = {name: held(f"band_{name}") for name in ("vy", "sideslip") if f"band_{name}" in estimate.channels}
     innovations = "nis" in estimate.channels and "nis_dof" in estimate.channels
     return Scored(
         time=scored.time,
@@ -268,6 +296,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         covariance_of=covariance_of,
         nis=held("nis") if innovations else None,
         nis_dof=held("nis_dof") if innovations else None,
+        bands=bands,
     )
 
 

@@ -1,4 +1,4 @@
-"""Fourth stage: fitted estimators to estimates and metrics, all read on one grid of times."""
+"""Fifth stage: fitted estimators to estimates and metrics, all read on one grid of times."""
 
 from __future__ import annotations
 
@@ -21,16 +21,29 @@ from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import About, load_model, read_description
 from vehest.estimators.registry import estimator_module
+from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
 from vehest.evaluation.blocks import Segments, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, sequences
+from vehest.evaluation.metrics import (
+    UNITS,
+    Protocol,
+    Scored,
+    accuracy,
+    pieces_of,
+    reference_state,
+    score_all,
+    scored_range,
+    sequences,
+)
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.train import file_digest, learnt_spans, read_fit_metrics, recording_file
 from vehest.studies.artefacts import read_frame
+from vehest.trust.bands import Bands, with_bands
+from vehest.trust.record import read_trust
 
 STAGE = "evaluate"
 METRICS = "metrics.csv"
@@ -72,6 +85,7 @@ class EvaluateJob:
         references: data set -> recordings at the evaluation rate.
         kinds: data set -> ``real`` or ``simulated``.
         protocol: how estimates are scored.
+        calibration: how far the model's estimates can be trusted, where that was learnt.
     """
 
     plan: StagePlan
@@ -81,6 +95,7 @@ class EvaluateJob:
     references: Mapping[str, Artefact]
     kinds: Mapping[str, str]
     protocol: Protocol
+    calibration: Artefact | None = None
 
     def reference(self, span: Span) -> Recording:
         """The recording of a range at the evaluation rate, references included."""
@@ -119,6 +134,7 @@ def plan_evaluate(
     kinds: Mapping[str, str],
     protocol: Protocol,
     output: Path,
+    calibration: Artefact | None = None,
 ) -> EvaluateJob:
     """What an evaluation would make.
 
@@ -135,7 +151,7 @@ def plan_evaluate(
                         f"test set '{name}' shares samples with what {model.label} was trained or chosen on ({learnt.describe()}); "
                         f"test it on something else"
                     )
-    inputs = {"model": model.digest}
+    inputs = {"model": model.digest} | ({} if calibration is None else {"calibration": calibration.digest})
     for span in scored_spans(split):
         inputs[f"{span.dataset}/{span.recording}"] = file_digest(data[span.dataset], span)
         inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
@@ -151,7 +167,7 @@ def plan_evaluate(
         code=code_of_evaluation(estimator_module(estimator)),
         output=output,
     )
-    return EvaluateJob(plan, model, split, data, references, kinds, protocol)
+    return EvaluateJob(plan, model, split, data, references, kinds, protocol, calibration)
 
 
 def code_of_evaluation(module: str) -> str:
@@ -160,8 +176,9 @@ def code_of_evaluation(module: str) -> str:
     Args:
         module: that of the estimator.
     """
-    parts = ("blocks", "floors", "intervals", "lever_arm", "metrics", "regimes")
-    return code_version([module, *(f"vehest.evaluation.{part}" for part in parts), "vehest.estimators.model_files"], own=[__name__])
+    parts = ("bands", "blocks", "floors", "intervals", "lever_arm", "metrics", "regimes")
+    modules = [module, *(f"vehest.evaluation.{part}" for part in parts), "vehest.estimators.model_files", "vehest.trust.record"]
+    return code_version(modules, own=[__name__])
 
 
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
@@ -171,11 +188,12 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     fit = read_fit_metrics(job.model.folder)
     if not set(FIT_FIGURES) <= set(fit):
         raise DataError(f"'{job.model.folder}' does not say {', '.join(sorted(set(FIT_FIGURES) - set(fit)))} of its fit; train it again")
+    bands = _bands_of(job)
     rows: list[tuple[Any, ...]] = []
     blocks: dict[str, Segments] = {}
     for name, spans in test_sets(job.split).items():
         pieces = sequences(spans, job.reference, job.protocol)
-        estimates = _estimates(estimator, job, pieces)
+        estimates = _with_bands(_estimates(estimator, job, pieces), job, pieces, bands, name)
         for position, estimate in enumerate(estimates):
             write_estimate(estimate, folder / name / f"{position}.parquet")
         scored = score_all(estimates.__getitem__, spans, job.reference, job.protocol)
@@ -194,6 +212,8 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
             masks = [regimes_of(reference, piece, job.protocol) for reference, piece in pieces_of(spans, job.reference, job.protocol)]
             for regime, own in errors_by_regime(scored, masks, job.protocol.rate_hz).items():
                 rows += _rows(estimator, about, job, name, spans, own, {}, subset=regime)
+        if bands is not None:
+            rows += _band_rows(estimator, about, job, name, spans, scored, bands)
     rows += _training_rows(estimator, about, job)
     write_segments(folder / BLOCKS, blocks)
     for file, timed in ((METRICS, False), (TIMINGS, True)):
@@ -224,6 +244,39 @@ def _rows(
     for metric, value in figures.items():
         ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]
         rows.append((*head, about.seed, metric, repr(float(value)), UNITS[metric], *ends))
+    return rows
+
+
+def _bands_of(job: EvaluateJob) -> Bands | None:
+    """The model's calibrated bands, where there are any."""
+    return None if job.calibration is None else read_trust(job.calibration.folder).bands
+
+
+def _with_bands(estimates: list[Estimate], job: EvaluateJob, pieces: Sequence[Span], bands: Bands | None, test_set: str) -> list[Estimate]:
+    """Estimates with their 90 % bands, wider on vehicles that bands were not calibrated on and on test sets that the protocol names."""
+    if bands is None:
+        return estimates
+    found = []
+    for estimate, piece in zip(estimates, pieces, strict=True):
+        measured = _measured(job, piece)
+        elsewhere = measured.vehicle not in bands.vehicles or test_set in job.protocol.sets_elsewhere
+        found.append(with_bands(estimate, measured, bands, elsewhere=elsewhere))
+    return found
+
+
+def _band_rows(
+    estimator: Estimator, about: About, job: EvaluateJob, name: str, spans: Sequence[Span], scored: Sequence[Scored], bands: Bands
+) -> list[tuple[Any, ...]]:
+    """What bands are worth on a test set, and there by lateral acceleration."""
+    rate, own = job.protocol.rate_hz, banded(scored, bands)
+    turns, masks = [], []
+    for reference, piece in pieces_of(spans, job.reference, job.protocol):
+        turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, job.protocol))] if "yaw_rate" in reference else None)
+        masks.append(regimes_of(reference, piece, job.protocol))
+    figures = band_figures(own, scored, turns, rate)
+    rows = _rows(estimator, about, job, name, spans, figures, coverage_intervals(own, scored, rate))
+    for regime, inside in figures_by_regime(own, masks, rate).items():
+        rows += _rows(estimator, about, job, name, spans, inside, {}, subset=regime)
     return rows
 
 

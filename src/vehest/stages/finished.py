@@ -36,7 +36,7 @@ FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 1
 MOST_FILES = 20_000  # below a data set's folder; beyond, looking at each takes longer than the whole way
 ABSENT = "absent"
-TRACKED_STAGES = ("train", "evaluate")
+TRACKED_STAGES = ("train", "calibrate", "evaluate")
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env\s*:\s*([A-Za-z_]\w*)")
 _RESOLVERS = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:")
 

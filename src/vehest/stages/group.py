@@ -1,4 +1,4 @@
-"""What one worker does: train the members of a group together, then evaluate each."""
+"""What one worker does: train the members of a group together, then calibrate and evaluate each."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
 from vehest.stages.artefacts import Artefact, Status, ensured, find, make
+from vehest.stages.calibrate import STAGE, CalibrateJob, plan_calibrate, write_calibration
 from vehest.stages.evaluate import plan_evaluate
 from vehest.stages.evaluate_faults import FaultedJob, write_faulted
 from vehest.stages.faults import FaultSettings
@@ -44,9 +45,9 @@ class Evaluation:
     output: Path
     faults: tuple[FaultSettings, ...] = ()
 
-    def of(self, model: Artefact) -> FaultedJob:
-        """The evaluation of a model."""
-        job = plan_evaluate(model, self.split, self.data, self.references, self.kinds, self.protocol, self.output)
+    def of(self, model: Artefact, calibration: Artefact | None) -> FaultedJob:
+        """The evaluation of a model that was calibrated, or not."""
+        job = plan_evaluate(model, self.split, self.data, self.references, self.kinds, self.protocol, self.output, calibration)
         return FaultedJob(job, self.faults)
 
 
@@ -59,12 +60,14 @@ class Group:
         evaluation: none if they are trained only.
         force: stages to run although their artefacts are there.
         label: what its members have in common, for people; the estimator and its variant if empty.
+        split: that members are calibrated on where they are trained only; none if they are not.
     """
 
     jobs: Sequence[TrainJob]
     evaluation: Evaluation | None = None
     force: frozenset[str] = frozenset()
     label: str = ""
+    split: Split | None = None
 
     @property
     def name(self) -> str:
@@ -73,14 +76,20 @@ class Group:
         label = self.label or self.jobs[0].plan.label.rsplit("-seed", 1)[0]
         return f"{label} seed {seeds[0]}" if len(seeds) == 1 else f"{label} seeds {', '.join(seeds)}"
 
+    @property
+    def split_of_bands(self) -> Split | None:
+        """Whose validation range members are calibrated on."""
+        return self.split if self.evaluation is None else self.evaluation.split
+
 
 @dataclass(frozen=True)
 class Member:
-    """What became of one member: its model and its evaluation, where they are there."""
+    """What became of one member: its model, its calibration and its evaluation, where they are there."""
 
     job: TrainJob
     model: Artefact | None = None
     evaluation: Artefact | None = None
+    calibration: Artefact | None = None
 
 
 def existing(group: Group) -> list[Member]:
@@ -88,13 +97,21 @@ def existing(group: Group) -> list[Member]:
     members = []
     for job in group.jobs:
         model = None if "train" in group.force else find(job.plan)
-        members.append(Member(job, model, _found_evaluation(group, model)))
+        calibration = _found_calibration(group, job, model)
+        members.append(Member(job, model, _found_evaluation(group, job, model, calibration), calibration))
     return members
 
 
 def is_finished(group: Group, member: Member) -> bool:
     """Whether nothing is left to do for a member."""
-    return member.model is not None and (group.evaluation is None or member.evaluation is not None)
+    if member.model is None or (group.evaluation is not None and member.evaluation is None):
+        return False
+    return member.calibration is not None or _calibration_job(group, member.job, member.model) is None
+
+
+def is_calibrated(group: Group) -> bool:
+    """Whether there is anything to calibrate the members of a group by."""
+    return group.split_of_bands is not None and bool(group.split_of_bands.validation)
 
 
 def drop_finished_checkpoint(job: TrainJob) -> None:
@@ -140,10 +157,14 @@ def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Calla
     members = []
     for job in group.jobs:
         model = models[job.plan.key]
-        evaluation = None
-        if model is not None and model.status == "complete" and group.evaluation is not None and not should_stop():
-            evaluation = _evaluated(group, model, should_stop, on_progress)
-        members.append(Member(job, model, evaluation))
+        calibration = evaluation = None
+        if model is not None and model.status == "complete" and not should_stop():
+            calibrating = _calibration_job(group, job, model)
+            if calibrating is not None:
+                calibration = _calibrated(group, job, calibrating, should_stop, on_progress)
+            if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
+                evaluation = _evaluated(group, job, model, calibration, should_stop, on_progress)
+        members.append(Member(job, model, evaluation, calibration))
     return members
 
 
@@ -186,16 +207,45 @@ def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progres
     return artefacts
 
 
-def _found_evaluation(group: Group, model: Artefact | None) -> Artefact | None:
+def _calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
+    """How a model is calibrated; none where it is not, or there is nothing to calibrate it by."""
+    split = group.split_of_bands
+    return None if split is None else plan_calibrate(model, split, job.data, job.plan.output)
+
+
+def _found_calibration(group: Group, job: TrainJob, model: Artefact | None) -> Artefact | None:
+    calibrating = None if model is None or STAGE in group.force else _calibration_job(group, job, model)
+    return None if calibrating is None else find(calibrating.plan)
+
+
+def _calibrated(
+    group: Group, job: TrainJob, calibrating: CalibrateJob, should_stop: Callable[[], bool], say: Callable[[Waiting], None]
+) -> Artefact | None:
+    """The calibration of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
+    return _found_calibration(group, job, calibrating.model) or ensured(
+        calibrating.plan, lambda folder: write_calibration(calibrating, folder), STAGE in group.force, should_stop, say
+    )
+
+
+def _found_evaluation(group: Group, job: TrainJob, model: Artefact | None, calibration: Artefact | None) -> Artefact | None:
     if model is None or group.evaluation is None or "evaluate" in group.force:
         return None
-    return find(group.evaluation.of(model).plan)
+    if calibration is None and _calibration_job(group, job, model) is not None:
+        return None
+    return find(group.evaluation.of(model, calibration).plan)
 
 
-def _evaluated(group: Group, model: Artefact, should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Artefact | None:
+def _evaluated(
+    group: Group,
+    job: TrainJob,
+    model: Artefact,
+    calibration: Artefact | None,
+    should_stop: Callable[[], bool],
+    say: Callable[[Waiting], None],
+) -> Artefact | None:
     """The evaluation of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
     assert group.evaluation is not None
-    job = group.evaluation.of(model)
-    return _found_evaluation(group, model) or ensured(
-        job.plan, lambda folder: write_faulted(job, folder), "evaluate" in group.force, should_stop, say
+    scoring = group.evaluation.of(model, calibration)
+    return _found_evaluation(group, job, model, calibration) or ensured(
+        scoring.plan, lambda folder: write_faulted(scoring, folder), "evaluate" in group.force, should_stop, say
     )

@@ -24,12 +24,12 @@ from vehest.data.files import ASIDE_PREFIX, aside_of, is_left_over, writing_erro
 from vehest.data.text_files import read_json
 from vehest.estimators.registry import estimator_module
 from vehest.sources.base import source_module
-from vehest.stages import downsample, evaluate, ingest, report, sweep, train
+from vehest.stages import calibrate, downsample, evaluate, ingest, report, sweep, train
 from vehest.stages.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.stages.finished import FINISHED
 
 CHECKPOINTS = "checkpoints"
-STAGES = (ingest.STAGE, downsample.STAGE, train.STAGE, evaluate.STAGE, report.STAGE, sweep.STAGE)
+STAGES = (ingest.STAGE, downsample.STAGE, train.STAGE, calibrate.STAGE, evaluate.STAGE, report.STAGE, sweep.STAGE)
 OUTDATED, DAMAGED, ORPHANED = "its code has changed", "it is damaged", "what it was made from is gone"
 SUPERFLUOUS, LEFT_OVER, BROKEN = "its model is there, or found itself", "left by a process that was killed", "of a study that is not whole"
 _NAME = re.compile(r".+-[0-9a-f]{12}")
@@ -124,7 +124,8 @@ def _provided(whole: Mapping[str, Sequence[Artefact]]) -> dict[str, set[str]]:
     compared = digests[train.STAGE] | digests[evaluate.STAGE] | digests[ingest.STAGE]
     return {
         downsample.STAGE: files[ingest.STAGE],
-        evaluate.STAGE: digests[train.STAGE] | files[downsample.STAGE],
+        calibrate.STAGE: digests[train.STAGE] | files[downsample.STAGE],
+        evaluate.STAGE: digests[train.STAGE] | digests[calibrate.STAGE] | files[downsample.STAGE],
         report.STAGE: compared,
         sweep.STAGE: compared,
     }
@@ -140,9 +141,10 @@ def _code_of(artefact: Artefact, models: Sequence[Artefact]) -> str | None:
             return downsample.code_of_downsampling()
         if artefact.stage == train.STAGE:
             return train.code_of_training(estimator_module(str(config["estimator"]["name"])))
-        if artefact.stage == evaluate.STAGE:
+        if artefact.stage in (calibrate.STAGE, evaluate.STAGE):
             model = next(model for model in models if model.digest == artefact.inputs["model"])
-            return evaluate.code_of_evaluation(estimator_module(str(model.config["estimator"]["name"])))
+            code_of = calibrate.code_of_calibration if artefact.stage == calibrate.STAGE else evaluate.code_of_evaluation
+            return code_of(estimator_module(str(model.config["estimator"]["name"])))
         if artefact.stage == sweep.STAGE:
             return sweep.code_of_sweep()
         return report.code_of_report(str(config["module"]))

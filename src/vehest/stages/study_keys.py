@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from vehest.data.split_files import dataset_names
 from vehest.estimators.registry import estimator_module
 from vehest.sources.base import kind_of, source_module
+from vehest.stages.calibrate import code_of_calibration
 from vehest.stages.comparison import resampling_fact, training_facts
 from vehest.stages.config import Config
 from vehest.stages.downsample import code_of_downsampling
@@ -81,6 +82,8 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
         module = estimator_module(name)
         yield f"train {name}", {CODE: code_of_training(module), CONFIGURATION: _hash(trained)}
+        if first["split"].get("validation"):
+            yield f"calibrate {name}", {CODE: code_of_calibration(module), CONFIGURATION: _hash(None)}
         if not faults:
             yield f"evaluate {name}", {CODE: code_of_evaluation(module), CONFIGURATION: _hash(first["evaluation"])}
             continue

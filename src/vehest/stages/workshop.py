@@ -19,6 +19,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.model_files import read_description
 from vehest.sources.base import kind_of, open_source
 from vehest.stages.artefacts import Artefact, StagePlan, Status, ensured, find
+from vehest.stages.calibrate import calibration_figures, calibration_of, plan_calibrate, write_calibration
 from vehest.stages.compiling import has_to_compile
 from vehest.stages.config import Config, compose_config, missing_keys
 from vehest.stages.console import Messages
@@ -26,7 +27,7 @@ from vehest.stages.downsample import plan_downsample, write_downsample
 from vehest.stages.evaluate import read_metrics, read_scored
 from vehest.stages.failures import Failure
 from vehest.stages.finished import Outcome, RawFolder
-from vehest.stages.group import Evaluation, Group, Member, drop_finished_checkpoint, existing, is_finished, run_group
+from vehest.stages.group import Evaluation, Group, Member, drop_finished_checkpoint, existing, is_calibrated, is_finished, run_group
 from vehest.stages.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.stages.launcher import Task, launch
 from vehest.stages.locks import Waiting
@@ -35,9 +36,10 @@ from vehest.stages.rates import Note
 from vehest.stages.shown import Shown
 from vehest.stages.signals import StopSignals
 from vehest.stages.tracking import Tracker
-from vehest.stages.train import HISTORY, read_fit_metrics
+from vehest.stages.train import HISTORY, learnt_spans, read_fit_metrics
 from vehest.studies.artefacts import read_frame
 from vehest.training.context import Progress
+from vehest.trust.record import read_trust
 
 
 class NotThereYet(Exception):
@@ -197,6 +199,28 @@ class Workshop:
         """Data set -> ``real`` or ``simulated``."""
         return {name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets}
 
+    def calibration(self, model: Artefact, split: Split, data: Mapping[str, Artefact]) -> Artefact | None:
+        """The calibration of a model that is to be evaluated on a split: made on that split if it learnt there, else looked for.
+
+        Args:
+            model: what the train stage made.
+            split: that it is evaluated on.
+            data: data set -> recordings at the model's rate.
+
+        Raises:
+            NotThereYet: in a dry run, if it would have to be made.
+        """
+        learnt = learnt_spans(model)
+        of_split = [*split.train, *split.validation]
+        job = plan_calibrate(model, split, data, self.output) if not learnt or set(learnt) == set(of_split) else None
+        found = calibration_of(model.folder, self.output) if job is None or model.status != "complete" else None
+        if found is None and job is not None and model.status == "complete":
+            found = self._ensure(job.plan, partial(write_calibration, job))
+            self.log_calibration(found)
+        elif found is None:
+            self.messages.line("note", "calibrate", model.label, "has no calibration, so its estimates have no bands")
+        return found
+
     def run_groups(self, groups: Sequence[Group]) -> tuple[list[Member], list[tuple[str, Failure]]]:
         """Train and evaluate groups, side by side where there are cores; returns members and failures.
 
@@ -221,11 +245,14 @@ class Workshop:
         if self.dry_run and waiting:
             for group in waiting:
                 for job in group.jobs:
-                    self.messages.line("plan", "train", job.plan.label, "then evaluate" if group.evaluation else "")
+                    then = [stage for stage, wanted in (("calibrate", is_calibrated(group)), ("evaluate", group.evaluation)) if wanted]
+                    self.messages.line("plan", "train", job.plan.label, f"then {' and '.join(then)}" if then else "")
             raise NotThereYet
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(name):
                 self.messages.line("once", "compile", name, "tens of seconds before its first training; later ones load it")
+        for split in dict.fromkeys(group.split_of_bands.name for group in waiting if group.split_of_bands and not is_calibrated(group)):
+            self.messages.line("note", "calibrate", split, "has no validation range: no bands")
         failures: list[tuple[str, Failure]] = []
         tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
         with self.messages.bars() as bars:
@@ -248,7 +275,7 @@ class Workshop:
                     self._say_made(member)
                     self._track(member, waiting[done.position].evaluation)
         self.stop.raise_if_requested()
-        for made in (artefact for member in members for artefact in (member.model, member.evaluation)):
+        for made in (artefact for member in members for artefact in (member.model, member.calibration, member.evaluation)):
             if made is not None:
                 self.artefacts[made.folder] = made
         return members, failures
@@ -283,6 +310,8 @@ class Workshop:
 
     def _say_skipped(self, member: Member) -> None:
         self.messages.line("skip", "train", member.job.plan.label, "up to date")
+        if member.calibration is not None:
+            self.messages.line("skip", "calibrate", member.calibration.label, "up to date")
         if member.evaluation is not None:
             self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
 
@@ -301,6 +330,8 @@ class Workshop:
             loss = fit.get("best_validation_loss")
             outcome = f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}"
             self.messages.line("done", "train", member.model.label, f"{epochs}{outcome}")
+        if member.calibration is not None:
+            self.say_calibrated(member.calibration)
         if member.evaluation is None:
             return
         if member.evaluation.skipped:
@@ -310,9 +341,23 @@ class Workshop:
             shown = ", ".join(f"{name} {value:.3f}°" for name, value in figures.items() if name.startswith("rmse_sideslip"))
             self.messages.line("done", "evaluate", member.evaluation.label, shown)
 
+    def say_calibrated(self, calibration: Artefact) -> None:
+        """Say of a calibration on what it stands, or why there are no bands."""
+        if calibration.skipped:
+            self.messages.line("skip", "calibrate", calibration.label, "up to date")
+            return
+        trust = read_trust(calibration.folder)
+        if trust.bands is None:
+            self.messages.line("note", "calibrate", calibration.label, f"no bands: {trust.about.note}")
+        else:
+            what = "ranges" if trust.bands.blocks == "range" else "stretches from turn to turn"
+            self.messages.line("done", "calibrate", calibration.label, f"bands by {trust.bands.n_blocks} {what}")
+
     def _track(self, member: Member, how: Evaluation | None) -> None:
         if member.model is not None:
             self.log_fit(member.model)
+            if member.calibration is not None:
+                self.log_calibration(member.calibration)
             if member.evaluation is not None and how is not None:
                 self.log_evaluation(member.evaluation, member.model, how)
 
@@ -321,6 +366,11 @@ class Workshop:
         if self.tracker is not None and not self.tracker.is_tracked(model):
             drawn = {"learning.png": partial(_learning_figure, model)}
             self.tracker.log(model, self.tags, read_fit_metrics(model.folder), model.folder / HISTORY, drawn)
+
+    def log_calibration(self, calibration: Artefact) -> None:
+        """Track a calibration, unless it is tracked: what it stands on, and the file itself."""
+        if self.tracker is not None and not self.tracker.is_tracked(calibration):
+            self.tracker.log(calibration, self.tags, calibration_figures(calibration.folder))
 
     def log_evaluation(self, evaluation: Artefact, model: Artefact, how: Evaluation) -> None:
         """Track an evaluation, unless it is tracked: figures, and traces over each test set."""

@@ -22,6 +22,7 @@ from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.bands import band_blocks
 from vehest.studies.kit.drives import floors_table, regime_table
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
@@ -288,7 +289,8 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
         blocks.append(
             f"The following figures show {len(shown)} of {len(finite)} estimators: those with the lowest RMSE(v) on the validation range."
         )
-    return blocks + _figures_of(drive, shown, file, lines)
+    in_bands = {name: chosen[name] for name in drive.estimates}
+    return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(drive, shown, file, lines)]
 
 
 def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Block]:

@@ -1,0 +1,505 @@
+"""Calibrated bands: how far an estimate of v and β may be off, at stated levels, for any family.
+
+    half width at level p = q_p · s(x) · w(x)
+
+s is a local scale that training ranges give: s² is a combination, with weights that are not negative, of what the estimator reads at the
+instant and of its estimate; of a filter s² = a (P + floor²) with its own variance P. q_p is the level's quantile of |error|/(s w) on
+validation ranges, each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens where training has not been.
+
+The rule of w was fixed before any of its effects was looked at: with m the 99.9th percentile of |f| in training, w is the largest of
+1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre other than those calibrated on.
+
+Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA 118 (544), 2023 (pooling
+CDFs); Lee, Barber & Willett, Distribution-free inference with hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et
+al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.estimators.kernels.compiling import entry
+
+LEVELS = (0.5, 0.68, 0.9, 0.95)
+SHOWN_LEVEL = 0.9  # of the channels band_vy and band_sideslip
+
+LEAST_PIECES = 10  # ranges, from which on each is a block
+TURN_YAW_RATE = 0.05  # rad/s
+LEAST_BLOCK_SECONDS = 2.0
+
+DOMAIN_QUANTILE = 0.999
+ELSEWHERE = 2.0  # by which a band is wider on another car or tyre
+LOWEST_SPEED = 1.0  # m/s, below which an error of v says no more of β
+LEAST_SCALE = 0.1  # of the root mean square error in training: the scale's floor
+FITS = 20  # of the scale, each with the weights that the last one gives
+
+COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")
+TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
+"""What s² is made of: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over vx². ``variance`` is P."""
+
+_FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
+_HEAD = 5  # numbers before the weights in a `PackedBands`
+
+Blocks = Literal["range", "turn"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """The band of one quantity.
+
+    Args:
+        weights: term -> its weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]; the others have none.
+        floor: s is never below [m/s, or rad].
+        factors: q of each level.
+        beyond: of each level, whether there are too few blocks for it: q is then the largest score times 1 + 1/K.
+        effective_blocks: how many equal blocks the squared scores are spread over (Kish 1965).
+    """
+
+    weights: dict[str, float]
+    floor: float
+    factors: tuple[float, ...]
+    beyond: tuple[bool, ...]
+    effective_blocks: float
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.weights if name not in TERMS]
+        if unknown:
+            raise DataError(f"weights name {unknown[0]}, which is not one of: {', '.join(TERMS)}")
+        if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
+            raise DataError(f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})")
+        if min(self.weights.values(), default=0.0) < 0 or not self.floor > 0 or min(self.factors) < 0:
+            raise DataError("weights and factors must not be negative, and floor must be positive")
+
+    def beside(self, level: float) -> FloatArray:
+        """Half widths of all `LEVELS` over that of one, (L,)."""
+        factors = np.array(self.factors)
+        shown = factors[LEVELS.index(level)]
+        return factors / shown if shown > 0 else np.ones_like(factors)
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Half widths of v and β of one model.
+
+    Args:
+        vehicles: that were driven where it was calibrated.
+        datasets: whose recordings these are.
+        scaled_on: ranges that gave scale and domain.
+        calibrated_on: ranges that gave the factors.
+        blocks: what a block is: a ``range``, or a stretch from ``turn`` to turn.
+        n_blocks: how many there are.
+        seconds: that were calibrated on [s].
+        channels: that the model reads, the columns of its rows.
+        horizon_steps: sampling intervals that its estimate lies ahead of the sample.
+        largest: term -> the 99.9th percentile of its size in training.
+        vy: the band of v.
+        sideslip: the band of β.
+    """
+
+    vehicles: tuple[str, ...]
+    datasets: tuple[str, ...]
+    scaled_on: tuple[str, ...]
+    calibrated_on: tuple[str, ...]
+    blocks: Blocks
+    n_blocks: int
+    seconds: float
+    channels: tuple[str, ...]
+    horizon_steps: int
+    largest: dict[str, float]
+    vy: Quantity
+    sideslip: Quantity
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.largest if name not in TERMS]
+        if unknown or min(self.largest.values(), default=0.0) < 0:
+            raise DataError(f"largest must name sizes of: {', '.join(TERMS)}")
+
+    def packed(self, level: float = SHOWN_LEVEL, *, elsewhere: bool = False) -> PackedBands:
+        """What `band_rows` takes.
+
+        Args:
+            level: one of `LEVELS`.
+            elsewhere: whether the car or its tyres are others than those calibrated on.
+
+        Raises:
+            DataError: there is no such level.
+        """
+        if level not in LEVELS:
+            raise DataError(f"bands have no level {level}, only {', '.join(map(str, LEVELS))}")
+        which, wider = LEVELS.index(level), ELSEWHERE if elsewhere else 1.0
+        head = [self.vy.factors[which] * wider, self.sideslip.factors[which] * wider, self.vy.floor**2, self.sideslip.floor**2]
+        weights = [own.weights.get(name, 0.0) for own in (self.vy, self.sideslip) for name in TERMS]
+        numbers = np.array([*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)])
+        return PackedBands(_columns(self.channels), numbers)
+
+    def half_widths(self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False) -> FloatArray:
+        """Half widths of all levels.
+
+        Args:
+            rows: what the model reads, (T, C), in the order of ``channels``; NaN was not measured and counts as the training's largest.
+            vy: estimate that was made of it, (T,) [m/s].
+            variance: of its error as the method gives it, (T,) [m²/s²]; NaN where it gives none.
+            elsewhere: as in `packed`.
+
+        Returns:
+            (T, 2, L): v [m/s] and β [rad]; NaN where there is no estimate.
+        """
+        terms = terms_of(rows, vy, variance, _columns(self.channels))
+        largest = np.array([self.largest.get(name, 0.0) for name in TERMS])
+        terms = np.where(np.isfinite(terms), terms, largest)
+        wider = _widening(terms, largest) * (ELSEWHERE if elsewhere else 1.0)
+        speed = (
+            np.maximum(np.abs(rows[:, self.channels.index("vx")]), LOWEST_SPEED) if "vx" in self.channels else np.full(len(rows), np.nan)
+        )
+        scales = [_scale(terms, self.vy), _scale(terms / speed[:, None], self.sideslip)]
+        half = np.stack(
+            [(scale * wider)[:, None] * np.array(own.factors) for scale, own in zip(scales, (self.vy, self.sideslip), strict=True)], 1
+        )
+        half[:, 1] = np.where(half[:, 1] < math.pi, half[:, 1], math.pi)  # without a speed, too
+        half[~np.isfinite(vy)] = np.nan
+        return np.asarray(half)
+
+
+@dataclass(frozen=True, eq=False)
+class PackedBands:
+    """A level's band as `band_rows` takes it.
+
+    Args:
+        columns: where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,).
+        numbers: factors and squared floors of v and β, lowest speed, weights of `TERMS` for v and for β, their largest sizes, (29,).
+    """
+
+    columns: NDArray[np.int64]
+    numbers: FloatArray
+
+
+def half_widths_of_rows(
+    rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64], numbers: FloatArray, bands: FloatArray
+) -> None:
+    """Half widths of one level, sample by sample, as `Bands.half_widths` says.
+
+    Args:
+        rows: what the model reads, (T, C).
+        vy: estimate, (T,) [m/s].
+        variance: of its error, (T,) [m²/s²]; NaN where the method gives none.
+        columns: of `PackedBands`.
+        numbers: of `PackedBands`.
+        bands: output, (T, 2): v [m/s] and β [rad].
+    """
+    n_terms = (len(numbers) - _HEAD) // 3
+    terms = np.empty(n_terms)
+    for k in range(len(vy)):
+        if not math.isfinite(vy[k]):
+            bands[k, 0] = bands[k, 1] = math.nan
+            continue
+        vx = rows[k, columns[0]] if columns[0] >= 0 else math.nan
+        terms[0] = math.sqrt(variance[k]) if variance[k] >= 0.0 else math.nan
+        terms[1], terms[2] = 1.0, vx
+        terms[3] = rows[k, columns[1]] if columns[1] >= 0 else math.nan
+        terms[4] = rows[k, columns[2]] if columns[2] >= 0 else math.nan
+        terms[5] = rows[k, columns[3]] * vx if columns[3] >= 0 else math.nan
+        terms[6] = rows[k, columns[4]] * vx if columns[4] >= 0 else math.nan
+        terms[7] = vy[k]
+        squared_vy, squared_sideslip, wider = 0.0, 0.0, 1.0
+        for j in range(n_terms):
+            largest = numbers[_HEAD + 2 * n_terms + j]
+            size = abs(terms[j])
+            if not math.isfinite(size):
+                size = largest
+            if j >= _FIRST_FEATURE and largest > 0.0 and size / largest > wider:
+                wider = size / largest
+            squared_vy += numbers[_HEAD + j] * size * size
+            squared_sideslip += numbers[_HEAD + n_terms + j] * size * size
+        bands[k, 0] = numbers[0] * wider * math.sqrt(max(squared_vy, numbers[2]))
+        bands[k, 1] = math.pi
+        if math.isfinite(vx):
+            speed = max(abs(vx), numbers[4])
+            bands[k, 1] = min(numbers[1] * wider * math.sqrt(max(squared_sideslip / (speed * speed), numbers[3])), math.pi)
+
+
+band_rows = entry(nogil=True)(half_widths_of_rows)
+
+
+def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
+    """An estimate with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad].
+
+    Args:
+        estimate: of ``measured``, on its clock.
+        measured: what the model has seen.
+        bands: of the model.
+        elsewhere: whether the car or its tyres are others than those calibrated on.
+
+    Raises:
+        DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
+    """
+    rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
+    found, packed = np.empty((len(vy), 2)), bands.packed(elsewhere=elsewhere)
+    band_rows(rows, vy, variance, packed.columns, packed.numbers, found)
+    own = {"band_vy": found[:, 0].copy(), "band_sideslip": found[:, 1].copy()}
+    return replace(estimate, channels={**estimate.channels, **own})
+
+
+def band_inputs(
+    estimate: Estimate, measured: Recording, channels: Sequence[str], horizon_steps: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them.
+
+    A row is the last sample that the estimate was made of, so that what runs online sees the same.
+
+    Raises:
+        DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
+    """
+    if len(estimate) != len(measured):
+        raise DataError(f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the recording {len(measured)}")
+    rows = measured.stack(channels)
+    rows = np.ascontiguousarray(rows[np.maximum(np.arange(len(rows)) - horizon_steps, 0)])
+    variance = np.full(len(estimate), np.nan)
+    if estimate.covariance is not None and "vy" in estimate.covariance_of:
+        at = estimate.covariance_of.index("vy")
+        variance = np.ascontiguousarray(estimate.covariance[:, at, at], dtype=np.float64)
+    return rows, np.ascontiguousarray(estimate["vy"], dtype=np.float64), variance
+
+
+def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
+    """`TERMS` of each sample without their squares, (T, 8); NaN where a channel is not read or was not measured."""
+    read = [rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns]
+    vx, ax, ay, yaw_rate, steer = read
+    deviation = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
+    return np.stack([deviation, np.ones(len(rows)), vx, ax, ay, yaw_rate * vx, steer * vx, vy], axis=1)
+
+
+def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
+    return np.array([channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64)
+
+
+def _widening(terms: FloatArray, largest: FloatArray) -> FloatArray:
+    """w of each sample, (T,); terms of a size that training never had count nothing."""
+    known = (np.arange(len(TERMS)) >= _FIRST_FEATURE) & (largest > 0)
+    excess = np.abs(terms[:, known]) / largest[known]
+    return np.maximum(excess.max(axis=1, initial=1.0), 1.0)
+
+
+def _scale(terms: FloatArray, own: Quantity) -> FloatArray:
+    weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
+    return np.asarray(np.sqrt(np.maximum(np.square(terms) @ weights, own.floor**2)))
+
+
+# Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A range with its estimate, as bands are learnt from it; arrays of T samples.
+
+    Args:
+        rows: what the model reads, (T, C).
+        vy: estimate, (T,) [m/s].
+        variance: of its error, (T,) [m²/s²], NaN where there is none.
+        error_vy: v̂ - v, (T,) [m/s]; NaN where either is not known, or nothing is to be learnt from.
+        error_sideslip: β̂ - β, (T,) [rad]; likewise.
+        yaw_rate: measured, (T,) [rad/s]; None if it was not.
+        rate_hz: of the samples [Hz].
+    """
+
+    rows: FloatArray
+    vy: FloatArray
+    variance: FloatArray
+    error_vy: FloatArray
+    error_sideslip: FloatArray
+    yaw_rate: FloatArray | None
+    rate_hz: float
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Samples whose errors are known, (T,)."""
+        return np.isfinite(self.error_vy) & np.isfinite(self.error_sideslip)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where bands come from and whose they are; see `Bands`."""
+
+    vehicles: tuple[str, ...]
+    datasets: tuple[str, ...]
+    scaled_on: tuple[str, ...]
+    calibrated_on: tuple[str, ...]
+    channels: tuple[str, ...]
+    horizon_steps: int = 0
+
+
+def calibrated(training: Sequence[Piece], validation: Sequence[Piece], origin: Origin) -> Bands:
+    """Bands of a model: scale and domain from training ranges, factors from validation ranges.
+
+    Args:
+        training: ranges that the model learnt from, or would have.
+        validation: ranges that it has not learnt from.
+        origin: what they are.
+
+    Raises:
+        DataError: there is no sample whose error is known, in one of the two.
+    """
+    for pieces, what in ((training, "training"), (validation, "validation")):
+        if not any(piece.known.any() for piece in pieces):
+            raise DataError(f"no sample of the {what} ranges has both an estimate and a reference to calibrate bands by")
+    columns = _columns(origin.channels)
+    terms, error_vy, error_sideslip, speed = _together(training, columns)
+    largest = np.array([np.quantile(own[np.isfinite(own)], DOMAIN_QUANTILE) if np.isfinite(own).any() else 0.0 for own in np.abs(terms).T])
+    filled = np.where(np.isfinite(terms), terms, largest)
+    usable = _usable(terms)
+    names = [name for name, chosen in zip(TERMS, usable, strict=True) if chosen]
+    in_vy, in_sideslip = filled[:, usable], filled[:, usable] / speed[:, None]
+    vy, sideslip = (_unit_quantity(names, *fitted_scale(own, errors)) for own, errors in ((in_vy, error_vy), (in_sideslip, error_sideslip)))
+    labels, kind = block_labels([piece.yaw_rate for piece in validation], [len(piece.vy) for piece in validation], validation[0].rate_hz)
+    blocks = np.concatenate(labels)[np.concatenate([piece.known for piece in validation])]
+    bands = Bands(
+        vehicles=origin.vehicles,
+        datasets=origin.datasets,
+        scaled_on=origin.scaled_on,
+        calibrated_on=origin.calibrated_on,
+        blocks=kind,
+        n_blocks=len(np.unique(blocks)),
+        seconds=len(blocks) / validation[0].rate_hz,
+        channels=origin.channels,
+        horizon_steps=origin.horizon_steps,
+        largest={name: float(size) for name, size in zip(TERMS, largest, strict=True) if size > 0 and name != "one"},
+        vy=vy,
+        sideslip=sideslip,
+    )
+    half = np.concatenate([bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known, :, 0] for piece in validation])
+    errors = np.concatenate([np.stack([piece.error_vy, piece.error_sideslip], 1)[piece.known] for piece in validation])
+    scores = np.abs(errors) / half
+    return replace(bands, vy=_with_factors(vy, scores[:, 0], blocks), sideslip=_with_factors(sideslip, scores[:, 1], blocks))
+
+
+def _unit_quantity(names: Sequence[str], weights: FloatArray, floor: float) -> Quantity:
+    """A scale whose factors are still 1."""
+    kept = {name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0}
+    return Quantity(kept, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0)
+
+
+def _together(pieces: Sequence[Piece], columns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Terms (N, 8), errors of v and β (N,) and speeds (N,) of all samples whose errors are known."""
+    terms = np.concatenate([terms_of(p.rows, p.vy, p.variance, columns)[p.known] for p in pieces])
+    error_vy, error_sideslip = (np.concatenate([getattr(p, name)[p.known] for p in pieces]) for name in ("error_vy", "error_sideslip"))
+    speed = np.abs(terms[:, TERMS.index("vx")])
+    return terms, error_vy, error_sideslip, np.maximum(np.where(np.isfinite(speed), speed, LOWEST_SPEED), LOWEST_SPEED)
+
+
+def _usable(terms: FloatArray) -> NDArray[np.bool_]:
+    """Terms that s² is made of: P and a constant where the method gives a variance, else all that were measured."""
+    measured: NDArray[np.bool_] = np.any(np.isfinite(terms), axis=0)
+    if measured[TERMS.index("variance")]:
+        measured[_FIRST_FEATURE:] = False
+    return measured
+
+
+def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
+    found = [pooled_quantile(scores, blocks, level) for level in LEVELS]
+    squared = np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores))
+    total = float(np.sum(np.square(squared)))
+    effective = float(squared.sum()) ** 2 / total if total > 0 else float(len(squared))
+    return replace(
+        own, factors=tuple(factor for factor, _ in found), beyond=tuple(beyond for _, beyond in found), effective_blocks=effective
+    )
+
+
+def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, float]:
+    """Weights, none negative, and floor of a scale: s² = Σ c_j f_j², as squared errors are spread.
+
+    Iterated least squares, each sample weighted by 1/s⁴ of the last fit: the quasi-likelihood of squares whose standard deviation is
+    proportional to their mean, as that of Gaussian errors is (McCullagh & Nelder 1989, Section 9.2).
+
+    Args:
+        terms: f, (N, J).
+        errors: (N,).
+
+    Returns:
+        c, (J,), and the floor of s.
+    """
+    squares, targets = np.square(terms), np.square(errors)
+    mean = float(targets.mean())
+    floor = max(LEAST_SCALE * math.sqrt(mean), 1e-9)
+    columns = np.sqrt(np.mean(np.square(squares), axis=0))
+    columns[columns == 0] = 1.0
+    predicted, weights = np.full(len(targets), max(mean, floor**2)), np.zeros(terms.shape[1])
+    for _ in range(FITS):
+        whitened = squares / columns / predicted[:, None]
+        triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r"))  # few rows
+        weights = optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
+        former, predicted = predicted, np.maximum(squares @ weights, floor**2)
+        if np.allclose(predicted, former, rtol=1e-6):
+            break
+    return np.asarray(weights), floor
+
+
+def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float) -> tuple[float, bool]:
+    """The level's quantile of scores pooled over K blocks, each of weight 1/(K + 1), with as much at infinity.
+
+    A further block, exchangeable with these, has on average at least the level of its samples below: with its own distribution in
+    the place of infinity the pooled one would be symmetric in all K + 1, and the quantile is no smaller than that one's.
+
+    Args:
+        scores: (N,), none negative.
+        blocks: which block each belongs to, (N,).
+        level: between 0 and 1.
+
+    Returns:
+        The quantile; and whether K is too small for the level, where by rule it is the largest score times 1 + 1/K.
+
+    Source: Dunn, Wasserman & Ramdas 2023; Lee, Barber & Willett 2023.
+    """
+    _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
+    n_blocks = len(counts)
+    if level > n_blocks / (n_blocks + 1) + 1e-12:
+        return float(scores.max()) * (1.0 + 1.0 / n_blocks), True
+    order = np.argsort(scores, kind="stable")
+    below = np.cumsum(1.0 / ((n_blocks + 1) * counts[label[order]]))
+    return float(scores[order][min(int(np.searchsorted(below, level - 1e-9)), len(scores) - 1)]), False
+
+
+def block_labels(yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float) -> tuple[list[NDArray[np.int64]], Blocks]:
+    """Block that each sample of some ranges belongs to, counted through: a range each if there are 10, else from turn to turn.
+
+    Args:
+        yaw_rates: of each range [rad/s]; without it a range is one block.
+        lengths: samples of each range.
+        rate_hz: of the samples [Hz].
+    """
+    found, count = [], 0
+    kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"
+    for yaw_rate, length in zip(yaw_rates, lengths, strict=True):
+        whole = kind == "range" or yaw_rate is None
+        own = np.zeros(length, dtype=np.int64) if yaw_rate is None or whole else turns_of(yaw_rate, rate_hz)
+        found.append(own + count)
+        count += int(own[-1]) + 1 if length else 0
+    return found, kind
+
+
+def turns_of(yaw_rate: FloatArray, rate_hz: float) -> NDArray[np.int64]:
+    """Number of the stretch, from the start of one turn to that of the next, that each sample belongs to, (T,).
+
+    A turn starts where |yaw rate| rises over 0.05 rad/s, at the earliest 2 s after the one before; what is left at the end and shorter
+    than that belongs to the last.
+    """
+    turning = np.abs(np.nan_to_num(yaw_rate)) >= TURN_YAW_RATE
+    least = max(math.ceil(LEAST_BLOCK_SECONDS * rate_hz), 1)
+    starts = [0]
+    for start in np.flatnonzero(turning[1:] & ~turning[:-1]) + 1:
+        if start - starts[-1] >= least:
+            starts.append(int(start))
+    if len(starts) > 1 and len(turning) - starts[-1] < least:
+        starts.pop()
+    labels = np.zeros(len(turning), dtype=np.int64)
+    labels[starts[1:]] = 1
+    return np.cumsum(labels)

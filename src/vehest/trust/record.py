@@ -1,0 +1,87 @@
+"""What is known of how far a model's estimates can be trusted, on disk: trust.yaml."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vehest.data.errors import DataError
+from vehest.data.schema import check_format, validated
+from vehest.data.text_files import read_yaml
+from vehest.trust.bands import Bands
+
+TRUST = "trust.yaml"
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class About:
+    """Whose trust it is.
+
+    Args:
+        estimator: name in the registry.
+        variant: what the paper calls it.
+        note: why something is missing, for people; empty where nothing is.
+    """
+
+    estimator: str
+    variant: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Trust:
+    """How far a model's estimates can be trusted; what is None was not learnt.
+
+    Args:
+        about: whose it is.
+        bands: calibrated half widths.
+        guard: limits of plausible samples.
+        health: residuals and thresholds of the health flag.
+    """
+
+    about: About
+    bands: Bands | None = None
+    guard: dict[str, Any] | None = None
+    health: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class _File(Trust):
+    format: int = 0
+
+
+def write_trust(trust: Trust, folder: Path) -> None:
+    """Write trust.yaml into an existing folder.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    content = _plain({"format": FORMAT, **asdict(trust)})
+    (folder / TRUST).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+
+
+def read_trust(folder: Path) -> Trust:
+    """Read trust.yaml of a folder back.
+
+    Raises:
+        MissingError: there is none.
+        DataError: it is damaged, or of another format.
+    """
+    path = folder / TRUST
+    content = read_yaml(path)
+    if not isinstance(content, dict) or "format" not in content:
+        raise DataError(f"'{path}' does not say how far a model can be trusted; calibrate it again")
+    check_format(content["format"], FORMAT, f"'{path}'")
+    found = validated(_File, content, f"'{path}'")
+    return Trust(found.about, found.bands, found.guard, found.health)
+
+
+def _plain(value: Any) -> Any:
+    """The same value with lists for tuples, as YAML has them."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value

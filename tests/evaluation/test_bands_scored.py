@@ -1,0 +1,128 @@
+"""Scores of bands against closed forms of a Gaussian, and coverage intervals against simulations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from vehest.evaluation.bands import (
+    band_figures,
+    banded,
+    coverage_intervals,
+    crps_of_levels,
+    figures_by_regime,
+    interval_score,
+    intraclass_correlation,
+    proportion_interval,
+)
+from vehest.evaluation.metrics import UNITS, Scored
+from vehest.trust.bands import LEVELS, Bands, Quantity
+
+GAUSSIAN = stats.norm.ppf([0.5 + 0.5 * level for level in LEVELS])
+UNIT = Quantity({"one": 1.0}, 0.01, tuple(GAUSSIAN.tolist()), (False,) * 4, 9.0)
+BANDS = Bands(("car",), ("mine",), (), ("two (all)",), "turn", 9, 100.0, ("vx",), 0, {}, UNIT, UNIT)
+
+
+def part_of(rng: np.random.Generator, seconds: float = 100.0, deviation: float = 0.1) -> Scored:
+    """White Gaussian errors of v at 20 m/s, and true 90 % bands."""
+    n = round(20.0 * seconds)
+    vy, vx = rng.standard_normal(n), np.full(n, 20.0)
+    error = deviation * rng.standard_normal(n)
+    half = np.full(n, deviation * GAUSSIAN[2])
+    angles = np.arctan2(vy + error, vx), np.arctan2(vy, vx)
+    bands = {"vy": half, "sideslip": np.arctan2(half, vx)}
+    return Scored(np.arange(n) / 20.0, vy + error, vy, *angles, rng.uniform(0.0, 5.0, n), bands=bands)
+
+
+def test_interval_score_of_a_gaussian_is_its_closed_form():
+    """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ; each side misses with the same."""
+    errors = np.random.default_rng(0).standard_normal(400_000)
+    for level in (0.5, 0.9):
+        z = stats.norm.ppf(0.5 + 0.5 * level)
+        expected = 2.0 * z + 2.0 / (1.0 - level) * 2.0 * (stats.norm.pdf(z) - z * stats.norm.sf(z))
+        found = interval_score(errors, np.full_like(errors, z), level)
+        assert found.mean() == pytest.approx(expected, abs=4.0 * found.std() / math.sqrt(len(found)))
+
+
+def test_interval_score_is_lowest_at_the_true_width():
+    errors = np.random.default_rng(1).standard_normal(100_000)
+    scores = [interval_score(errors, np.full_like(errors, width * GAUSSIAN[2]), 0.9).mean() for width in (0.7, 1.0, 1.4)]
+    assert scores[1] == min(scores)
+
+
+def test_crps_of_four_levels_is_a_little_below_that_of_a_gaussian():
+    """Sample by sample against σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) (Gneiting & Raftery 2007, Eq. 21)."""
+    z = np.linspace(-5.0, 5.0, 2001)
+    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    found = crps_of_levels(z, np.tile(GAUSSIAN, (len(z), 1)), LEVELS)
+    np.testing.assert_allclose(found[np.abs(z) < 2.0], exact[np.abs(z) < 2.0], atol=0.045)
+    weight = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
+    assert weight @ exact == pytest.approx(1.0 / math.sqrt(math.pi), rel=1e-3)
+    assert weight @ found == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
+
+
+def test_crps_of_many_levels_is_that_of_a_gaussian():
+    levels = np.arange(0.002, 0.9999, 0.002)
+    z = np.linspace(-2.0, 2.0, 41)
+    exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
+    half = np.tile(stats.norm.ppf(0.5 + 0.5 * levels), (len(z), 1))
+    np.testing.assert_allclose(crps_of_levels(z, half, levels.tolist()), exact, atol=1e-3)
+
+
+def test_intraclass_correlation_of_planted_variances():
+    rng = np.random.default_rng(2)
+    labels = np.repeat(np.arange(3000), rng.integers(5, 15, 3000))
+    values = math.sqrt(0.3) * rng.standard_normal(3000)[labels] + math.sqrt(0.7) * rng.standard_normal(len(labels))
+    assert intraclass_correlation(values, labels) == pytest.approx(0.3, abs=0.03)
+    assert intraclass_correlation(labels.astype(float), labels) == pytest.approx(1.0)
+    assert math.isnan(intraclass_correlation(values, np.zeros(len(values), dtype=int)))
+
+
+def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
+    """2000 test sets of 12 blocks with coverage drawn from a beta distribution of mean 0.9; three standard errors are 0.015."""
+    rng, held = np.random.default_rng(3), 0
+    for _ in range(2000):
+        sizes = rng.integers(50, 150, 12).astype(float)
+        sums = rng.binomial(sizes.astype(int), rng.beta(4.5, 0.5, 12)).astype(float)
+        low, high = proportion_interval(sums, sizes)
+        held += low <= 0.9 <= high
+    assert held / 2000 >= 0.95 - 0.015
+
+
+def test_interval_of_full_coverage_is_that_of_one_sample_a_block():
+    low, high = proportion_interval(np.full(10, 50.0), np.full(10, 50.0))
+    assert low == pytest.approx(0.025 ** (1.0 / 10.0))  # Clopper & Pearson for 10 of 10
+    assert high == 1.0
+
+
+def test_true_bands_cover_what_they_say():
+    rng = np.random.default_rng(4)
+    parts = [part_of(rng), part_of(rng)]
+    own = banded(parts, BANDS)
+    turns = [np.sin(part.time) for part in parts]
+    figures = band_figures(own, parts, turns, 20.0)
+    assert set(figures) <= set(UNITS)
+    for suffix in ("", "_vy"):
+        for level in LEVELS:
+            assert figures[f"coverage_{100 * level:.0f}{suffix}"] == pytest.approx(level, abs=0.03)
+        assert figures[f"coverage_90_p10{suffix}"] < 0.9 < figures[f"coverage_90_p90{suffix}"]
+        assert abs(figures[f"error_icc{suffix}"]) < 0.02
+    assert figures["width_90_vy"] == pytest.approx(2.0 * 0.1 * GAUSSIAN[2])
+    assert figures["width_90"] == pytest.approx(math.degrees(figures["width_90_vy"] / 20.0), rel=1e-3)
+    assert figures["crps_vy"] == pytest.approx(0.1 / math.sqrt(math.pi), rel=0.05)
+    intervals = coverage_intervals(own, parts, 20.0)
+    assert set(intervals) == {f"coverage_{100 * level:.0f}{suffix}" for level in LEVELS for suffix in ("", "_vy")}
+    low, high = intervals["coverage_90"]
+    assert low < figures["coverage_90"] < high
+
+
+def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
+    part = part_of(np.random.default_rng(5))
+    names = {"ay_0_2": (0.0, 2.0), "ay_2_4": (2.0, 4.0), "ay_4_6": (4.0, 6.0), "ay_6_": (6.0, math.inf)}
+    masks = {name: (part.ay >= low) & (part.ay < high) for name, (low, high) in names.items()}
+    found = figures_by_regime(banded([part], BANDS), [masks], 20.0)
+    assert set(found) == {"ay_0_2", "ay_2_4", "ay_4_6"}
+    assert found["ay_0_2"]["coverage_90"] == pytest.approx(0.9, abs=0.05)

@@ -1,0 +1,258 @@
+"""Bands: calibration against planted scales and exchangeable blocks, kernel against numpy, and what is written and read back."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.trust.bands import (
+    ELSEWHERE,
+    LEVELS,
+    Origin,
+    Piece,
+    band_inputs,
+    band_rows,
+    block_labels,
+    calibrated,
+    fitted_scale,
+    half_widths_of_rows,
+    pooled_quantile,
+    turns_of,
+    with_bands,
+)
+from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
+
+CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
+ORIGIN = Origin(("my car",), ("mine",), ("one (all)",), ("two (all)",), CHANNELS)
+
+
+def piece_of(rng: np.random.Generator, n: int, deviation: float = 0.1, variance: float = math.nan) -> Piece:
+    """A range at 20 Hz whose error grows with |ay|, σ² = deviation² + (0.05 ay)²; one error a block of 100 samples, and noise."""
+    rows = rng.standard_normal((n, 5)) * [0.3, 3.0, 3.0, 1.0, 0.05] + [0.0, 25.0, 0.0, 0.0, 0.0]
+    sigma = np.sqrt(deviation**2 + (0.05 * rows[:, 2]) ** 2)
+    shared = np.repeat(rng.standard_normal(n // 100 + 1), 100)[:n]
+    error = sigma * (shared + rng.standard_normal(n)) / math.sqrt(2.0)
+    time = np.arange(n) / 20.0
+    return Piece(rows, rng.standard_normal(n), np.full(n, variance), error, error / rows[:, 1], 0.3 * np.sin(0.5 * time), 20.0)
+
+
+def bands_of(seed: int = 0, **changes):
+    rng = np.random.default_rng(seed)
+    return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], ORIGIN)
+
+
+def test_scale_follows_a_planted_growth_with_acceleration():
+    rng = np.random.default_rng(1)
+    terms = np.stack([np.ones(200_000), 3.0 * rng.standard_normal(200_000), rng.standard_normal(200_000)], axis=1)
+    errors = np.sqrt(0.04 + 0.01 * terms[:, 1] ** 2) * rng.standard_normal(200_000)
+    weights, floor = fitted_scale(terms, errors)
+    assert weights == pytest.approx([0.04, 0.01, 0.0], abs=1e-3)
+    assert floor == pytest.approx(0.1 * np.sqrt(np.mean(errors**2)))
+
+
+def test_scale_of_a_filter_is_its_variance_and_a_floor():
+    rng = np.random.default_rng(2)
+    deviation = rng.uniform(0.01, 0.3, 100_000)
+    errors = 3.0 * np.sqrt(deviation**2 + 0.2**2) * rng.standard_normal(100_000)
+    weights, _ = fitted_scale(np.stack([deviation, np.ones_like(deviation)], axis=1), errors)
+    assert weights[0] == pytest.approx(9.0, rel=0.1)
+    assert math.sqrt(weights[1] / weights[0]) == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_filter_s_band_takes_its_variance_and_nothing_else():
+    assert set(bands_of(variance=0.01).vy.weights) <= {"variance", "one"}
+    assert "ay" in bands_of().vy.weights
+
+
+def test_pooled_quantile_of_blocks_of_one_is_that_of_split_conformal():
+    scores = np.random.default_rng(3).exponential(size=40)
+    for level in LEVELS:
+        rank = math.ceil(level * 41)  # Lei et al. 2018, Theorem 2.2
+        assert pooled_quantile(scores, np.arange(40), level) == (np.sort(scores)[rank - 1], False)
+
+
+def test_each_block_counts_once_however_long_it_is():
+    scores = np.concatenate([np.full(1000, 5.0), np.arange(1.0, 9.0)])
+    blocks = np.concatenate([np.zeros(1000, dtype=int), np.arange(1, 9)])
+    assert pooled_quantile(scores, blocks, 0.5)[0] == 5.0
+    assert pooled_quantile(scores, np.arange(1008), 0.003)[0] == 4.0
+
+
+def test_too_few_blocks_for_a_level_take_the_largest_score_and_say_so():
+    scores, blocks = np.arange(1.0, 11.0), np.arange(10) // 2  # K = 5: levels up to 5/6
+    assert pooled_quantile(scores, blocks, 0.9) == (10.0 * 1.2, True)
+    assert pooled_quantile(scores, blocks, 0.68)[1] is False
+
+
+def test_coverage_of_a_further_block_averages_the_level():
+    """Over 4000 draws of 12 blocks of unlike sizes and a further one; tolerance: three standard errors, each about 0.006 at 0.5."""
+    rng = np.random.default_rng(4)
+    covered = {level: np.empty(4000) for level in (0.5, 0.68, 0.9)}
+    for draw in range(4000):
+        sizes = rng.integers(5, 60, 13)
+        blocks = np.repeat(np.arange(13), sizes)
+        scores = np.abs(
+            np.exp(0.7 * rng.standard_normal(13))[blocks] * (rng.standard_normal(13)[blocks] + rng.standard_normal(len(blocks)))
+        )
+        seen = blocks < 12
+        for level, own in covered.items():
+            own[draw] = np.mean(scores[~seen] <= pooled_quantile(scores[seen], blocks[seen], level)[0])
+    for level, own in covered.items():
+        error = own.std() / math.sqrt(len(own))
+        assert own.mean() >= level - 3.0 * error
+        assert own.mean() <= level + 1.0 / 13.0 + 3.0 * error  # and no wider than the share at infinity makes it
+
+
+def test_coverage_on_further_ranges_of_the_whole_calibration():
+    """Scale, blocks and factors together: 60 calibrations on 32 turns, each judged on 100 s more."""
+    rng, covered = np.random.default_rng(5), []
+    for _ in range(60):
+        bands = calibrated([piece_of(rng, 3000)], [piece_of(rng, 4000)], ORIGIN)
+        further = piece_of(rng, 2000)
+        half = bands.half_widths(further.rows, further.vy, further.variance)
+        errors = np.abs(np.stack([further.error_vy, further.error_sideslip], axis=1))[:, :, None]
+        covered.append((errors <= half).mean(axis=0))
+    mean, error = np.mean(covered, axis=0), np.std(covered, axis=0) / math.sqrt(60)
+    assert np.all(mean[:, :3] >= np.array(LEVELS)[:3] - 3.0 * error[:, :3])
+    assert np.all(mean[:, :3] <= np.array(LEVELS)[:3] + 0.09)
+
+
+def test_band_is_wider_where_errors_are():
+    bands = bands_of()
+    rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
+    rows[1, 2] = 6.0
+    calm, hard = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0, 2]
+    assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
+
+
+@pytest.mark.parametrize("variance", [math.nan, 0.01])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_kernel_agrees_with_numpy_for_every_level(variance, elsewhere):
+    bands, rng = bands_of(variance=variance), np.random.default_rng(6)
+    own = piece_of(rng, 300, variance=variance)
+    rows, vy, spread = own.rows * 2.0, own.vy.copy(), own.variance.copy()
+    rows[10, 0], rows[20, 1], vy[30], spread[40] = np.nan, np.nan, np.nan, -1.0
+    rows[50, 1] = 0.0
+    half = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
+    for which, level in enumerate(LEVELS):
+        packed = bands.packed(level, elsewhere=elsewhere)
+        for kernel in (band_rows, half_widths_of_rows):
+            found = np.empty((300, 2))
+            kernel(rows, vy, spread, packed.columns, packed.numbers, found)
+            np.testing.assert_allclose(found, half[:, :, which], rtol=1e-13, equal_nan=True)
+
+
+def test_rows_one_by_one_are_rows_together():
+    packed, own = bands_of().packed(), piece_of(np.random.default_rng(7), 50)
+    together, one = np.empty((50, 2)), np.empty((1, 2))
+    band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
+    for k in range(50):
+        band_rows(own.rows[k : k + 1], own.vy[k : k + 1], own.variance[k : k + 1], packed.columns, packed.numbers, one)
+        assert np.array_equal(one[0], together[k])
+
+
+def test_band_is_finite_where_an_estimate_is_and_nowhere_else():
+    bands, own = bands_of(), piece_of(np.random.default_rng(8), 20)
+    rows, vy = own.rows.copy(), own.vy.copy()
+    rows[:10] = np.nan
+    vy[15] = np.nan
+    half = bands.half_widths(rows, vy, own.variance)
+    assert np.isfinite(half).all(axis=(1, 2)).tolist() == [k != 15 for k in range(20)]
+    assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
+
+
+def test_widening_is_the_excess_over_the_training_s_largest():
+    bands = bands_of()
+    flat = replace(bands, vy=replace(bands.vy, weights={"one": 1.0}))
+    rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
+    rows[1, 2] = 1.7 * bands.largest["ay"]
+    inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0, 2]
+    assert outside / inside == pytest.approx(1.7)
+    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0, 2] == pytest.approx(ELSEWHERE * inside)
+
+
+def test_what_was_not_measured_counts_as_the_training_s_largest():
+    bands = bands_of()
+    rows = np.tile([0.0, 25.0, bands.largest["ay"], 0.0, 0.0], (2, 1))
+    rows[1, 2] = np.nan
+    half = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))
+    assert half[0] == pytest.approx(half[1])
+
+
+def test_blocks_are_ranges_where_there_are_ten_and_turns_elsewhere():
+    yaw_rate = 0.3 * np.sin(2.0 * math.pi * np.arange(400) / 100.0)  # 20 s at 20 Hz, a turn each 2.5 s
+    labels, kind = block_labels([yaw_rate] * 10, [400] * 10, 20.0)
+    assert kind == "range"
+    assert [own[0] for own in labels] == list(range(10))
+    labels, kind = block_labels([yaw_rate, None], [400, 50], 20.0)
+    assert kind == "turn"
+    assert len(np.unique(labels[0])) == 8  # turns start at 0.13, 2.63 … s; that at 0.13 s comes too soon after the range's start
+    assert np.unique(labels[1]).tolist() == [8]
+
+
+def test_turns_shorter_than_two_seconds_are_joined():
+    yaw_rate = np.zeros(200)
+    yaw_rate[[50, 60, 70, 100, 190]] = 0.1
+    labels = turns_of(yaw_rate, 20.0)
+    assert np.flatnonzero(np.diff(labels)).tolist() == [49, 99]
+
+
+def test_bands_say_what_they_were_calibrated_on():
+    bands = bands_of()
+    assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (("my car",), ("mine",), ("two (all)",))
+    assert bands.blocks == "turn"
+    assert bands.n_blocks == 32  # 200 s, a turn each 2π s
+    assert 1.0 < bands.vy.effective_blocks <= bands.n_blocks
+    assert bands.seconds == 200.0
+
+
+def test_calibration_without_a_reference_is_refused():
+    rng = np.random.default_rng(9)
+    blind = replace(piece_of(rng, 100), error_vy=np.full(100, np.nan))
+    with pytest.raises(DataError, match="no sample of the validation ranges"):
+        calibrated([piece_of(rng, 100)], [blind], ORIGIN)
+
+
+def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
+    rng, n = np.random.default_rng(10), 100
+    own = piece_of(rng, n)
+    measured = Recording("lap", "my car", 20.0, 0.0, dict(zip(CHANNELS, own.rows.T, strict=True)))
+    estimate = Estimate("lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])})
+    ahead = replace(bands_of(), horizon_steps=1)
+    found = with_bands(estimate, measured, ahead)
+    expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])[:, :, 2]
+    np.testing.assert_allclose(np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13)
+    rows, _, variance = band_inputs(estimate, measured, CHANNELS, 0)
+    assert np.array_equal(rows, own.rows)
+    assert np.isnan(variance).all()
+
+
+def test_trust_is_read_back_as_it_was_written(tmp_path):
+    trust = Trust(About("luenberger", "luenberger"), bands_of())
+    write_trust(trust, tmp_path)
+    assert read_trust(tmp_path) == trust
+    write_trust(Trust(About("zero", note="no reference")), tmp_path)
+    assert read_trust(tmp_path).bands is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("format: 1", "format: 2", "newer vehest"),
+        ("floor: ", "floor: -", "floor must be positive"),
+        ("n_blocks: 32", "n_blocks: many", "whole number"),
+        ("n_blocks: 32", "n_bricks: 32", "n_blocks is missing"),
+    ],
+)
+def test_a_damaged_record_is_refused(tmp_path, old, new, message):
+    write_trust(Trust(About("luenberger"), bands_of()), tmp_path)
+    file = tmp_path / TRUST
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(DataError, match=message):
+        read_trust(tmp_path)
