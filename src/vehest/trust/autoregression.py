@@ -1,0 +1,157 @@
+"""Vector autoregression: what the next sample of several channels is expected to be, and by how much it differs.
+
+y_k = c + A₁ y_{k-1} + … + A_p y_{k-p} + ε_k,  ε ~ N(0, S)      (Lütkepohl, New Introduction to Multiple Time Series Analysis, 2005, Eq. 2.1.1)
+
+Fitted by least squares, once more without the rows that hold outliers; its order by BIC (Section 4.3.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+
+OUTLIER = 8.0  # robust standard deviations
+LEAST_DEVIATION = 1e-7  # of a channel's innovation, in its standard deviations: keeps S regular where a simulation has no noise
+LEVELS = (0.2, 5.0)  # between which the noise may change with the speed
+ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
+
+
+@dataclass(frozen=True, eq=False)
+class Autoregression:
+    """A fitted model.
+
+    Args:
+        constant: c, (C,).
+        coefficients: A₁ to A_p, (p, C, C).
+        covariance: S, (C, C).
+    """
+
+    constant: FloatArray
+    coefficients: FloatArray
+    covariance: FloatArray
+
+    @property
+    def order(self) -> int:
+        """p."""
+        return len(self.coefficients)
+
+    def innovations(self, samples: FloatArray) -> FloatArray:
+        """y_k less its prediction from the p samples before, (T, C); NaN for the first p and where a sample is not finite."""
+        found = np.full(np.shape(samples), np.nan)
+        if len(samples) > self.order:
+            found[self.order :] = samples[self.order :] - self.constant
+            for lag, coefficient in enumerate(self.coefficients, start=1):
+                found[self.order :] -= samples[self.order - lag : len(samples) - lag] @ coefficient.T
+        return found
+
+    def filtered(self, signature: FloatArray) -> FloatArray:
+        """How a signature that is added to the samples shows in the innovations, (T, C): the same filter without the constant.
+
+        Args:
+            signature: faulty less healthy samples, (T, C); zero before its first row.
+        """
+        found = np.array(signature, dtype=np.float64)
+        for lag, coefficient in enumerate(self.coefficients, start=1):
+            found[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T
+        return found
+
+
+def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
+    """Fit orders 1 to ``max_order`` to the same rows and keep the one with the least BIC.
+
+    Args:
+        pieces: uninterrupted stretches, (T, C) each; rows that hold NaN are left out, with those that they are needed for.
+        max_order: highest p.
+
+    Raises:
+        DataError: there are too few samples.
+    """
+    n_channels = pieces[0].shape[1]
+    regressors, targets = _rows(pieces, max_order)
+    if len(targets) < ROWS_A_NUMBER * (1 + max_order * n_channels):
+        raise DataError(
+            f"{len(targets)} samples without gaps are too few for an autoregression of order {max_order} in {n_channels} channels"
+        )
+    centre, spread = targets.mean(0), np.maximum(targets.std(0), 1e-12)
+    regressors, targets = (regressors - np.tile(centre, max_order)) / np.tile(spread, max_order), (targets - centre) / spread
+    kept = np.ones(len(targets), dtype=bool)
+    for _ in range(2):
+        left = _least_squares(regressors[kept], targets[kept], max_order * n_channels)
+        residual = targets - left[0] - regressors @ left[1:]
+        robust = 1.4826 * np.median(np.abs(residual), axis=0) + LEAST_DEVIATION
+        robust = np.maximum(robust, 0.2 * np.sqrt(np.mean(np.square(np.clip(residual, *np.percentile(residual, [0.5, 99.5], axis=0))), 0)))
+        odd = (np.abs(residual) > OUTLIER * robust).any(1)
+        kept = ~odd if odd.mean() < 0.02 else kept
+    chosen, lowest = left, math.inf
+    for order in range(1, max_order + 1):
+        fitted = _least_squares(regressors[kept], targets[kept], order * n_channels)
+        residual = targets[kept] - fitted[0] - regressors[kept][:, : order * n_channels] @ fitted[1:]
+        covariance = residual.T @ residual / len(residual) + LEAST_DEVIATION**2 * np.eye(n_channels)
+        criterion = len(residual) * float(np.linalg.slogdet(covariance)[1]) + fitted.size * math.log(len(residual))
+        if criterion < lowest:
+            lowest, chosen, best = criterion, fitted, covariance
+    coefficients = chosen[1:].reshape(-1, n_channels, n_channels).transpose(0, 2, 1) * spread[:, None] / spread
+    constant = centre + spread * chosen[0] - coefficients.sum(0) @ centre
+    return Autoregression(constant, coefficients, best * np.outer(spread, spread))
+
+
+def _rows(pieces: Sequence[FloatArray], order: int) -> tuple[FloatArray, FloatArray]:
+    """Regressors (N, p·C), the latest sample first, and targets (N, C) of complete rows."""
+    regressors, targets = [], []
+    for piece in pieces:
+        if len(piece) > order:
+            regressors.append(np.concatenate([piece[order - lag : len(piece) - lag] for lag in range(1, order + 1)], axis=1))
+            targets.append(piece[order:])
+    if not targets:
+        return np.empty((0, order * pieces[0].shape[1])), np.empty((0, pieces[0].shape[1]))
+    before, after = np.concatenate(regressors), np.concatenate(targets)
+    complete = np.isfinite(before).all(1) & np.isfinite(after).all(1)
+    return before[complete], after[complete]
+
+
+def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) -> FloatArray:
+    """Constant and coefficients of the first ``columns`` regressors, (1 + columns, C)."""
+    design = np.concatenate([np.ones((len(regressors), 1)), regressors[:, :columns]], axis=1)
+    gram = design.T @ design
+    gram[np.diag_indices_from(gram)] += 1e-10 * len(design)  # where one channel is another's multiple
+    return np.linalg.solve(gram, design.T @ targets)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """How large innovations are at a speed, in their standard deviations over all of training.
+
+    Args:
+        speeds: (L,), rising.
+        factors: (L, C); between the speeds by straight lines, constant outside.
+    """
+
+    speeds: FloatArray
+    factors: FloatArray
+
+    def at(self, speed: FloatArray) -> FloatArray:
+        """Factors at |speed|, (T, C)."""
+        return np.stack([np.interp(np.abs(speed), self.speeds, column) for column in self.factors.T], axis=1)
+
+
+def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int) -> NoiseLevels:
+    """Root mean squares, outliers cut off, in as many bins of speed with equal numbers of samples.
+
+    Args:
+        innovations: (T, C); rows with NaN do not count.
+        covariance: of the innovations, (C, C).
+        speed: at the same samples, (T,).
+        n_levels: number of bins.
+    """
+    known = np.isfinite(innovations).all(1) & np.isfinite(speed)
+    own, speed = innovations[known] / np.sqrt(np.diag(covariance)), np.abs(speed[known])
+    bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)
+    speeds = np.array([float(np.median(speed[rows])) for rows in bins])
+    factors = np.array([np.sqrt(np.mean(np.square(np.clip(own[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0)) for rows in bins])
+    return NoiseLevels(speeds, np.clip(factors, *LEVELS))

@@ -1,0 +1,190 @@
+"""How the measured channels of a car go together: relations with coefficients learnt from drives, without any reference.
+
+With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r:
+
+    lateral         ay = k u r + c                              what is left is the change of v, which returns to zero, and bank
+    steering        δ = c₁ r/u + c₂ u r + c₃ (u r)³ + c         wheelbase, understeer gradient, tyres that give way
+                    δ = c₁ ay/u² + c₂ ay + c₃ ay³ + c           the same without the yaw rate
+    longitudinal    ax = k du/dt + c₁ r² + c₂ u² + c            drag; v r goes with r² as long as v goes with r
+    wheels, motor   ω = u/R + c r                               radius and half the track
+
+Coefficients are those of least squares on signals that are low-passed alike, reweighted by Huber's function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import signal
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+
+SPEEDS = ("vx", "motor_speed", "wheel_speed_rl", "wheel_speed_rr", "wheel_speed_fl", "wheel_speed_fr")
+"""Channels that serve as the speed u, the first that is there."""
+
+FEATURES = ("1", "r", "u", "u r", "(u r)³/100", "r/u", "ay", "ay/u²", "ay³/100", "r²", "u²", "ax")
+RATE = "du/dt"
+
+LOW_PASS_SECONDS = 0.5
+HUBER = 1.5  # robust standard deviations
+LEAST_SPEED_SHARE = 0.1  # of the median speed, below which angles say little
+LEAST_ROWS = 50
+
+
+@dataclass(frozen=True)
+class Relation:
+    """What one channel is by others.
+
+    Args:
+        target: channel that is explained.
+        partner: channel that it is held against, for messages.
+        terms: feature, or `RATE`, -> coefficient; the target's units over the feature's.
+        instant: whether it holds for each sample and not only on average.
+    """
+
+    target: str
+    partner: str
+    terms: dict[str, float] = field(default_factory=dict)
+    instant: bool = False
+
+
+def speed_channel(channels: Sequence[str]) -> str | None:
+    """The channel that serves as speed."""
+    return next((name for name in SPEEDS if name in channels), None)
+
+
+def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, ...], bool]]:
+    """Target, partner, features and whether it holds at each instant, of every relation that these channels allow."""
+    speed, has = speed_channel(channels), set(channels)
+    found: list[tuple[str, str, tuple[str, ...], bool]] = []
+    if speed is None:
+        return found
+    if {"ay", "yaw_rate"} <= has:
+        found.append(("ay", "yaw_rate", ("u r", "1"), True))
+    for angle in ("steer", "handwheel"):
+        if angle in has and "yaw_rate" in has:
+            found.append((angle, "yaw_rate", ("r/u", "u r", "(u r)³/100", "1"), True))
+        if angle in has and "ay" in has:
+            found.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
+    if "ax" in has:
+        found.append(("ax", speed, (RATE, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False))
+    for wheel in channels:
+        if wheel.startswith(("wheel_speed", "motor_speed")) and wheel != speed:
+            found.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
+    return found
+
+
+def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[str, FloatArray]:
+    """Feature -> (T,), of channels as they are measured; those that need a channel that is not there are of zeros."""
+    some = next(iter(samples.values()))
+    speed = speed_channel(list(samples))
+    r, ay, ax = (samples.get(name, np.zeros_like(some)) for name in ("yaw_rate", "ay", "ax"))
+    u = samples[speed] if speed else np.zeros_like(some)
+    w = np.maximum(np.abs(u), least_speed)
+    values = (np.ones_like(some), r, u, u * r, 0.01 * (u * r) ** 3, r / w, ay, ay / w**2, 0.01 * ay**3, r * r, u * u, ax)
+    return dict(zip(FEATURES, values, strict=True))
+
+
+def without_spikes(samples: FloatArray) -> FloatArray:
+    """Samples with NaN where one stands apart from both neighbours by far more than any usual change, as recordings' own glitches do.
+
+    By the second difference, against ten times its 99.9 % quantile.
+    """
+    if len(samples) < LEAST_ROWS:
+        return samples
+    apart = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
+    known = apart[np.isfinite(apart)]
+    if not len(known):
+        return samples
+    alone = apart > 10.0 * max(float(np.quantile(known, 0.999)), 1e-12)
+    back = np.abs(samples[2:] - samples[:-2]) < 0.5 * apart
+    clean = np.array(samples)
+    clean[1:-1][alone & back] = np.nan
+    return clean
+
+
+def without_glitches(recording: Recording, channels: Sequence[str]) -> Recording:
+    """These channels of a drive, NaN where a single sample is a glitch."""
+    own = recording.select(channels)
+    clean = {name: without_spikes(samples) for name, samples in own.channels.items()}
+    return replace(own, channels=clean, gappy=frozenset(name for name in channels if np.isnan(clean[name]).any()))
+
+
+def least_speed_of(recordings: Sequence[Recording], channels: Sequence[str]) -> float:
+    """Speed below which angles say little: a share of the median one [unit of the speed channel]."""
+    speed = speed_channel(channels)
+    if speed is None:
+        return 1.0
+    return max(LEAST_SPEED_SHARE * float(np.nanmedian(np.abs(np.concatenate([recording[speed] for recording in recordings])))), 1e-6)
+
+
+def residuals_of(
+    samples: Mapping[str, FloatArray], channels: Sequence[str], relations: Sequence[Relation], least_speed: float
+) -> FloatArray:
+    """y = x - W φ(x): channels less what relations that hold at each instant explain of them, (T, C)."""
+    features = features_of(samples, least_speed)
+    left = {name: np.array(samples[name], dtype=np.float64) for name in channels}
+    for relation in relations:
+        if relation.instant:
+            left[relation.target] -= sum(value * features[feature] for feature, value in relation.terms.items())
+    return np.stack([left[name] for name in channels], axis=1)
+
+
+def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float) -> list[Relation]:
+    """Coefficients of every relation, from drives at one rate.
+
+    Args:
+        recordings: with the channels; samples that are NaN are left out.
+        channels: that are measured.
+        rate_hz: [Hz].
+        least_speed: below which samples do not count [unit of the speed channel].
+    """
+    forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
+    speed = speed_channel(channels)
+    parts = []
+    for recording in recordings:
+        own = {name: _held(recording[name]) for name in channels}
+        known = np.isfinite(recording.stack(channels)).all(1)
+        columns = {**features_of(own, least_speed), **{f"channel {name}": own[name] for name in channels}}
+        if speed:
+            known &= np.abs(own[speed]) >= least_speed
+            columns[RATE] = np.concatenate([[0.0], np.diff(own[speed])]) * rate_hz
+        smooth = {name: _smoothed(values, forget) for name, values in columns.items()}
+        parts.append({name: values[known] for name, values in smooth.items()})
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    found = []
+    for target, partner, features, instant in relations_among(channels):
+        design, wanted = np.stack([joined[name] for name in features], axis=1), joined[f"channel {target}"]
+        if len(wanted) >= LEAST_ROWS:
+            found.append(Relation(target, partner, dict(zip(features, _robust(design, wanted).tolist(), strict=True)), instant))
+    return found
+
+
+def _held(samples: FloatArray) -> FloatArray:
+    """The last measured value where there is none, the first one before it."""
+    known = np.flatnonzero(np.isfinite(samples))
+    if not len(known):
+        return np.zeros_like(samples)
+    place = np.maximum(np.searchsorted(known, np.arange(len(samples)), side="right") - 1, 0)
+    return samples[known[place]]
+
+
+def _smoothed(values: FloatArray, forget: float) -> FloatArray:
+    return signal.lfilter([forget], [1.0, forget - 1.0], values, zi=[(1.0 - forget) * values[0]])[0]
+
+
+def _robust(design: FloatArray, target: FloatArray) -> FloatArray:
+    """Least squares, reweighted ten times by Huber's function of the residual over its median size."""
+    size = np.maximum(np.sqrt(np.mean(np.square(design), axis=0)), 1e-300)
+    scaled, weight = design / size, np.ones(len(target))
+    coefficients = np.zeros(design.shape[1])
+    for _ in range(10):
+        gram = (scaled * weight[:, None]).T @ scaled + 1e-9 * len(target) * np.eye(design.shape[1])
+        coefficients = np.linalg.solve(gram, (scaled * weight[:, None]).T @ target)
+        residual = np.abs(target - scaled @ coefficients)
+        bound = HUBER * max(1.4826 * float(np.median(residual)), 1e-12)
+        weight = np.minimum(1.0, bound / np.maximum(residual, 1e-300))
+    return coefficients / size
