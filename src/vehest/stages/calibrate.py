@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from vehest.data.errors import DataError, VehestError
+from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
@@ -22,6 +23,8 @@ from vehest.stages.artefacts import Artefact, StagePlan, read_artefact
 from vehest.stages.code_version import code_version
 from vehest.stages.train import file_digest, recording_file
 from vehest.trust.bands import Bands, Origin, Piece, band_inputs, calibrated
+from vehest.trust.guard import learn_limits
+from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 STAGE = "calibrate"
@@ -80,18 +83,32 @@ def code_of_calibration(module: str) -> str:
     Args:
         module: that of the estimator.
     """
-    return code_version([module, "vehest.trust.bands", "vehest.trust.record", "vehest.estimators.model_files"], own=[__name__])
+    return code_version(
+        [module, "vehest.trust.bands", "vehest.trust.guard", "vehest.trust.health", "vehest.trust.record", "vehest.estimators.model_files"],
+        own=[__name__],
+    )
 
 
 def write_calibration(job: CalibrateJob, folder: Path) -> None:
     """Calibrate a model; write trust.yaml into ``folder``. What keeps a model from bands is noted in there."""
-    description = read_description(job.model.folder)
-    bands, note = None, ""
+    description, estimator = read_description(job.model.folder), load_model(job.model.folder)
+    train, validation = (_measured(estimator, job.data, spans) for spans in (job.split.train, job.split.validation))
+    bands, guard, health, notes = None, None, None, []
     try:
-        bands = _bands(load_model(job.model.folder), job)
+        bands = _bands(estimator, job)
     except DataError as error:  # as of a reference that is not there, which is no reason to go without an evaluation
-        note = str(error)
-    write_trust(Trust(About(description.estimator, description.variant, note), bands), folder)
+        notes.append(str(error))
+    try:
+        guard = learn_limits(train, estimator.channels, estimator.settings.rate_hz)
+        health = learn_health(
+            [recording.without_references() for recording in train],
+            [recording.without_references() for recording in validation],
+            estimator.channels,
+            estimator.settings.rate_hz,
+        )
+    except DataError as error:
+        notes.append(str(error))
+    write_trust(Trust(About(description.estimator, description.variant, "; ".join(notes)), bands, guard, health), folder)
 
 
 def calibration_figures(folder: Path) -> dict[str, float]:
@@ -139,6 +156,11 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
         if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
             found.append(artefact)
     return max(found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None)
+
+
+def _measured(estimator: Estimator, data: Mapping[str, Artefact], spans: Sequence[Span]) -> list[Recording]:
+    """The ranges, references included."""
+    return [read_recording(recording_file(data[span.dataset], span)).cut(span.start, span.stop) for span in spans]
 
 
 def _bands(estimator: Estimator, job: CalibrateJob) -> Bands:

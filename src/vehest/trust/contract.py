@@ -5,7 +5,9 @@ What is received goes through `vehest.trust.guard`, what is estimated through `v
 1. Values that are not finite, beyond physics, jumping or standing still count as not measured, and so do samples that are missing.
 2. Gaps up to 0.5 s are bridged; after longer ones the estimator starts anew.
 3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
-4. The estimate stays within what the last believed speed allows. One that does not for 0.3 s, is not finite or raises starts anew, and
+4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
+   the fault is over (`vehest.trust.verdict`).
+5. The estimate stays within what the last believed speed allows. One that does not for 0.3 s, is not finite or raises starts anew, and
    takes states that adapt, such as tyres, back to what they were fitted to.
 
 `GuardedStepper` holds it online, `estimate_guarded` for a recording: both by the same compiled recursions, so that they agree.
@@ -28,8 +30,11 @@ from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, Stepper
 from vehest.trust.front_end import FrontEnd
-from vehest.trust.guard import BRIDGED_SECONDS, RESTART, WAIT, Cleaned, Guard, GuardLimits, usual_limits
-from vehest.trust.watch import Watch
+from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
+from vehest.trust.monitor import Monitor
+from vehest.trust.record import Trust
+from vehest.trust.verdict import Verdict
+from vehest.trust.watch import Watch, Watched
 
 FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
 """What an estimator may end in on samples that mean nothing to it; it then starts anew."""
@@ -54,17 +59,20 @@ class Guarded:
     marks: NDArray[np.int8]
 
 
-def limits_for(estimator: Estimator, limits: GuardLimits | None) -> GuardLimits:
+def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
     """The limits that were learnt with an estimator, or those of any car."""
-    return limits or usual_limits(estimator.channels, estimator.settings.rate_hz)
+    own = trust.guard if trust is not None else None
+    return own or usual_limits(estimator.channels, estimator.settings.rate_hz)
 
 
 def estimate_guarded(
     estimator: Estimator,
     samples: Mapping[str, FloatArray],
     recording: Recording,
-    limits: GuardLimits | None = None,
+    trust: Trust | None = None,
     initial_state: Mapping[str, float] | None = None,
+    *,
+    elsewhere: bool = False,
 ) -> Guarded:
     """Estimate a recording under the contract.
 
@@ -72,8 +80,12 @@ def estimate_guarded(
         estimator: fitted.
         samples: channels that it reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
         recording: whose clock, name and vehicle it is; its own samples do not count.
-        limits: learnt with the estimator; by default those of any car.
+        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
         initial_state: that a protocol hands over at the first sample.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on.
+
+    Returns:
+        Its estimate has ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
 
     Raises:
         DataError: a channel is missing.
@@ -82,12 +94,14 @@ def estimate_guarded(
     if missing:
         raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
     rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
-    limits = limits_for(estimator, limits)
+    limits = limits_for(estimator, trust)
     rate = estimator.settings.rate_hz
     cleaned = Guard(estimator.channels, estimator.skippable, limits, rate)(rows)
+    monitor = Monitor(estimator, trust, elsewhere=elsewhere)
+    verdict = monitor.before(rows, cleaned)
     run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
     run.go()
-    return run.outcome()
+    return run.outcome(monitor, verdict)
 
 
 class _Run:
@@ -113,8 +127,8 @@ class _Run:
                 end = at + (int(np.argmin(waits)) if not waits.all() else len(waits))
                 at = self._watched(at, end, np.full(end - at, np.nan))[0]
                 continue
-            end = at + int(np.argmax(waits)) if waits.any() else steps
-            at = self._piece(at, end)
+            ends = self.cleaned.flow[at + 1 :] != USE
+            at = self._piece(at, at + 1 + int(np.argmax(ends)) if ends.any() else steps)
 
     def _piece(self, start: int, end: int) -> int:
         """Estimate from a start on, up to ``end`` or until the estimator is lost; returns the row to go on with.
@@ -181,19 +195,22 @@ class _Run:
             self.variance[k] = found.get("vy_variance", math.nan)
         return raw
 
-    def outcome(self) -> Guarded:
-        """The estimate on the recording's clock: what was said after row k holds ``horizon`` samples later."""
-        vy, variance = (np.concatenate([np.full(self.horizon, np.nan), values])[: len(values)] for values in (self.out, self.variance))
+    def outcome(self, monitor: Monitor, verdict: Verdict) -> Guarded:
+        """The estimate on the recording's clock: what was said after row k holds ``horizon`` samples later, health at once."""
         vx = np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])
         vx = np.where(np.isnan(vx), held(vx), vx)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx)}
+        bands = monitor.after(verdict, Watched(self.out, self.marks, len(self.out), lost=False), self.cleaned, vx, self.variance)
+
+        def later(values: FloatArray) -> FloatArray:
+            return np.concatenate([np.full(self.horizon, np.nan), values])[: len(values)]
+
+        vy = later(self.out)
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), "health": verdict.status, "health_reason": verdict.reason}
+        if monitor.has_bands:
+            channels |= {"band_vy": later(bands[:, 0]), "band_sideslip": later(bands[:, 1])}
         mode: Mode = "causal" if self.estimator.causal else "offline"
-        known = np.isfinite(variance).any()
-        covariance = np.where(np.isnan(variance), np.inf, variance)[:, None, None] if known else None
         r = self.recording
-        estimate = Estimate(
-            r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode, covariance, ("vy",) if known else ()
-        )  # type: ignore[arg-type]
+        estimate = Estimate(r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode)
         return Guarded(estimate, self.cleaned, self.marks)
 
 
@@ -220,27 +237,33 @@ class GuardedStepper(Stepper):
 
     Args:
         estimator: fitted, causal.
-        limits: learnt with the estimator; by default those of any car.
+        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
         bus_rate_hz: rate at which samples come, if it is above the estimator's: they then go through a causal anti-aliasing filter first.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on.
 
     Raises:
         ConfigurationError: the estimator is not causal, or the bus is slower than it.
+
+    Attributes:
+        last: what the last step returned.
+        marks: of `vehest.trust.watch` for it.
     """
 
-    def __init__(self, estimator: Estimator, limits: GuardLimits | None = None, bus_rate_hz: float | None = None) -> None:
+    def __init__(
+        self, estimator: Estimator, trust: Trust | None = None, bus_rate_hz: float | None = None, *, elsewhere: bool = False
+    ) -> None:
         self.estimator = estimator
-        self._stepper = estimator.online()
+        self._stepper, self._fresh = estimator.online(), True
         rate = estimator.settings.rate_hz
-        self._limits = limits_for(estimator, limits)
-        self._front = FrontEnd(estimator.channels, estimator.skippable, self._limits, bus_rate_hz, rate) if bus_rate_hz else None
+        limits = limits_for(estimator, trust)
+        self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz else None
         self._rate = bus_rate_hz or rate
-        self._guard = Guard(estimator.channels, estimator.skippable, self._limits, rate)
-        self._watch = Watch(self._limits, estimator.warm_up_steps, rate)
-        self._used = 0
+        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate)
+        self._watch = Watch(limits, estimator.warm_up_steps, rate)
+        self._monitor = Monitor(estimator, trust, elsewhere=elsewhere)
         self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)
-        self._raw = np.empty(1)
+        self._raw, self._vx, self._variance = np.empty(1), np.full(1, np.nan), np.full(1, np.nan)
         self._places = [estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION]
-        self._fresh = True
         self._clock = _Clock(self._rate)
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
@@ -254,11 +277,12 @@ class GuardedStepper(Stepper):
         """Take what was received at one instant.
 
         Args:
-            sample: channel -> value [SI]; a channel missing, None or no number counts as not measured; None: all.
+            sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
             time: of the sample [s], where it is known: samples that are repeated are passed over, those that are missing bridged.
 
         Returns:
-            ``vy`` [m/s] and ``sideslip`` [rad]; NaN only before the first estimate.
+            ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
+            ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
         if time is not None:
             skipped = self._clock.skipped(time)
@@ -269,48 +293,51 @@ class GuardedStepper(Stepper):
         return self._received(sample)
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
-        row = self._row
+        row: FloatArray | None = self._row
         for at, name in enumerate(self.estimator.channels):
-            row[0, at] = _number(sample.get(name)) if sample is not None else math.nan
+            self._row[0, at] = _number(sample.get(name)) if sample is not None else math.nan
         if self._front is not None:
-            due = self._front(row)
-            if due is None:
-                return self.last
-            row = due
-        return self._stepped(row)
+            row = self._front(self._row)
+        if row is not None:
+            self.last = self._stepped(row)
+        return self.last
 
     def _stepped(self, row: FloatArray) -> dict[str, float]:
         cleaned = self._guard(row)
-        flow = cleaned.flow[0]
-        raw, vx, failed = math.nan, math.nan, False
-        if flow != WAIT:
-            if flow == RESTART and not self._fresh:
-                self._stepper = self.estimator.online()
-            self._fresh = False
-            try:
-                found = self._stepper.step(dict(zip(self.estimator.channels, cleaned.rows[0].tolist(), strict=True)))
-                raw, vx = found["vy"], found.get("vx", math.nan)
-            except FAILURES:
-                failed = True
-        motion = self._motion
+        verdict = self._monitor.before(row, cleaned)
+        self._raw[0], vx, self._variance[0], failed = self._estimated(cleaned)
+        motion, flow = self._motion, cleaned.flow[0]
         for column, at in enumerate(self._places):
             known = at >= 0 and (flow != WAIT or cleaned.measured[0, at])
             motion[0, column] = cleaned.rows[0, at] if known else math.nan
         if math.isnan(motion[0, 0]):
             motion[0, 0] = vx
-        self._raw[0] = raw
         watched = self._watch(self._raw, motion, cleaned.flow)
         if watched.lost or failed:
             self._stepper, self._fresh = self.estimator.online(), True
-        self.marks = int(watched.marks[0])
-        vy = float(watched.vy[0])
-        speed = motion[0, 0]
-        if not math.isnan(speed):
-            self._speed = float(speed)
-        self.last = {"vy": vy, "sideslip": math.atan2(vy, self._speed) if not math.isnan(self._speed) else math.nan}
-        return self.last
+        self.marks, vy = int(watched.marks[0]), float(watched.vy[0])
+        if not math.isnan(motion[0, 0]):
+            self._vx[0] = motion[0, 0]
+        bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
+        said = {"vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
+        if self._monitor.has_bands:
+            said["band_vy"], said["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
+        said["health"], said["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
+        return said
 
-    _speed = math.nan
+    def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float, bool]:
+        """What the estimator says of a row: v, its own vx, the variance of v's error, and whether it failed."""
+        flow = cleaned.flow[0]
+        if flow == WAIT:
+            return math.nan, math.nan, math.nan, False
+        if flow == RESTART and not self._fresh:
+            self._stepper = self.estimator.online()
+        self._fresh = False
+        try:
+            found = self._stepper.step(dict(zip(self.estimator.channels, cleaned.rows[0].tolist(), strict=True)))
+        except FAILURES:
+            return math.nan, math.nan, math.nan, True
+        return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan), False
 
 
 class _Clock:

@@ -12,6 +12,8 @@ from vehest.data.errors import DataError
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_yaml
 from vehest.trust.bands import Bands
+from vehest.trust.guard import GuardLimits
+from vehest.trust.health import HealthModel
 
 TRUST = "trust.yaml"
 FORMAT = 1
@@ -45,8 +47,8 @@ class Trust:
 
     about: About
     bands: Bands | None = None
-    guard: dict[str, Any] | None = None
-    health: dict[str, Any] | None = None
+    guard: GuardLimits | None = None
+    health: HealthModel | None = None
 
 
 @dataclass(frozen=True)

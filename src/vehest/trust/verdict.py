@@ -1,0 +1,129 @@
+"""What follows from health: which channels an estimator gets, when it starts anew, what is said of its estimate, how wide its band is.
+
+- A channel that health accuses of a fault counts as not measured where the method can do without it, so that nothing adapts to it.
+- Once a fault is over, an estimator that remembers starts anew: states that adapted meanwhile, such as tyres, go back to what they were
+  fitted to.
+- The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
+  least as far as sideslip did in training. These factors were set before their effect was looked at.
+
+The recursions are compiled and take one row or all of a recording, so that online and batch agree to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.estimators.kernels.compiling import entry
+from vehest.trust import health_kernel as kernel
+from vehest.trust.guard import RESTART, USE, WAIT
+from vehest.trust.health import DEGRADED, INVALID, NUMBERS, VALID
+from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
+
+NO_ESTIMATE, BEYOND_SPEED = 30, 31
+"""Further kinds of reasons: there is no estimate; it was beyond what the speed allows."""
+
+WIDER = (1.0, 2.0, 4.0)
+"""Factor of the band of a valid, a degraded, an invalid estimate."""
+
+NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
+"""Kinds of reasons that accuse no sensor of anything that an estimator could do without."""
+
+
+class Verdict(NamedTuple):
+    """What is said of an estimate.
+
+    Args:
+        status: 0 valid, 1 degraded, 2 invalid, (T,).
+        reason: code of `vehest.trust.health.reason_in_words`, (T,); 0 where there is none.
+    """
+
+    status: FloatArray
+    reason: FloatArray
+
+
+def numbers_of(channels: tuple[str, ...]) -> NDArray[np.int64]:
+    """Numbers of channels in codes of reasons, (C,)."""
+    return np.array([NUMBERS[name] for name in channels], np.int64)
+
+
+@entry(nogil=True)
+def heed_rows(status, reason, numbers, skippable, remembers, rows, measured, flow, state):  # type: ignore[no-untyped-def]
+    """Take accused channels out of the rows, and start estimators that remember anew once a fault is over; in place.
+
+    Args:
+        status, reason: of each row, (T,).
+        numbers: of the channels, (C,).
+        skippable: which of them the estimator can do without, (C,).
+        remembers: whether the estimator has more memory than a window.
+        rows, measured, flow: as in `vehest.trust.guard.Cleaned`.
+        state: whether there was a fault since health was last valid, (1,).
+    """
+    for k in range(rows.shape[0]):
+        kind, channel = int(reason[k]) // 10000, int(reason[k]) % 10000 // 100
+        at_fault = status[k] == INVALID
+        for other in NO_FAULTS:
+            at_fault = at_fault and kind != other
+        if at_fault:
+            state[0] = 1.0
+            for c in range(rows.shape[1]):
+                if skippable[c] and numbers[c] == channel:
+                    rows[k, c], measured[k, c] = math.nan, False
+        elif status[k] == VALID and state[0] > 0.0:
+            state[0] = 0.0
+            if remembers and flow[k] == USE:
+                flow[k] = RESTART
+
+
+@entry(nogil=True)
+def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  # type: ignore[no-untyped-def]
+    """Add to health what guard and watch know; in place.
+
+    Args:
+        vy: what is passed on, (T,).
+        marks: of `vehest.trust.watch`, (T,).
+        flow, measured: of `vehest.trust.guard`, (T,) and (T, C).
+        needed: channels that the estimator cannot do without, (C,).
+        numbers: of the channels, (C,).
+        status, reason: of `vehest.trust.health`, (T,); changed.
+    """
+    for k in range(vy.shape[0]):
+        found, why = int(status[k]), int(reason[k])
+        for c in range(measured.shape[1]):
+            if needed[c] and not measured[k, c] and why == 0:
+                found, why = max(found, DEGRADED), kernel.MISSING * 10000 + numbers[c] * 100
+        if marks[k] & SPINNING and found == VALID:
+            found, why = DEGRADED, kernel.SPIN * 10000
+        if marks[k] & CLIPPED:
+            found, why = INVALID, BEYOND_SPEED * 10000 if why == 0 else why
+        if marks[k] & EXTRAPOLATED or flow[k] == WAIT or not math.isfinite(vy[k]):
+            found, why = INVALID, NO_ESTIMATE * 10000 if why == 0 else why
+        status[k], reason[k] = found, why
+
+
+@entry(nogil=True)
+def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
+    """Widen the band of estimates that are not valid; in place.
+
+    Args:
+        status: of each row, (T,).
+        marks: of `vehest.trust.watch`, (T,).
+        vy: what is passed on, (T,) [m/s].
+        vx: speed that it goes with, (T,) [m/s].
+        farthest: largest |v| of estimates in training [m/s].
+        bands: half widths of v [m/s] and β [rad], (T, 2).
+    """
+    for k in range(vy.shape[0]):
+        wider = WIDER[int(status[k])]
+        bands[k, 0] *= wider
+        bands[k, 1] = min(bands[k, 1] * wider, math.pi)
+        if marks[k] & EXTRAPOLATED and math.isfinite(vy[k]):
+            reach = abs(vy[k]) + farthest
+            speed = max(abs(vx[k]), 1.0)
+            bands[k, 0] = max(bands[k, 0], reach)
+            if math.isfinite(speed):
+                bands[k, 1] = max(bands[k, 1], min(math.atan(reach / speed), math.pi))
