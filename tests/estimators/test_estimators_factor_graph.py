@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.factor_graph import FactorGraph, FactorGraphSettings
 from vehest.estimators.registry import estimator_class
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel, kalman_filter, smooth
 from vehest.stages.config import compose_config
@@ -195,3 +197,25 @@ def test_gtsam_is_imported_only_to_work():
     known = "from vehest.estimators.registry import estimator_names; assert 'factor_graph' in estimator_names()"
     code = f"import sys; {known}; assert 'gtsam' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_with_a_long_window_its_gate_is_that_of_the_kalman_filter(gtsam):
+    estimator = factor_graph(window=3.0, gate=4.0, noise={"measured_ay": 0.5})
+    drive = drive_with_gaps(1.35)
+    for name, samples, size in (("ay", slice(75, 76), 1e6), ("yaw_rate", slice(80, 135), 3.0)):  # longer than it is patient
+        spoilt = drive[name].copy()
+        spoilt[samples] += size
+        drive = replace(drive, channels={**drive.channels, name: spoilt})
+    model, measurements, first = same_as_filter(estimator, drive)
+    filtered = kalman_filter(model, measurements, first, Gate.of(4.0, 100.0))
+    assert not filtered.measured[75, 0]
+    assert not filtered.measured[80:130, 1].any(), "shut for half a second"
+    assert filtered.measured[130, 1], "and open then"
+    found = estimator.estimate([drive])[0]
+    assert np.abs(found["vy"] - drive["vx"] * np.tan(filtered.filtered.mean[:, 0].numpy())).max() < 1e-6
+    assert np.abs(found["yaw_rate"] - filtered.filtered.mean[:, 1].numpy()).max() < 1e-7
+
+
+def test_a_gate_without_a_window_is_refused():
+    with pytest.raises(ConfigurationError, match=r"estimator\.gate needs estimator\.window"):
+        factor_graph(gate=5.0)

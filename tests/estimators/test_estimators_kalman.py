@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from single_track_drive import NOISE, linear_drive, with_gaps
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.kalman import KalmanFilter, KalmanSettings
 from vehest.estimators.registry import estimator_class
@@ -175,3 +178,80 @@ def test_a_long_recording_takes_well_under_a_second():
     started = time.perf_counter()
     estimator.estimate([long])
     assert time.perf_counter() - started < 1.0  # 0.04 s on the machine it was written on
+
+
+def with_planted_offsets(seed: int, ay: float, steer: float) -> tuple[Recording, FloatArray]:
+    """A drive whose accelerometer and steering angle are off by constants that are drawn."""
+    drive, states = linear_drive(4.0, seed=seed)
+    generator = np.random.default_rng(1000 + seed)
+    shifted = {"ay": drive["ay"] + ay * generator.standard_normal(), "steer": drive["steer"] + steer * generator.standard_normal()}
+    return replace(drive.without_references(), channels={**drive.without_references().channels, **shifted}), states
+
+
+def augmented(drive: Recording, ay: float, steer: float, seconds: float) -> tuple[FloatArray, FloatArray]:
+    """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
+    A, B, C, D = kalman(**GIVEN).sampled_model(drive["vx"])
+    kept = np.exp(-0.01 / seconds)
+    mean, covariance = np.zeros(4), np.diag([1e4, 1e4, ay**2, steer**2])
+    R = np.diag([NOISE["ay"] ** 2, NOISE["yaw_rate"] ** 2])
+    means, covariances = [], []
+    for k in range(len(drive)):
+        if k > 0:
+            F = np.block([[A[k - 1], np.zeros((2, 1)), -B[k - 1][:, None]], [np.zeros((2, 2)), kept * np.eye(2)]])
+            Q = np.zeros((4, 4))
+            Q[:2, :2] = NOISE["steer"] ** 2 * np.outer(B[k - 1], B[k - 1])
+            Q[2:, 2:] = (1.0 - kept**2) * np.diag([ay**2, steer**2])
+            mean = F @ mean
+            mean[:2] += B[k - 1] * drive["steer"][k - 1]
+            covariance = F @ covariance @ F.T + Q
+        H = np.array([[*C[k], 1.0, -D[k]], [0.0, 1.0, 0.0, 0.0]])
+        gain = covariance @ H.T @ np.linalg.inv(H @ covariance @ H.T + R)
+        mean = mean + gain @ (np.array([drive["ay"][k] - D[k] * drive["steer"][k], drive["yaw_rate"][k]]) - H @ mean)
+        left = np.eye(4) - gain @ H
+        covariance = left @ covariance @ left.T + gain @ R @ gain.T
+        means.append(mean)
+        covariances.append(covariance)
+    return np.array(means), np.array(covariances)
+
+
+OFFSETS = {"ay": 0.6, "steer": 0.01, "seconds": 100.0}
+
+
+def test_offsets_are_the_states_of_an_augmented_filter():
+    drive, _ = with_planted_offsets(3, 0.6, 0.01)
+    means, covariances = augmented(drive, **OFFSETS)
+    estimator = kalman(**GIVEN, offsets=OFFSETS)
+    samples = drive.stack(estimator.channels)
+    found = estimator.filter_samples(samples, estimator.levels, estimator.start(samples[0, 1])).filtered
+    assert found.mean == pytest.approx(means, abs=1e-8)
+    assert found.covariance == pytest.approx(covariances, abs=1e-8)
+    assert estimator.estimate([drive])[0]["yaw_rate"] == pytest.approx(means[:, 1], abs=1e-8)
+
+
+@pytest.mark.parametrize(("offsets", "honest"), [(OFFSETS, True), ({}, False)])
+def test_with_offsets_errors_that_last_are_as_large_as_the_covariance_says(offsets, honest):
+    estimator = kalman(**GIVEN, offsets=offsets)
+    drives = 300
+    nees = []
+    for seed in range(drives):
+        drive, states = with_planted_offsets(seed, 0.6, 0.01)
+        samples = drive.stack(estimator.channels)
+        found = estimator.filter_samples(samples, estimator.levels, estimator.start(samples[0, 1])).filtered
+        error = found.mean[-1, :2] - states[-1]
+        nees.append(error @ np.linalg.solve(found.covariance[-1, :2, :2], error))
+    bounds = chi2.ppf([0.0005, 0.9995], 2 * drives) / drives
+    assert bool(bounds[0] < np.mean(nees) < bounds[1]) is honest
+
+
+def test_online_is_batch_with_offsets_and_a_variant_is_called_so():
+    estimator = kalman(**GIVEN, offsets=OFFSETS, gate=5.0)
+    assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
+    drive, _ = with_planted_offsets(1, 0.6, 0.01)
+    stepper, batch = estimator.online(), estimator.estimate([drive])[0]
+    online = [stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))]
+    assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9
+
+
+def test_an_offset_of_nothing_is_refused():
+    with pytest.raises(ConfigurationError, match=r"estimator\.offsets\.ay must be positive"):
+        kalman(**GIVEN, offsets={"ay": 0.0})

@@ -415,8 +415,6 @@ class DugoffUkfStepper(Stepper):
         """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample; measurements that are NaN are skipped."""
         estimator = self._estimator
         row = checked_sample(sample, estimator.channels, estimator.skippable)
-        if np.isinf(row).any():
-            raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         measurements, inputs = samples_of(row[None])
         self._trusts = bool(estimator.trusts_forces(measurements[:, 0], self._trusts)[0])
         state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])

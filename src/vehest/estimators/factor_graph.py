@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -24,6 +24,7 @@ from vehest.estimators.filtering.single_track import (
     checked_sample,
     require_positive,
 )
+from vehest.filters.gating import Gate, in_words, refuses, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 
@@ -59,10 +60,13 @@ class FactorGraphSettings(SingleTrackSettings):
     Args:
         window: how far the graph behind a causal estimate reaches back [s]; none for one graph over the whole recording, offline.
         noise: standard deviations of the factors.
+        gate: standard deviations of an innovation beyond which a measurement gets no factor; none: all get one. Only with a window; see
+            `Gate`.
     """
 
     window: float | None = None
     noise: FactorNoise = FactorNoise()
+    gate: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,6 +74,9 @@ class FactorGraphSettings(SingleTrackSettings):
             raise ConfigurationError(
                 f"estimator.window must be null or at least one sampling interval, {1 / self.rate_hz:g} s, not {self.window} s"
             )
+        require_positive("estimator", {"gate": self.gate})
+        if self.gate is not None and self.window is None:
+            raise ConfigurationError("estimator.gate needs estimator.window: one graph over a whole recording has no sample to predict")
 
     @property
     def intervals(self) -> int:
@@ -104,13 +111,14 @@ class FactorGraph(SingleTrackEstimator):
 
     @property
     def variant(self) -> str:
-        """Batch, or how long the window is."""
-        return f"factor_graph_lag_{self.settings.window:g}s" if self.causal else "factor_graph_batch"
+        """Batch, or how long the window is and its gate."""
+        return f"factor_graph_lag_{self.settings.window:g}s{suffix(self.settings.gate)}" if self.causal else "factor_graph_batch"
 
     @property
     def full_title(self) -> str:
         """Title with how it is solved."""
-        return f"{self.title}, fixed lag of {self.settings.window:g} s" if self.causal else f"{self.title}, batch"
+        own = f"fixed lag of {self.settings.window:g} s{in_words(self.settings.gate)}" if self.causal else "batch"
+        return f"{self.title}, {own}"
 
     @property
     def n_parameters(self) -> int:
@@ -131,11 +139,11 @@ class FactorGraph(SingleTrackEstimator):
         factors = _Factors(self.settings.noise)
         if not self.causal:
             return self.wrapped_state(recording, _whole(factors, model, samples, first))
-        window = _Window(factors, self.settings.intervals, first)
+        window = _Window(factors, self.settings.intervals, first, Gate.of(self.settings.gate, self.settings.rate_hz))
         states = np.empty((len(samples), 2))
-        for k, sample in enumerate(samples):
+        for k in range(len(samples)):
             between = factors.between(k - 1, model, k - 1, samples[k - 1]) if k > 0 else []
-            states[k] = window.add(between, factors.at(k, model, k, sample))
+            states[k] = window.add(between, model, k, samples[k])
         return self.wrapped_state(recording, states)
 
     def online(self) -> FactorGraphStepper:
@@ -170,10 +178,11 @@ class FactorGraphStepper(Stepper):
         row = checked_sample(sample, estimator.channels, estimator.skippable)
         if self._window is None:
             first = estimator.first_state(row[1], estimator.settings.noise.first_state, None)
-            self._window = _Window(self._factors, estimator.settings.intervals, first)
+            gate = Gate.of(estimator.settings.gate, estimator.settings.rate_hz)
+            self._window = _Window(self._factors, estimator.settings.intervals, first, gate)
         model = estimator.sampled_model(row[1:2])
         between = self._factors.between(self._count - 1, self._last[0], 0, self._last[1]) if self._last is not None else []
-        sideslip, yaw_rate = self._window.add(between, self._factors.at(self._count, model, 0, row))
+        sideslip, yaw_rate = self._window.add(between, model, 0, row)
         self._last, self._count = (model, row), self._count + 1
         return {"vy": float(row[1] * math.tan(sideslip)), "yaw_rate": float(yaw_rate)}
 
@@ -229,11 +238,21 @@ class _Factors:
 
     def solve(self, factors: Sequence[Any], wanted: Sequence[int]) -> FloatArray:
         """The most likely states of these samples, (len(wanted), 2), given all factors."""
+        solution = self._graph(factors).optimize()
+        return np.array([[solution.at(key)[0] for key in self.keys(k)] for k in wanted])
+
+    def covariance(self, factors: Sequence[Any]) -> FloatArray:
+        """Of the last sample's state given all factors, (2, 2)."""
+        information, _ = self._graph(factors).hessian()  # rows in the order of the keys: β of all samples, then r
+        own = np.eye(len(information))[:, [len(information) // 2 - 1, len(information) - 1]]
+        marginal: FloatArray = own.T @ np.linalg.solve(information, own)
+        return marginal
+
+    def _graph(self, factors: Sequence[Any]) -> Any:
         graph = self.gtsam.GaussianFactorGraph()
         for factor in factors:
             graph.push_back(factor)
-        solution = graph.optimize()
-        return np.array([[solution.at(key)[0] for key in self.keys(k)] for k in wanted])
+        return graph
 
 
 def _whole(factors: _Factors, model: SampledModel, samples: FloatArray, first: Gaussian[FloatArray]) -> FloatArray:
@@ -246,31 +265,68 @@ def _whole(factors: _Factors, model: SampledModel, samples: FloatArray, first: G
     return factors.solve(made, range(len(samples)))
 
 
-class _Window:
-    """The factors of the newest samples, and the running estimate of where they begin."""
+class _Kept(NamedTuple):
+    """Number of a window's first sample, what is known before it, and factors of each sample: those that lead to it, and its own."""
 
-    def __init__(self, factors: _Factors, intervals: int, first: Gaussian[FloatArray]) -> None:
+    first: int
+    begin: Gaussian[FloatArray]
+    samples: list[tuple[list[Any], list[Any]]]
+
+
+class _Window:
+    """The factors of the newest samples, and the running estimate of where they begin; a sample that fails changes nothing."""
+
+    def __init__(self, factors: _Factors, intervals: int, first: Gaussian[FloatArray], gate: Gate | None) -> None:
         self._factors = factors
         self._intervals = intervals
-        self._begin = first
-        self._first = 0
+        self._gate = gate
+        self._kept = _Kept(0, first, [])
         self._second = first.mean
-        self._samples: deque[tuple[list[Any], list[Any]]] = deque()
+        self._refused = np.zeros(2, np.int64)
 
-    def add(self, between: list[Any], at: list[Any]) -> FloatArray:
-        """Take a sample: the factors from the one before to it, and those of its measurements. Returns its β and r."""
-        self._samples.append((between, at))
-        if len(self._samples) > self._intervals + 1:
-            self._samples.popleft()
-            self._first += 1
-            deviation = self._factors.noise.window_start
-            self._begin = Gaussian(self._second, np.diag([deviation**2, deviation**2]))
-        made = self._factors.prior(self._first, self._begin)
-        for position, (leading_here, measured) in enumerate(self._samples):
-            made += [*leading_here, *measured] if position > 0 else measured
-        last = self._first + len(self._samples) - 1
-        self._second, newest = self._factors.solve(made, (min(self._first + 1, last), last))
+    def add(self, between: list[Any], model: SampledModel, row: int, sample: FloatArray) -> FloatArray:
+        """Take a sample, whose model stands in a row; ``between``: factors from the one before to it. Returns its β and r."""
+        refused = self._refused.copy()
+        if self._gate is not None:
+            sample = self._gated(self._gate, self._with(between, []), model, row, sample, refused)
+        last = self._kept.first + len(self._kept.samples)
+        kept = self._with(between, self._factors.at(last, model, row, sample))
+        second, newest = self._factors.solve(self._made(kept), (min(kept.first + 1, last), last))
+        self._kept, self._second, self._refused = kept, second, refused
         return newest
+
+    def _with(self, between: list[Any], at: list[Any]) -> _Kept:
+        """What is kept once there is a sample more, of which these factors are."""
+        first, begin, samples = self._kept
+        samples = [*samples, (between, at)]
+        if len(samples) <= self._intervals + 1:
+            return _Kept(first, begin, samples)
+        deviation = self._factors.noise.window_start
+        return _Kept(first + 1, Gaussian(self._second, np.diag([deviation**2, deviation**2])), samples[1:])
+
+    def _made(self, kept: _Kept) -> list[Any]:
+        made = self._factors.prior(kept.first, kept.begin)
+        for position, (leading_here, measured) in enumerate(kept.samples):
+            made += [*leading_here, *measured] if position > 0 else measured
+        return made
+
+    def _gated(
+        self, gate: Gate, before: _Kept, model: SampledModel, row: int, sample: FloatArray, refused: NDArray[np.int64]
+    ) -> FloatArray:
+        """The sample with NaN where it is too far from what the graph without its measurements expects."""
+        made = self._made(before)
+        (state,), covariance = self._factors.solve(made, (before.first + len(before.samples) - 1,)), self._factors.covariance(made)
+        noise, left = self._factors.noise, sample.copy()
+        for i, (column, slope, offset, own) in enumerate(
+            (
+                (0, np.array([0.0, 1.0]), 0.0, noise.measured_yaw_rate),
+                (2, model.C[row], model.D[row] * sample[3], noise.measured_ay),
+            )
+        ):
+            error, variance = sample[column] - offset - slope @ state, slope @ covariance @ slope + own**2
+            if not np.isnan(error) and refuses(error, variance, gate.deviations**2, gate.patience, refused, i):
+                left[column] = np.nan
+        return left
 
 
 def _gtsam() -> ModuleType:

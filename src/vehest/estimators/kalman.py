@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -62,16 +62,43 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
+class SensorOffsets:
+    """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within a manoeuvre is in the covariance.
+
+    Args:
+        ay: standard deviation of the accelerometer's offset, or of the road's bank [m/s²]; none: no such state.
+        steer: of the steering angle's [rad]; none: no such state.
+        seconds: how long an offset lasts: its correlation falls to 1/e [s].
+
+    Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
+    """
+
+    ay: float | None = None
+    steer: float | None = None
+    seconds: float = 60.0
+
+    def __post_init__(self) -> None:
+        require_positive("estimator.offsets", asdict(self))
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Which there are."""
+        return tuple(name for name in ("ay", "steer") if getattr(self, name) is not None)
+
+
+@dataclass(frozen=True)
 class KalmanSettings(SingleTrackSettings):
     """Settings of the Kalman filter.
 
     Args:
         noise: levels of the sensors' noise.
+        offsets: of sensors, that are states beside β and r.
         initial_deviation: standard deviation of β and r before the first sample [rad, rad/s].
         gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
     """
 
     noise: SensorNoise = SensorNoise()
+    offsets: SensorOffsets = SensorOffsets()
     initial_deviation: float = 100.0
     gate: float | None = None
 
@@ -111,15 +138,18 @@ class KalmanFilter(SingleTrackEstimator):
 
     @property
     def variant(self) -> str:
-        """Where the noise levels come from, unless it is the training; and the gate."""
+        """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
-        return self.name + noise + suffix(self.settings.gate)
+        offsets = "".join(f"_{name}_offset" for name in self.settings.offsets.given)
+        return self.name + noise + offsets + suffix(self.settings.gate)
 
     @property
     def full_title(self) -> str:
-        """Title with where the noise levels come from, and the gate."""
+        """Title with where the noise levels come from, offsets, and the gate."""
         noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
-        return self.title + noise + in_words(self.settings.gate)
+        names = {"ay": "ay", "steer": "the steering angle"}
+        offsets = "".join(f", offset of {names[name]}" for name in self.settings.offsets.given)
+        return self.title + noise + offsets + in_words(self.settings.gate)
 
     @property
     def n_parameters(self) -> int:
@@ -156,12 +186,22 @@ class KalmanFilter(SingleTrackEstimator):
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         levels = self._known_levels() if self.causal else self._levels_of([recording])
         measurements = recording.stack(self.channels)
-        first = self.first_state(measurements[0, 1], self.settings.initial_deviation, initial_state)
+        first = self.start(measurements[0, 1], initial_state)
         result = self.filter_samples(measurements, levels, first)
         scaled = np.linalg.solve(result.innovation_covariance, result.innovation[..., None])[..., 0]
         nis = np.einsum("ti,ti->t", result.innovation, scaled)
         n_measured: FloatArray = np.sum(np.asarray(result.measured), axis=1, dtype=np.float64)
-        return self.wrapped_state(recording, result.filtered.mean, result.filtered.covariance, nis=nis, nis_dof=n_measured)
+        return self.wrapped_state(
+            recording, result.filtered.mean[:, :2], result.filtered.covariance[:, :2, :2], nis=nis, nis_dof=n_measured
+        )
+
+    def start(self, vx: float, initial_state: Mapping[str, float] | None = None) -> Gaussian[FloatArray]:
+        """State before the first sample: β and r, and offsets of 0 that are known to their standard deviations."""
+        motion = self.first_state(vx, self.settings.initial_deviation, initial_state)
+        variances = [getattr(self.settings.offsets, name) ** 2 for name in self.settings.offsets.given]
+        mean, covariance = np.zeros(2 + len(variances)), np.diag([0.0, 0.0, *variances])
+        mean[:2], covariance[:2, :2] = motion
+        return Gaussian(mean, covariance)
 
     def filter_samples(
         self,
@@ -184,8 +224,28 @@ class KalmanFilter(SingleTrackEstimator):
             observation_offset=np.stack([D * steer, np.zeros_like(steer)], axis=1),
             observation_noise=np.diag([levels["ay"] ** 2, levels["yaw_rate"] ** 2]),
         )
+        model = self._with_offsets(model, B, D)
         gate = Gate.of(self.settings.gate, self.settings.rate_hz)
         return kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
+
+    def _with_offsets(self, model: LinearModel[FloatArray], B: FloatArray, D: FloatArray) -> LinearModel[FloatArray]:
+        """The model with offsets as states: what is measured is a_y + b_ay, and the wheels stand at δ - b_δ."""
+        offsets = self.settings.offsets
+        if not offsets.given:
+            return model
+        steps, n = len(B), 2 + len(offsets.given)
+        kept = math.exp(-1.0 / (offsets.seconds * self.settings.rate_hz))
+        transition, noise, observation = np.zeros((steps, n, n)), np.zeros((steps, n, n)), np.zeros((steps, 2, n))
+        transition[:, :2, :2], noise[:, :2, :2], observation[:, :, :2] = model.transition, model.process_noise, model.observation
+        for row, name in enumerate(offsets.given, 2):
+            transition[:, row, row] = kept
+            noise[:, row, row] = getattr(offsets, name) ** 2 * (1.0 - kept**2)
+            if name == "ay":
+                observation[:, 0, row] = 1.0
+            else:
+                transition[:, :2, row], observation[:, 0, row] = -B, -D
+        offset = np.concatenate([model.transition_offset, np.zeros((steps, n - 2))], axis=1)
+        return LinearModel(transition, offset, noise, observation, model.observation_offset, model.observation_noise)
 
     def online(self) -> KalmanStepper:
         """A stepper that knows nothing of the state yet."""
@@ -214,7 +274,7 @@ class KalmanStepper(SingleTrackStepper):
     _estimator: KalmanFilter
 
     def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
-        return self._estimator.first_state(row[1], self._estimator.settings.initial_deviation, None)
+        return self._estimator.start(row[1])
 
     def _filtered(
         self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]

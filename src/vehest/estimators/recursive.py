@@ -167,7 +167,7 @@ class RecursiveStepper(Stepper):
         for name, value in zip(self._estimator.channels, row, strict=True):
             if math.isnan(value) and name not in self._estimator.skippable:
                 raise DataError(f"the sample's '{name}' is NaN, which estimator '{self._estimator.name}' cannot skip")
-        if not self._started:
-            self._state, self._started = self._estimator.first_state(row, {}), True
-        found, self._state = self._estimator.run(row[None], self._state)
+        state = self._state if self._started else self._estimator.first_state(row, {})
+        found, self._state = self._estimator.run(row[None], state)
+        self._started = True
         return {name: float(values[0]) for name, values in found.items()}

@@ -257,8 +257,6 @@ class NetworkUkfStepper(Stepper):
         """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample."""
         estimator = self._estimator
         row = checked_sample(sample, estimator.channels, ())[None]
-        if np.isinf(row).any():
-            raise DataError(f"the sample holds an infinite value: {dict(sample)}")
         word = estimator.word(estimator.seen(row))
         measurements, inputs = estimator.taken(row)
         trusts = bool(estimator.trusts(measurements[:, 0], self._trusts)[0])

@@ -134,9 +134,11 @@ def checked_sample(sample: Mapping[str, float], channels: Sequence[str], skippab
     """Values of the channels in this order.
 
     Raises:
-        DataError: one is missing, or NaN where the method cannot do without.
+        DataError: one is missing, infinite, or NaN where the method cannot do without.
     """
     values = np.array(required(sample, channels))
+    if np.isinf(values).any():
+        raise DataError(f"the sample holds an infinite value: {dict(sample)}")
     for name, value in zip(channels, values, strict=True):
         if np.isnan(value) and name not in skippable:
             raise DataError(f"the sample's '{name}' is NaN; only {' and '.join(skippable)} may be missing")

@@ -316,10 +316,11 @@ class RecurrentVelocityStepper(Stepper):
         """Velocities [m/s, rad/s] at the time of the sample."""
         estimator = self._estimator
         channels = dict(zip(estimator.channels, required(sample, estimator.channels), strict=True))
-        if self._state is None:
-            self._state = estimator._start({name: np.array([value]) for name, value in channels.items()}, None)
+        state = self._state
+        if state is None:
+            state = estimator._start({name: np.array([value]) for name, value in channels.items()}, None)
         inputs = np.array([[channels[name] for name in estimator.settings.inputs]])
-        values, self._state = estimator._advance(inputs, self._state)
+        values, self._state = estimator._advance(inputs, state)
         return dict(zip(estimator.settings.outputs, values[0].tolist(), strict=True))
 
 
