@@ -10,7 +10,8 @@ The rule of w was fixed before any of its effects was looked at: with m the 99.9
 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre other than those calibrated on.
 
 Source: Dunn, Wasserman & Ramdas, Distribution-free prediction sets for two-layer hierarchical models, JASA 118 (544), 2023 (pooling
-CDFs); Lee, Barber & Willett, Distribution-free inference with hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
+CDFs); Lee, Barber & Willett, Distribution-free inference with hierarchical data, arXiv:2306.06342, 2023 (mass at infinity); Lei et
+al., Distribution-free predictive inference for regression, JASA 113 (523), 2018, Section 5.2 (local scale).
 """
 
 from __future__ import annotations
