@@ -187,7 +187,7 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
     client = MlflowClient(f"sqlite:///{together / 'mlflow.db'}")
     runs = client.search_runs([client.get_experiment_by_name("vehest").experiment_id])
     assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(
-        artefact.key for folder in _folders(together) if (artefact := read_artefact(folder)).stage in {"train", "evaluate"}
+        artefact.key for folder in _folders(together) if (artefact := read_artefact(folder)).stage in {"train", "calibrate", "evaluate"}
     )
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert not list((together / "checkpoints").rglob("*"))
@@ -205,7 +205,11 @@ def test_a_training_made_again_leaves_its_evaluation_up_to_date(place: Place):
 
 
 def _folders(output: Path) -> list[Path]:
-    return [folder for stage in ("ingest", "downsample", "train", "evaluate", "report") for folder in sorted((output / stage).iterdir())]
+    return [
+        folder
+        for stage in ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
+        for folder in sorted((output / stage).iterdir())
+    ]
 
 
 def _contents(output: Path) -> dict[str, str]:

@@ -12,7 +12,7 @@ import pytest
 
 from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
-from vehest.stages import downsample, evaluate, ingest, train
+from vehest.stages import calibrate, downsample, evaluate, ingest, train
 from vehest.stages.artefacts import Artefact, StagePlan, make
 from vehest.stages.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unnamed
 
@@ -28,7 +28,10 @@ class Root:
         self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), downsample.code_of_downsampling())
         module = "vehest.estimators.luenberger"
         self.model = self.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, train.code_of_training(module))
-        self.scored = self.add("evaluate", "one-on-mine", {}, {"model": self.model.digest}, evaluate.code_of_evaluation(module))
+        of_model = {"model": self.model.digest}
+        self.trusted = self.add("calibrate", "one-trust", {}, of_model, calibrate.code_of_calibration(module))
+        of_both = of_model | {"calibration": self.trusted.digest}
+        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(module))
 
     def add(self, stage: str, label: str, config: dict, inputs: dict[str, str], code: str) -> Artefact:
         """Make an artefact with one file, whose content is its label."""
@@ -70,10 +73,17 @@ def test_a_model_of_an_estimator_that_is_not_installed_stays(root):
     assert root.found() == {}
 
 
-def test_an_evaluation_without_its_model_is_found_but_not_a_model_without_its_recordings(root):
+def test_what_was_made_of_a_model_that_is_gone_is_found_but_not_a_model_without_its_recordings(root):
     for file in [*root.model.folder.iterdir()]:
         file.unlink()
     root.model.folder.rmdir()
+    assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
+
+
+def test_an_evaluation_without_its_calibration_is_found(root):
+    for file in [*root.trusted.folder.iterdir()]:
+        file.unlink()
+    root.trusted.folder.rmdir()
     assert root.found() == {name_of(root.scored): ORPHANED}
 
 

@@ -36,7 +36,7 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("vehest")
     runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
-    assert len(runs) == 8
+    assert len(runs) == 12
     trained = runs["ksnn-linear_no_bias_p2-seed0"]
     assert trained.data.params["estimator.n_local"] == "2"
     assert trained.data.params["training.learning_rate"] == "0.001"
@@ -58,13 +58,14 @@ def test_training_goes_on_when_the_tracking_server_is_away(place):
 TRAIN = ("train", "split=mine", "training.max_epochs=2")
 
 
-def _local(place: Place) -> list:
-    """Runs in the local store."""
+def _local(place: Place, stage: str = "") -> list:
+    """Runs in the local store, of one stage or of all."""
     from mlflow import MlflowClient
 
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("vehest")
-    return list(client.search_runs([experiment.experiment_id])) if experiment else []
+    runs = client.search_runs([experiment.experiment_id]) if experiment else []
+    return [run for run in runs if not stage or run.data.tags["vehest.stage"] == stage]
 
 
 def _markers(place: Place) -> list[str]:
@@ -81,8 +82,8 @@ def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Pla
     code, _, err = place("run", "small", "--jobs", "1")
     assert code == 0, err
     assert "done" not in err, "nothing is made again for it"
-    assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 8
-    assert len(_markers(place)) == 8
+    assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
+    assert len(_markers(place)) == 12
 
 
 def test_a_run_that_was_logged_and_not_marked_is_not_logged_twice(place: Place):
@@ -91,7 +92,7 @@ def test_a_run_that_was_logged_and_not_marked_is_not_logged_twice(place: Place):
     shutil.rmtree(place.folder / "outputs" / "tracked")
     assert place(*TRAIN)[0] == 0
     assert _markers(place) == marked
-    assert len(_local(place)) == 1
+    assert len(_local(place, "train")) == 1
 
 
 @pytest.mark.parametrize("step", ["log_batch", "log_artifact", "log_figure", "set_terminated"])
@@ -101,9 +102,9 @@ def test_a_run_that_was_half_logged_is_completed(place: Place, monkeypatch: pyte
     with monkeypatch.context() as killed:
         killed.setattr(MlflowClient, step, _raising(KeyboardInterrupt()))
         assert place(*TRAIN)[0] == 130
-    assert [run.info.status for run in _local(place)] == ["RUNNING"]
+    assert [run.info.status for run in _local(place, "train")] == ["RUNNING"]
     assert place(*TRAIN)[0] == 0
-    [run] = _local(place)
+    [run] = _local(place, "train")
     assert run.info.status == "FINISHED"
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
     assert [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")] == [1, 2]
@@ -119,13 +120,13 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place: Place, mo
         killed.setattr(MlflowClient, "log_figure", _raising(KeyboardInterrupt()))
         assert place(*TRAIN, shared, "output=there")[0] == 130
     assert place(*TRAIN, shared, "output=here")[0] == 0
-    assert sorted(run.info.status for run in _local(place)) == ["FINISHED", "RUNNING"]
+    assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
 
 
 def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place: Place):
     assert place(*TRAIN)[0] == 0
     assert place(*TRAIN, "--force")[0] == 0
-    [run] = _local(place)
+    [run] = _local(place, "train")
     tracker = Tracker({"name": "mlflow"}, place.folder / "outputs", pytest.fail)
     [folder] = (place.folder / "outputs" / "train").iterdir()
     artefact = read_artefact(folder)
@@ -134,14 +135,14 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     other = replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64})
     assert not tracker.is_tracked(other)
     tracker.log(other, {}, {})
-    assert [run.info.status for run in _local(place)] == ["FINISHED"] * 2
+    assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
 def test_a_store_that_is_gone_is_filled_again(place: Place):
     assert place(*TRAIN)[0] == 0
     (place.folder / "outputs" / "mlflow.db").unlink()
     assert place(*TRAIN)[0] == 0
-    assert len(_local(place)) == 1
+    assert len(_local(place, "train")) == 1
 
 
 def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place):
@@ -165,7 +166,7 @@ def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place: Pl
     assert not list((place.folder / "outputs").glob("*mlflow.db*")), "no half of a store stays"
     code, _, err = place(*TRAIN)
     assert code == 0, err
-    assert [run.info.status for run in _local(place)] == ["FINISHED"]
+    assert [run.info.status for run in _local(place, "train")] == ["FINISHED"]
 
 
 def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
@@ -178,11 +179,11 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
     full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    assert len(_markers(place)) < 9
+    assert len(_markers(place)) < 14
     code, _, err = place("run", "small", "--jobs", "1")
     assert code == 0, err
-    assert len(_markers(place)) == 9
-    assert [run.info.status for run in _local(place)] == ["FINISHED"] * 9
+    assert len(_markers(place)) == 14
+    assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
 
 def _raising(error: BaseException):
@@ -248,7 +249,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
         assert code == 0, err
         assert "does not answer" not in err
         runs = _runs(client)
-        assert len(runs) == 8
+        assert len(runs) == 12
         trained = runs["ksnn-linear_no_bias_p2-seed1"]
         assert trained.info.status == "FINISHED"
         assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2

@@ -68,7 +68,7 @@ def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], 
     inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for spans in roles.values() for span in spans}
     plan = StagePlan(
         stage=STAGE,
-        label=model.label,
+        label=f"{model.label}-trust",
         config={role: [str(span) for span in spans] for role, spans in roles.items()},
         inputs=inputs,
         code=code_of_calibration(estimator_module(read_description(model.folder).estimator)),

@@ -210,14 +210,15 @@ class Workshop:
         Raises:
             NotThereYet: in a dry run, if it would have to be made.
         """
-        learnt = learnt_spans(model)
-        of_split = [*split.train, *split.validation]
-        job = plan_calibrate(model, split, data, self.output) if not learnt or set(learnt) == set(of_split) else None
-        found = calibration_of(model.folder, self.output) if job is None or model.status != "complete" else None
-        if found is None and job is not None and model.status == "complete":
-            found = self._ensure(job.plan, partial(write_calibration, job))
-            self.log_calibration(found)
-        elif found is None:
+        learnt, found = learnt_spans(model), None
+        if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
+            job = plan_calibrate(model, split, data, self.output)
+            if job is not None:
+                found = self._ensure(job.plan, partial(write_calibration, job))
+                self.log_calibration(found)
+        elif learnt:  # one of a model that learns nothing may have seen these tests
+            found = calibration_of(model.folder, self.output)
+        if found is None:
             self.messages.line("note", "calibrate", model.label, "has no calibration, so its estimates have no bands")
         return found
 

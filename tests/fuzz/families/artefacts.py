@@ -11,7 +11,7 @@ from fuzz.case import Case, Command, generator, template
 from fuzz.honest import KSNN, drives, run
 from fuzz.mutations import NAMES, spoil_bytes, spoil_json, spoil_text
 
-STAGES = ("ingest", "downsample", "train", "evaluate", "report")
+STAGES = ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
 
 
 def _commands(case: Case) -> Command:
