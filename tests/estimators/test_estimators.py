@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import yaml
@@ -37,15 +39,20 @@ def test_parameter_counts_are_those_of_the_paper():
 def test_online_agrees_with_batch(name, dtype, tolerance):
     estimator = fitted(name, dtype)
     drive = drive_for(estimator)
-    batch = estimator.estimate([drive])[0]["vy"]
+    estimate = estimator.estimate([drive])[0]
+    batch = estimate["vy"]
     stepper = estimator.online()
-    online = np.full(len(drive) + stepper.horizon_steps, np.nan)
-    for k in range(len(drive)):
-        online[k + stepper.horizon_steps] = stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"]
-    online = online[: len(drive)]
+    assert stepper.horizon_steps == estimator.horizon_steps
+    said = [stepper.step({channel: drive[channel][k] for channel in drive.channels}) for k in range(len(drive))]
+    online = np.array([math.nan] * stepper.horizon_steps + [row["vy"] for row in said])[: len(drive)]
     assert np.array_equal(np.isnan(online), np.isnan(batch))
     assert np.nanmax(np.abs(online - batch)) <= tolerance
-    assert np.isfinite(batch).sum() >= len(drive) - 30
+    assert np.isfinite(batch).sum() == len(drive) - estimator.warm_up_steps - estimator.horizon_steps
+    if "vy" in estimate.covariance_of:
+        row = estimate.covariance_of.index("vy")
+        np.testing.assert_allclose([own["vy_variance"] for own in said], estimate.covariance[:, row, row], rtol=10 * tolerance)
+    else:
+        assert "vy_variance" not in said[-1]
 
 
 @pytest.mark.parametrize("name", estimator_names())

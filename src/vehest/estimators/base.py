@@ -68,6 +68,8 @@ class Stepper(ABC):
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """Take the measurements of one instant [SI], return ``vy`` [m/s]; NaN while there is none yet.
 
+        A method that has a covariance also returns ``vy_variance`` [m²/s²].
+
         Raises:
             DataError: a channel is missing.
         """

@@ -418,7 +418,7 @@ class DugoffUkfStepper(Stepper):
         measurements, inputs = samples_of(row[None])
         self._trusts = bool(estimator.trusts_forces(measurements[:, 0], self._trusts)[0])
         state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])
-        return dict(zip(TRACK_STATES, state.tolist(), strict=True))
+        return dict(zip(TRACK_STATES, state.tolist(), strict=True)) | {"vy_variance": self._filter.variance}
 
 
 def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:

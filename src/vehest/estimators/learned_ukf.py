@@ -413,7 +413,8 @@ class LearnedUkfStepper(Stepper):
             )
         dtype = self._filter.mean.dtype
         estimated = self._filter.step(row[:4].astype(dtype), self._inputs.astype(dtype), *self._noises)
-        return dict(zip(STATES, estimated.tolist(), strict=True))
+        variance = float(self._filter.covariance[STATES.index("vy"), STATES.index("vy")])
+        return dict(zip(STATES, estimated.tolist(), strict=True)) | {"vy_variance": variance}
 
 
 def _held(values: FloatArray) -> FloatArray:

@@ -274,7 +274,8 @@ class NetworkUkfStepper(Stepper):
             filtered = self._filter.filtered(y, u, before, noise, state, self._gate, refused).steps.filtered
         self._trusts, self._refused = trusts, refused
         self._before, self._state = (u[:, -1:], process), Gaussian(filtered.mean[:, -1], filtered.covariance[:, -1])
-        return dict(zip(TRACK_STATES, self._state.mean[0].tolist(), strict=True))
+        found = dict(zip(TRACK_STATES, self._state.mean[0].tolist(), strict=True))
+        return found | {"vy_variance": float(self._state.covariance[0, 0, 0])}
 
 
 def observation_noise(sensors: Tensor, trusted: Tensor, variance: Tensor) -> Tensor:

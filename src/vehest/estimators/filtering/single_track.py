@@ -117,7 +117,9 @@ class SingleTrackStepper(Stepper):
         refused = self._refused.copy()
         self._state, others = self._filtered(rows, state, refused)
         self._last, self._refused = row, refused
-        return {"vy": float(row[1] * math.tan(self._state.mean[0])), "yaw_rate": float(self._state.mean[1]), **others}
+        tangent = math.tan(self._state.mean[0])
+        variance = (row[1] * (1.0 + tangent**2)) ** 2 * self._state.covariance[0, 0]
+        return {"vy": float(row[1] * tangent), "vy_variance": float(variance), "yaw_rate": float(self._state.mean[1]), **others}
 
     @abstractmethod
     def _first(self, row: FloatArray) -> Gaussian[FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
@@ -120,6 +121,11 @@ class TrackStepper:
         self._own, self._model, self._gate = own, own.model(torch.float64), gate
         self._filter: UnscentedStepper | None = None
         self._rolled = False
+
+    @property
+    def variance(self) -> float:
+        """Of the lateral velocity at the last sample [m²/s²]; NaN before the first."""
+        return math.nan if self._filter is None else float(self._filter.covariance[0, 0])
 
     def step(self, measurement: FloatArray, inputs: FloatArray, process_noise: FloatArray, observation_noise: FloatArray) -> FloatArray:
         """The state at a sample, (2,), valid until the next one.
