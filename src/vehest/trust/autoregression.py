@@ -1,8 +1,9 @@
 """Vector autoregression: what the next sample of several channels is expected to be, and by how much it differs.
 
-y_k = c + A₁ y_{k-1} + … + A_p y_{k-p} + ε_k,  ε ~ N(0, S)      (Lütkepohl, New Introduction to Multiple Time Series Analysis, 2005, Eq. 2.1.1)
+    y_k = c + A₁ y_{k-1} + … + A_p y_{k-p} + ε_k,  ε ~ N(0, S)
 
-Fitted by least squares, once more without the rows that hold outliers; its order by BIC (Section 4.3.2).
+(Lütkepohl, New Introduction to Multiple Time Series Analysis, 2005, Eq. 2.1.1). Fitted by least squares, once more without the rows that
+hold outliers; its order by BIC (Section 4.3.2).
 """
 
 from __future__ import annotations

@@ -62,6 +62,7 @@ class Oracle:
         levels: of the noise at each speed.
         healthy: innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each.
         false_alarms_per_hour: that the test may have.
+        reserve: how many times as large the innovations of healthy drives may be without an alarm, the margin of the detector.
     """
 
     channels: tuple[str, ...]
@@ -73,6 +74,7 @@ class Oracle:
     levels: NoiseLevels
     healthy: tuple[FloatArray, ...]
     false_alarms_per_hour: float
+    reserve: float
 
     def sees(
         self,
@@ -123,7 +125,7 @@ class Oracle:
         step = max(round(STARTS_SECONDS * self.rate_hz), 1)
         for innovations in self.healthy:
             for begin in range(self.model.order, len(innovations) - within + 1, step):
-                highest = max(highest, float(np.cumsum(test(np.nan_to_num(innovations[begin : begin + within]))).max()))
+                highest = max(highest, float(np.cumsum(test(self.reserve * np.nan_to_num(innovations[begin : begin + within]))).max()))
         return highest
 
 
@@ -178,6 +180,7 @@ def learn_oracle(
     channels: Sequence[str],
     rate_hz: float,
     false_alarms_per_hour: float = 1.0,
+    reserve: float = 1.5,
 ) -> Oracle:
     """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
 
@@ -185,7 +188,7 @@ def learn_oracle(
         train, validation: at ``rate_hz``.
         channels: that an estimator reads.
         rate_hz: [Hz].
-        false_alarms_per_hour: those of the detector that it is compared with.
+        false_alarms_per_hour, reserve: those of the detector that it is compared with.
 
     Raises:
         DataError: a channel is missing or there are too few samples.
@@ -194,13 +197,11 @@ def learn_oracle(
     train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
     least_speed = least_speed_of(train, names)
     relations = tuple(learn_relations(train, names, rate_hz, least_speed))
-    pieces = [
-        residuals_of({name: recording[name] for name in names}, names, relations, least_speed) for recording in (*train, *validation)
-    ]
+    pieces = [residuals_of({name: recording[name] for name in names}, names, relations, least_speed) for recording in (*train, *validation)]
     model = fit_autoregression(pieces[: len(train)])
     speed, innovations = speed_channel(names), [model.innovations(piece) for piece in pieces]
     speeds = [recording[speed] if speed else np.zeros(len(recording)) for recording in (*train, *validation)]
     seen = len(train)
     levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
     healthy = tuple(own / levels.at(at) for own, at in zip(innovations, speeds, strict=True))
-    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour)
+    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour, reserve)

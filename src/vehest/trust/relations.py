@@ -50,6 +50,12 @@ class Relation:
     terms: dict[str, float] = field(default_factory=dict)
     instant: bool = False
 
+    def channels(self, speed: str | None) -> set[str]:
+        """Those that it takes: the target and what is in its terms, but for the small ones of drag."""
+        parts = " ".join(name for name in self.terms if name not in ("r²", "u²", RATE)).replace("/100", "").split()
+        named = {"yaw_rate": {"r", "(u", "r/u"}, "ay": {"ay", "ay/u²", "ay³"}, speed: {"u", "(u", "r/u", "ay/u²"}}
+        return {self.target, self.partner, *(name for name, words in named.items() if name and words & set(parts))}
+
 
 def speed_channel(channels: Sequence[str]) -> str | None:
     """The channel that serves as speed."""
