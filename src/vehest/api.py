@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 from vehest.data.estimate import Estimate
 from vehest.data.files import written_aside
@@ -19,8 +20,12 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model as _load_model
 from vehest.estimators.model_files import save_model as _save_model
+from vehest.stages.calibrate import trust_of
 from vehest.stages.estimate import PRETRAINED, estimate_recording, find_model, preparation_of, read_table, write_estimate_table
 from vehest.stages.in_memory import score_on, train_on
+from vehest.trust.contract import GuardedStepper
+from vehest.trust.record import Trust, write_trust
+from vehest.trust.verdict import reason_in_words
 
 __all__ = [
     "Estimate",
@@ -28,12 +33,18 @@ __all__ = [
     "Recording",
     "estimate",
     "load_model",
+    "online",
     "read_recording",
+    "reason_in_words",
     "save_model",
     "score",
     "train",
     "write_estimate",
 ]
+
+
+_TRUST: WeakKeyDictionary[Estimator, Trust] = WeakKeyDictionary()
+"""What was learnt with the estimators that were trained or loaded here."""
 
 
 def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:
@@ -48,9 +59,13 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
         MissingError: there is no such model.
         DataError: its files are damaged.
     """
-    folder = find_model(str(model), Path(output or os.environ.get("VEHEST_OUTPUT", "outputs")))
+    root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
+    folder = find_model(str(model), root)
     estimator = _load_model(folder)
     estimator.preparation = preparation_of(folder)
+    trust = trust_of(folder, root)
+    if trust is not None:
+        _TRUST[estimator] = trust
     return estimator
 
 
@@ -70,7 +85,8 @@ def train(
         ConfigurationError: an unknown name or setting.
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
-    return train_on(estimator, train, validation, overrides, seed)
+    model, _TRUST[model] = train_on(estimator, train, validation, overrides, seed)
+    return model
 
 
 def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
@@ -95,6 +111,8 @@ def save_model(model: Estimator, folder: str | Path) -> None:
     with written_aside(Path(folder)) as aside:
         aside.mkdir()
         _save_model(model, aside, {"n_parameters": model.n_parameters, "downsample": dict(model.preparation)})
+        if model in _TRUST:
+            write_trust(_TRUST[model], aside)
 
 
 def read_recording(path: str | Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
@@ -114,15 +132,30 @@ def read_recording(path: str | Path, overrides: Sequence[str] = (), *, reference
 
 
 def estimate(model: Estimator, recording: Recording) -> Estimate:
-    """Run a model on a recording, brought to the model's rate in the way it was trained with.
+    """Run a model on a recording, brought to the model's rate in the way it was trained with, under the contract that holds online.
 
     Returns:
-        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet.
+        ``vy`` [m/s] and ``sideslip`` [rad], each of shape (T,); NaN where the model's window is not full yet. ``health`` (0 valid,
+        1 degraded, 2 invalid) and ``health_reason`` (`reason_in_words`); half widths of the 90 % band, ``band_vy`` and ``band_sideslip``,
+        where the model was calibrated.
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    return estimate_recording(model, recording, dict(model.preparation))
+    return estimate_recording(model, recording, dict(model.preparation), _TRUST.get(model))
+
+
+def online(model: Estimator, bus_rate_hz: float | None = None) -> GuardedStepper:
+    """A model that runs along with a drive: ``online(model).step({"vx": 21.3, …})`` a sample.
+
+    Args:
+        model: fitted, causal.
+        bus_rate_hz: rate at which samples come, if it is above the model's: they then go through a causal anti-aliasing filter first.
+
+    Raises:
+        ConfigurationError: the model is not causal, or the bus is slower than it.
+    """
+    return GuardedStepper(model, _TRUST.get(model), bus_rate_hz)
 
 
 def write_estimate(estimate: Estimate, path: str | Path) -> None:

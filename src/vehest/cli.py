@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, MissingError, VehestError, is_printable, printable
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError, is_printable, printable
 from vehest.stages.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
 from vehest.version import __version__
 
@@ -300,9 +300,17 @@ def estimate(
     ] = None,
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet or .csv.")] = Path("estimate.parquet"),
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="End with exit code 3, and write nothing, where a check finds something in the channels that are read."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
+
+    Beside v and β stand the half widths of their calibrated 90 % bands and the estimate's health: 0 valid, 1 degraded, 2 invalid, with the reason.
 
     For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest and says so.
 
@@ -310,15 +318,18 @@ def estimate(
     """
     from vehest.data.limits import limits_from_config, use_limits
     from vehest.estimators.model_files import load_model
+    from vehest.stages.calibrate import trust_of
     from vehest.stages.estimate import (
         PRETRAINED,
         SUFFIXES,
         estimate_recording,
         find_model,
+        findings_for,
         preparation_of,
         pretrained_note,
         read_table,
         summary_of,
+        verdict_of,
         write_estimate_table,
     )
 
@@ -337,11 +348,19 @@ def estimate(
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
+    trust = trust_of(folder, Path(config["output"]))
     with use_limits(limits_from_config(config["limits"])):
-        result = estimate_recording(fitted, read_table(file, overrides), downsample)
+        drive = read_table(file, overrides)
+        findings = findings_for(drive, fitted, config["dataset"].get("accept") or ())
+        if strict and findings:
+            raise DataError(f"'{file}': {findings[0].channel}: {findings[0].message}")
+        result = estimate_recording(fitted, drive, downsample, trust)
+    for finding in findings:
+        typer.echo(f"warning: {finding.channel}: {finding.message}", err=True)
     write_estimate_table(result, out)
     note = {"note": pretrained_note()} if name == PRETRAINED else {}
-    _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **note})
+    said = {"verdict": verdict_of(result, drive, trust), "findings": [f"{finding.channel}: {finding.message}" for finding in findings]}
+    _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
 
 
 def _is_file_name(word: str) -> bool:

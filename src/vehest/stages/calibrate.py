@@ -90,25 +90,56 @@ def code_of_calibration(module: str) -> str:
 
 
 def write_calibration(job: CalibrateJob, folder: Path) -> None:
-    """Calibrate a model; write trust.yaml into ``folder``. What keeps a model from bands is noted in there."""
+    """Calibrate a model; write trust.yaml into ``folder``. What keeps a model from bands or health is noted in there."""
     description, estimator = read_description(job.model.folder), load_model(job.model.folder)
-    train, validation = (_measured(estimator, job.data, spans) for spans in (job.split.train, job.split.validation))
+    train, validation = (_stretches(job.data, spans) for spans in (job.split.train, job.split.validation))
+    write_trust(learn_trust(estimator, train, validation, description.variant), folder)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A range to learn from, with what of its recording lies before it.
+
+    Args:
+        recording: at the model's rate, from `WARM_UP_SECONDS` before the range on as far as there is any, references included.
+        start: of the range [s].
+        dataset: whose recording it is; empty where it is of none.
+        name: of the range, for people.
+    """
+
+    recording: Recording
+    start: float
+    dataset: str
+    name: str
+
+    @property
+    def measured(self) -> Recording:
+        """The range as an estimator may see it."""
+        return self.recording.cut(self.start, self.recording.end_time).without_references()
+
+
+def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = "") -> Trust:
+    """Bands, limits of samples and health of an estimator, from what it was fitted on and what it was stopped on.
+
+    Args:
+        estimator: fitted.
+        train: give scales, limits and relations between channels.
+        validation: gives factors of bands and, together with ``train``, thresholds of health.
+        variant: what the paper calls the estimator.
+    """
     bands, guard, health, notes = None, None, None, []
     try:
-        bands = _bands(estimator, job)
+        bands = _bands(estimator, train, validation)
     except DataError as error:  # as of a reference that is not there, which is no reason to go without an evaluation
         notes.append(str(error))
     try:
-        guard = learn_limits(train, estimator.channels, estimator.settings.rate_hz)
-        health = learn_health(
-            [recording.without_references() for recording in train],
-            [recording.without_references() for recording in validation],
-            estimator.channels,
-            estimator.settings.rate_hz,
-        )
+        ranges = [stretch.recording.cut(stretch.start, stretch.recording.end_time) for stretch in train]
+        guard = learn_limits(ranges, estimator.channels, estimator.settings.rate_hz)
+        learnt, stopped = ([stretch.measured for stretch in part] for part in (train, validation))
+        health = learn_health(learnt, stopped, estimator.channels, estimator.settings.rate_hz)
     except DataError as error:
         notes.append(str(error))
-    write_trust(Trust(About(description.estimator, description.variant, "; ".join(notes)), bands, guard, health), folder)
+    return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
 
 
 def calibration_figures(folder: Path) -> dict[str, float]:
@@ -158,47 +189,44 @@ def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
     return max(found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None)
 
 
-def _measured(estimator: Estimator, data: Mapping[str, Artefact], spans: Sequence[Span]) -> list[Recording]:
-    """The ranges, references included."""
-    return [read_recording(recording_file(data[span.dataset], span)).cut(span.start, span.stop) for span in spans]
+def _stretches(data: Mapping[str, Artefact], spans: Sequence[Span]) -> list[Stretch]:
+    found = []
+    for span in spans:
+        recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
+        found.append(Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe()))
+    return found
 
 
-def _bands(estimator: Estimator, job: CalibrateJob) -> Bands:
-    horizon = estimator.online().horizon_steps if estimator.causal else 0
-    training, validation = (_pieces(estimator, job.data, spans, horizon) for spans in (job.split.train, job.split.validation))
+def _bands(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch]) -> Bands:
     origin = Origin(
-        vehicles=tuple(dict.fromkeys(vehicle for vehicle, _ in validation)),
-        datasets=tuple(dict.fromkeys(span.dataset for span in job.split.validation)),
-        scaled_on=tuple(span.describe() for span in job.split.train),
-        calibrated_on=tuple(span.describe() for span in job.split.validation),
+        vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
+        datasets=tuple(dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)),
+        scaled_on=tuple(stretch.name for stretch in train),
+        calibrated_on=tuple(stretch.name for stretch in validation),
         channels=tuple(estimator.channels),
-        horizon_steps=horizon,
+        horizon_steps=estimator.horizon_steps,
     )
-    return calibrated([piece for _, piece in training], [piece for _, piece in validation], origin)
+    return calibrated(_pieces(estimator, train), _pieces(estimator, validation), origin)
 
 
-def _pieces(estimator: Estimator, data: Mapping[str, Artefact], spans: Sequence[Span], horizon: int) -> list[tuple[str, Piece]]:
-    """The vehicle of each range, and the range after its start with the model's estimate on it.
+def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
+    """Ranges after their starts with the model's estimates on them.
 
     Raises:
         DataError: a recording lacks a channel or the reference, or the model cannot estimate it.
     """
-    seen = []
-    for span in spans:
-        whole = read_recording(recording_file(data[span.dataset], span))
-        seen.append(whole.cut(span.start - WARM_UP_SECONDS, span.stop))
-    for recording in seen:
-        if "vy_ref" not in recording:
-            raise DataError(f"recording '{recording.id}' has no channel 'vy_ref' to calibrate bands by")
-    found: list[tuple[str, Piece]] = []
-    estimates = estimator.estimate([recording.without_references() for recording in seen])
-    for span, recording, estimate in zip(spans, seen, estimates, strict=True):
-        rows, vy, variance = band_inputs(estimate, recording, tuple(estimator.channels), horizon)
-        scored = slice(*recording.index_range(max(span.start, recording.start_time) + SKIP_SECONDS, span.stop))
+    for stretch in stretches:
+        if "vy_ref" not in stretch.recording:
+            raise DataError(f"recording '{stretch.recording.id}' has no channel 'vy_ref' to calibrate bands by")
+    found: list[Piece] = []
+    estimates = estimator.estimate([stretch.recording.without_references() for stretch in stretches])
+    for stretch, estimate in zip(stretches, estimates, strict=True):
+        recording = stretch.recording
+        rows, vy, variance = band_inputs(estimate, recording, tuple(estimator.channels), estimator.horizon_steps)
+        scored = slice(*recording.index_range(stretch.start + SKIP_SECONDS, recording.end_time))
         error = vy - recording["vy_ref"]
         turned = estimate["sideslip"] - np.arctan2(recording["vy_ref"], recording["vx"])
         turned = np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi
         yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
-        piece = Piece(rows[scored], vy[scored], variance[scored], error[scored], turned[scored], yaw_rate, recording.rate_hz)
-        found.append((recording.vehicle, piece))
+        found.append(Piece(rows[scored], vy[scored], variance[scored], error[scored], turned[scored], yaw_rate, recording.rate_hz))
     return found

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.checks import Finding, checks_of_recording
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
@@ -24,8 +24,14 @@ from vehest.estimators.model_files import read_description
 from vehest.sources.base import read_single
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
+from vehest.trust.contract import estimate_guarded
+from vehest.trust.health import domain_verdict
+from vehest.trust.record import Trust
+from vehest.trust.verdict import reason_in_words
 
 SUFFIXES = (".parquet", ".csv")
+CONTRADICTIONS = ("sign", "unit")
+"""Checks that prove a channel wrong by others."""
 PRETRAINED = "pretrained"
 """Name of the model that comes with vehest, for cars that nobody has trained on."""
 
@@ -107,13 +113,14 @@ def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Record
     return recording
 
 
-def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any]) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it.
+def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any], trust: Trust | None = None) -> Estimate:
+    """Bring a recording to the model's rate and run the model on it, under the contract that holds online (`vehest.trust.contract`).
 
     Args:
         model: fitted.
         recording: with the channels that the model reads, at any rate from the model's upwards.
         downsample: method and transforms, as in `preparation_of`.
+        trust: learnt with the model; without it there is neither band nor health of channels.
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
@@ -131,7 +138,8 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
         )
     for transform in transforms_of({"rate_hz": rate, **downsample}):
         needed = transform(needed)
-    estimate = model.estimate([needed])[0]
+    elsewhere = trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
+    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=elsewhere).estimate
     if np.isnan(estimate["vy"]).all():
         raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
     return estimate
@@ -149,7 +157,11 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
     if path.suffix.lower() == ".parquet":
         write_estimate(estimate, path)
         return
-    frame = pd.DataFrame({"time": estimate.time, **estimate.channels})
+    columns: dict[str, Any] = {"time": estimate.time, **estimate.channels}
+    if "health" in columns:
+        columns["health"] = columns["health"].astype(int)
+        columns["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
+    frame = pd.DataFrame(columns)
     with written_aside(path) as aside:
         frame.to_csv(aside, index=False, lineterminator="\n")
 
@@ -163,7 +175,7 @@ def summary_of(estimate: Estimate) -> dict[str, Any]:
     """What an estimate holds, for people and scripts."""
     known = estimate["vy"][~pd.isna(estimate["vy"])]
     degrees = [math.degrees(value) for value in (estimate["sideslip"][~pd.isna(estimate["sideslip"])])] or [math.nan]
-    return {
+    said: dict[str, Any] = {
         "recording": estimate.recording_id,
         "estimator": estimate.estimator,
         "rate_hz": estimate.rate_hz,
@@ -172,3 +184,43 @@ def summary_of(estimate: Estimate) -> dict[str, Any]:
         "quantities": {name: QUANTITIES[name] for name in estimate.channels},
         "sideslip_deg": {"min": round(min(degrees), 3), "max": round(max(degrees), 3)},
     }
+    if "band_sideslip" in estimate.channels:
+        half = np.degrees(estimate["band_sideslip"][~np.isnan(estimate["band_sideslip"])])
+        said["band_sideslip_deg"] = (
+            {"median": round(float(np.median(half)), 3), "largest": round(float(half.max()), 3)} if len(half) else {}
+        )
+    return said
+
+
+def findings_for(recording: Recording, model: Estimator, accepted: Sequence[str] = ()) -> list[Finding]:
+    """What the checks find in the channels that a model reads, the gravest first.
+
+    Args:
+        recording: at its native rate.
+        model: whose channels count.
+        accepted: names of checks that are not to stop anything.
+
+    Raises:
+        DataError: channels that the model reads contradict each other in sign or unit, which no estimate survives.
+    """
+    read = [name for name in model.channels if name in recording]
+    findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
+    for finding in findings:
+        if finding.check in CONTRADICTIONS and finding.check not in accepted:
+            raise DataError(
+                f"recording '{recording.id}': channels contradict each other: {finding.message} (or dataset.accept=[{finding.check}])"
+            )
+    return findings
+
+
+def verdict_of(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
+    """How far an estimate can be trusted, in a line."""
+    if trust is None or trust.health is None:
+        return "nobody calibrated this model: there is no band, and health knows gaps and speeds alone"
+    status, reasons = estimate["health"], estimate["health_reason"]
+    outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
+    bad = status[~np.isnan(estimate["vy"])] > 0
+    found, counts = np.unique(reasons[(status > 0) & (reasons > 0) & ~np.isnan(estimate["vy"])], return_counts=True)
+    worst = [reason_in_words(float(found[at])) for at in np.argsort(-counts)[:2]]
+    said = f"valid in {100.0 * (1.0 - float(bad.mean())):.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
+    return f"{outside}; {said}" if outside else said

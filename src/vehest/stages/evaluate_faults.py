@@ -29,6 +29,7 @@ from vehest.stages.faults import FaultSettings
 from vehest.stages.train import recording_file
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, inject, is_fault
+from vehest.trust.record import Trust, read_trust
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,7 @@ class _Ranges:
     def __init__(self, estimator: Estimator, job: EvaluateJob, name: str, spans: Sequence[Span], folder: Path) -> None:
         self.estimator, self.spans, self.protocol = estimator, spans, job.protocol
         self.reference = cache(job.reference)
+        self.trust = read_trust(job.calibration.folder) if job.calibration is not None else None
         self.pieces = sequences(spans, self.reference, job.protocol)
         self.recordings = [_measured(job, piece) for piece in self.pieces]
         self.states = [reference_state(self.reference(piece), piece) if job.protocol.initial_state else None for piece in self.pieces]
@@ -106,7 +108,7 @@ class _Ranges:
             start = max(piece.start - recording.start_time, 0.0)
             fault = settings.within(start, recording.duration - start, position)
             onset = recording.start_time + fault.onset
-            estimate = _estimated_under_fault(self.estimator, recording, fault, state)
+            estimate = _estimated_under_fault(self.estimator, self.trust, recording, fault, state)
             estimates.append(_lost_from(onset, estimate))
             windows.append((onset, onset + fault.duration))
         return errors_under_fault(self._scored(estimates), self.nominal, windows)
@@ -121,10 +123,12 @@ def _measured(job: EvaluateJob, piece: Span) -> Recording:
     return recording.cut(piece.start - job.protocol.warm_up_seconds, piece.stop).without_references()
 
 
-def _estimated_under_fault(estimator: Estimator, recording: Recording, fault: Fault, state: Mapping[str, float] | None) -> Estimate:
+def _estimated_under_fault(
+    estimator: Estimator, trust: Trust | None, recording: Recording, fault: Fault, state: Mapping[str, float] | None
+) -> Estimate:
     """The estimate of a recording one of whose channels is faulty, under the contract that holds online."""
     samples = inject(recording.channels, recording.rate_hz, fault)
-    return estimate_guarded(estimator, samples, recording, initial_state=state).estimate
+    return estimate_guarded(estimator, samples, recording, trust, state).estimate
 
 
 def _lost_from(onset: float, estimate: Estimate) -> Estimate:

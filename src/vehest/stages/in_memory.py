@@ -11,22 +11,28 @@ from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span
 from vehest.estimators.base import Estimator, FitData
 from vehest.evaluation.metrics import accuracy, score
+from vehest.stages.calibrate import Stretch, learn_trust
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
 from vehest.stages.estimate import estimate_recording
 from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.train import new_estimator
+from vehest.trust.record import Trust
 
 
-def train_on(name: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str], seed: int) -> Estimator:
-    """Fit an estimator as conf/train.yaml and overrides describe it; see `vehest.api.train`."""
+def train_on(
+    name: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str], seed: int
+) -> tuple[Estimator, Trust]:
+    """Fit an estimator as conf/train.yaml and overrides describe it, and calibrate it; see `vehest.api.train`."""
     config = compose_config("train", [f"estimator={name}", *overrides])
     model = new_estimator(config["estimator"])
     training: Any = settings_from_config(model.training_type, config["training"], "training")
     model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
     model.seed(seed)
-    model.fit(FitData(*([_at_rate(recording, model) for recording in part] for part in (train, validation))), training)
-    return model
+    learnt, stopped = ([_at_rate(recording, model) for recording in part] for part in (train, validation))
+    model.fit(FitData(learnt, stopped), training)
+    first, second = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in (learnt, stopped))
+    return model, learn_trust(model, first, second)
 
 
 def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:

@@ -116,6 +116,9 @@ class _Run:
         steps = len(cleaned.rows)
         self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
         self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
+        self.others: dict[str, FloatArray] = {}
+        self.covariance: FloatArray | None = None
+        self.covariance_of: tuple[str, ...] = ()
         self.motion = motion_of(estimator.channels, cleaned)
 
     def go(self) -> None:
@@ -178,6 +181,13 @@ class _Run:
         if "vy" in estimate.covariance_of and estimate.covariance is not None:
             row = estimate.covariance_of.index("vy")
             self.variance[start:end] = estimate.covariance[shift, row, row]
+            if self.covariance is None:
+                self.covariance = np.full((len(self.out), *estimate.covariance.shape[1:]), np.nan)
+                self.covariance_of = estimate.covariance_of
+            self.covariance[start:end] = estimate.covariance[shift]
+        for name, values in estimate.channels.items():
+            if name not in ("vy", "sideslip"):
+                self.others.setdefault(name, np.full(len(self.out), np.nan))[start:end] = values[shift]
         return np.asarray(estimate["vy"][shift])
 
     def _stepped(self, start: int, end: int) -> FloatArray:
@@ -205,12 +215,15 @@ class _Run:
             return np.concatenate([np.full(self.horizon, np.nan), values])[: len(values)]
 
         vy = later(self.out)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), "health": verdict.status, "health_reason": verdict.reason}
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), **{name: later(values) for name, values in self.others.items()}}
         if monitor.has_bands:
             channels |= {"band_vy": later(bands[:, 0]), "band_sideslip": later(bands[:, 1])}
+        channels |= {"health": verdict.status, "health_reason": verdict.reason}
         mode: Mode = "causal" if self.estimator.causal else "offline"
         r = self.recording
-        estimate = Estimate(r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode)
+        clock = (self.estimator.settings.rate_hz, r.start_time)
+        covariance = (self.covariance, self.covariance_of) if self.covariance is not None and self.horizon == 0 else (None, ())
+        estimate = Estimate(r.id, self.estimator.name, *clock, channels, mode, *covariance)
         return Guarded(estimate, self.cleaned, self.marks)
 
 
@@ -265,6 +278,7 @@ class GuardedStepper(Stepper):
         self._raw, self._vx, self._variance = np.empty(1), np.full(1, np.nan), np.full(1, np.nan)
         self._places = [estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION]
         self._clock = _Clock(self._rate)
+        self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
 
@@ -319,7 +333,7 @@ class GuardedStepper(Stepper):
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
-        said = {"vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
+        said = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
         if self._monitor.has_bands:
             said["band_vy"], said["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
         said["health"], said["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
@@ -328,6 +342,7 @@ class GuardedStepper(Stepper):
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float, bool]:
         """What the estimator says of a row: v, its own vx, the variance of v's error, and whether it failed."""
         flow = cleaned.flow[0]
+        self._others = {}
         if flow == WAIT:
             return math.nan, math.nan, math.nan, False
         if flow == RESTART and not self._fresh:
@@ -337,6 +352,7 @@ class GuardedStepper(Stepper):
             found = self._stepper.step(dict(zip(self.estimator.channels, cleaned.rows[0].tolist(), strict=True)))
         except FAILURES:
             return math.nan, math.nan, math.nan, True
+        self._others = {name: value for name, value in found.items() if name not in ("vy", "vy_variance")}
         return found["vy"], found.get("vx", math.nan), found.get("vy_variance", math.nan), False
 
 

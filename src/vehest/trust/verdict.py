@@ -22,6 +22,7 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE, WAIT
 from vehest.trust.health import DEGRADED, INVALID, NUMBERS, VALID
+from vehest.trust.health import reason_in_words as health_in_words
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 
 NO_ESTIMATE, BEYOND_SPEED = 30, 31
@@ -34,12 +35,21 @@ NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 """Kinds of reasons that accuse no sensor of anything that an estimator could do without."""
 
 
+OWN_WORDS = {NO_ESTIMATE: "there is no estimate", BEYOND_SPEED: "the estimate exceeds what the speed allows"}
+
+
+def reason_in_words(code: float) -> str:
+    """What the code of a reason says; empty for 0."""
+    kind = round(code) // 10000
+    return OWN_WORDS[kind] if kind in OWN_WORDS else health_in_words(code) if code else ""
+
+
 class Verdict(NamedTuple):
     """What is said of an estimate.
 
     Args:
         status: 0 valid, 1 degraded, 2 invalid, (T,).
-        reason: code of `vehest.trust.health.reason_in_words`, (T,); 0 where there is none.
+        reason: code of `reason_in_words`, (T,); 0 where there is none.
     """
 
     status: FloatArray
