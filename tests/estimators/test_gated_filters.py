@@ -151,3 +151,7 @@ def test_a_gate_of_nothing_is_refused(name: str) -> None:
 def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused() -> None:
     with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
         estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
+
+
+def test_a_learned_filter_is_trained_once_for_use_with_a_gate_and_without() -> None:
+    assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key
