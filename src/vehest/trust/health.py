@@ -2,7 +2,7 @@
 
 Learnt from training drives without any reference: relations between channels (`vehest.trust.relations`), an autoregression of what they
 leave (`vehest.trust.autoregression`), and for every statistic of `vehest.trust.health_kernel` the largest value that healthy training and
-validation drives reach. A statistic beyond its limit, `MARGIN` times that value, flags the estimate at once as degraded or invalid, with a
+validation drives reach. A statistic beyond its limit, that value times a margin, flags the estimate at once as degraded or invalid, with a
 reason. The flag is taken back after `HOLD_SECONDS` in which every statistic stayed below `CLEAR` times its limit.
 """
 
@@ -40,6 +40,7 @@ STATUS = ("valid", "degraded", "invalid")
 HOLD_SECONDS = 1.0  # for which a flag stays after the last statistic went down
 BRIDGED_SECONDS = 0.5  # from which on a missing channel makes the estimate invalid
 SPIN_SECONDS = 0.3
+SETTLE_SECONDS = 0.5  # after a start, before predictions count
 SHARE_SECONDS = 0.5  # over which equal samples are counted
 BRAKING_SECONDS = 0.2  # over which ax is averaged
 LATE_SECONDS = 0.05  # of the low-pass that stands for a delay
@@ -48,7 +49,8 @@ RATIO_SECONDS = (0.25, 1.0, 4.0, 12.0)
 RELATION_SECONDS = (0.25, 1.0, 4.0, 12.0)
 
 BLOCK_SECONDS = 5.0  # whose largest values set the limits
-MARGIN = 1.5  # of a limit over the largest value seen
+HOURS = 100.0  # in which healthy drives are to exceed a limit about once
+LEAST_VALUES = 10.0  # independent ones that any time holds
 LEAST_Z = 4.5  # below which no statistic that is N(0, 1) while all is well counts
 LEAST_RUN = 4.0  # equal samples in a row
 LEAST_SHARE = 0.3
@@ -205,6 +207,7 @@ class HealthModel:
         names = list(self.channels)
         columns = [names.index(name) if name in names else -1 for name in ("yaw_rate", speed_channel(names) or "", "ay", "ax")]
         rows = [max(round(seconds * self.rate_hz), 1) for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)]
+        rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
         memories = (len(ENERGY_SECONDS), len(RATIO_SECONDS), len(RELATION_SECONDS))
         return Layout(len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows)
 
@@ -300,7 +303,7 @@ class HealthModel:
             *(statistic.kind for statistic in statistics),
             *(names.index(statistic.channel) for statistic in statistics),
             *(names.index(statistic.partner) if statistic.partner else -1 for statistic in statistics),
-            *(int(name in relation.channels(speed_channel(names))) for relation in self.relations for name in names),
+            *(relation.involves(name, speed_channel(names)) for relation in self.relations for name in names),
             *(names.index(relation.partner) for relation in self.relations),
         ]
         return PackedHealth(np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in numbers]), np.array(sizes, np.int64))
@@ -378,7 +381,7 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         levels=_plain(levels),
     )
     found = _with_healthy(_with_healthy(found, train), train)
-    return replace(found, limits=limits_from(block_maxima(found, [*train, *validation]), found.statistics))
+    return replace(found, limits=limits_from(block_maxima(found, [*train, *validation]), found.statistics, 1.0 / rate_hz))
 
 
 _STILL = (("yaw_rate", STILL_YAW_RATE), ("ay", STILL_AY))
@@ -437,15 +440,27 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
     return np.array(found)
 
 
-def limits_from(maxima: FloatArray, statistics: Sequence[Statistic]) -> tuple[float, ...]:
+def margin(seconds: float, healthy_seconds: float) -> float:
+    """By how much what is seen in a short time is exceeded in `HOURS`, if it is normal: the ratio of the largest of N values, √(2 ln N).
+
+    Args:
+        seconds: after which a statistic is about independent of what it was.
+        healthy_seconds: in which it was seen.
+    """
+    seen, wanted = (max(time / seconds, LEAST_VALUES) for time in (healthy_seconds, 3600.0 * HOURS))
+    return max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
+
+
+def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float) -> tuple[float, ...]:
     """Limits of all statistics from what blocks of healthy drives reach.
 
-    `MARGIN` times the largest value, where blocks that stand apart from all others by a factor of `APART`, at most `MOST_APART` of them
+    The largest value times `margin`, where blocks that stand apart from all others by a factor of `APART`, at most `MOST_APART` of them
     and one from thirty blocks on, do not count: recordings hold faults of their own.
 
     Args:
         maxima: of each block, (B, K).
         statistics: K.
+        step: between samples [s].
     """
     ordered = np.sort(maxima, axis=0)[::-1]
     set_aside = max(1, int(MOST_APART * len(maxima))) if len(maxima) >= 30 else 0
@@ -453,7 +468,7 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic]) -> tuple[fl
     for column, statistic in zip(ordered.T, statistics, strict=True):
         apart = [k for k in range(set_aside) if column[k] > APART * column[k + 1]]
         top = float(column[apart[-1] + 1] if apart else column[0])
-        limit = MARGIN * top
+        limit = margin(max(statistic.seconds, step), BLOCK_SECONDS * len(maxima)) * top
         if statistic.rule == "normal":
             limit = max(limit, LEAST_Z)
         elif statistic.rule == "run":

@@ -29,7 +29,7 @@ STEP_CLIP = 8.0  # the same for steps
 CALM = 0.3  # of the mean energy, that a calm stretch counts as at least
 CAP = 2.0  # times its limit, beyond which a statistic remembers no more, so that it is down again soon after a fault
 INVALID = 1.5  # times its limit, from which on an estimate is invalid and not only degraded
-CLEAR = 0.85  # times its limit, below which a statistic has to stay
+CLEAR = 0.95  # times its limit, below which a statistic has to stay
 BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather than lost
 SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
@@ -61,6 +61,7 @@ class Layout(NamedTuple):
     hold: int
     bridged: int
     spinning: int
+    settling: int
 
     @property
     def n_statistics(self) -> int:
@@ -69,10 +70,10 @@ class Layout(NamedTuple):
 
 
 N_CHANNELS, N_LAGS, N_RELATIONS, N_ENERGIES, N_RATIOS, N_AVERAGES, COLUMN_R, COLUMN_U, COLUMN_AY, COLUMN_AX = range(10)
-ROWS_HOLD, ROWS_BRIDGED, ROWS_SPIN, N_STATISTICS = range(10, 14)
+ROWS_HOLD, ROWS_BRIDGED, ROWS_SPIN, ROWS_SETTLE, N_STATISTICS = range(10, 15)
 """Where ``sizes`` holds what `Layout` lists, and the number of statistics."""
 
-PLACES = 14
+PLACES = 15
 """Where ``sizes`` begins to say at which place each table and each part of the state begins."""
 
 (
@@ -112,7 +113,7 @@ spin, forgetting of the share of equal samples, of ax, and of the low-pass that 
 )
 """Tables in ``sizes`` itself: of channels whether they are modelled, may rest, longest gap, whether a wheel, number in a code; column of a
 relation's target; of statistics kind of reason, column that it accuses, column of the partner (-1: none); of relations whether they
-involve a channel (R, C)."""
+involve a channel (R, C; 2: by a small term, which breaks them where it is wrong by far and is not proven right where they hold)."""
 
 (
     AT_FLAGS,
@@ -286,10 +287,10 @@ def _describe(sizes, numbers, state):  # type: ignore[no-untyped-def]
 @part()
 def _usable(i, sizes, numbers, state):  # type: ignore[no-untyped-def]
     """Whether channel i was measured, and so was what its relation is made of, for long enough to be predicted."""
-    p, to_r, to_u = sizes[N_LAGS], sizes[COLUMN_R], sizes[COLUMN_U]
+    to_r, to_u = sizes[COLUMN_R], sizes[COLUMN_U]
     at_flags, at_modelled, at_gap, at_instant = sizes[AT_FLAGS], sizes[AT_MODELLED], sizes[AT_GAP], sizes[AT_INSTANT]
     at_features = sizes[AT_FEATURES]
-    if state[at_flags] < p or sizes[at_modelled + i] == 0 or state[at_gap + i] != 0.0:
+    if state[at_flags] < sizes[ROWS_SETTLE] or sizes[at_modelled + i] == 0 or state[at_gap + i] != 0.0:
         return False
     for f in range(1, INSTANT_FEATURES):
         if numbers[at_instant + i * N_FEATURES + f] != 0.0:
@@ -413,15 +414,15 @@ def _effect(i, form, sizes, numbers, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_for_forms(at, sizes, numbers, state):  # type: ignore[no-untyped-def]
     """Steps, offsets, scales and delays of each channel; returns the next statistic."""
-    C, p, G = sizes[N_CHANNELS], sizes[N_LAGS], sizes[N_RATIOS]
+    C, G = sizes[N_CHANNELS], sizes[N_RATIOS]
     at_flags, at_modelled, at_gap, at_slope = sizes[AT_FLAGS], sizes[AT_MODELLED], sizes[AT_GAP], sizes[AT_SLOPE]
     at_level, at_stepped, at_step_power, at_statistics = sizes[AT_LEVEL], sizes[AT_STEPPED], sizes[AT_STEP_POWER], sizes[AT_STATISTICS]
     at_effect, at_clipped_score, at_precision = sizes[AT_EFFECT], sizes[AT_CLIPPED_SCORE], sizes[AT_PRECISION]
-    at_heaviest, at_healthy, at_forget_ratio, at_limits = sizes[AT_HEAVIEST], sizes[AT_HEALTHY], sizes[AT_FORGET_RATIO], sizes[AT_LIMITS]
+    at_heaviest, at_healthy, at_forget_ratio, at_inverse = sizes[AT_HEAVIEST], sizes[AT_HEALTHY], sizes[AT_FORGET_RATIO], sizes[AT_INVERSE]
     at_ratios = sizes[AT_RATIOS]
     for i in range(C):
         _slope(i, sizes, numbers, state)
-        counts = state[at_flags] >= p and sizes[at_modelled + i] == 1 and state[at_gap + i] == 0.0
+        counts = state[at_flags] >= sizes[ROWS_SETTLE] and sizes[at_modelled + i] == 1 and state[at_gap + i] == 0.0
         step, power = 0.0, 0.0
         for m in range(C):
             if state[at_slope + m] != 0.0:
@@ -444,18 +445,25 @@ def _look_for_forms(at, sizes, numbers, state):  # type: ignore[no-untyped-def]
             top -= numbers[at_healthy + form * C + i] * weight
             for g in range(G):
                 place = at + C + (form * C + i) * G + g
-                keep, roof = 1.0 - numbers[at_forget_ratio + g], CAP * numbers[at_limits + place]
+                keep = 1.0 - numbers[at_forget_ratio + g]
                 above = keep * state[at_ratios + (i * G + g) * 2 * N_FORMS + 2 * form] + top
                 below = keep * keep * state[at_ratios + (i * G + g) * 2 * N_FORMS + 2 * form + 1] + weight
                 z = abs(above) / math.sqrt(below) if below > 0.0 else 0.0
-                if z > roof:
-                    above *= roof / z
-                    z = roof
                 state[at_ratios + (i * G + g) * 2 * N_FORMS + 2 * form], state[at_ratios + (i * G + g) * 2 * N_FORMS + 2 * form + 1] = (
                     above,
                     below,
                 )
                 state[at_statistics + place] = z
+    for g in range(G):
+        highest = 0.0
+        for n in range(N_FORMS * C):
+            place = at + C + n * G + g
+            highest = max(highest, state[at_statistics + place] * numbers[at_inverse + place])
+        if highest > CAP:  # all alike, so that they still compare with each other
+            for n in range(N_FORMS * C):
+                form, i = n // C, n % C
+                state[at_statistics + at + C + n * G + g] *= CAP / highest
+                state[at_ratios + (i * G + g) * 2 * N_FORMS + 2 * form] *= CAP / highest
     return at + C * (1 + N_FORMS * G)
 
 
@@ -547,6 +555,8 @@ def _decide(k, out, absent, slow, sizes, numbers, state):  # type: ignore[no-unt
                 weightiest, best = weight, m
     level, kind, channel, other = 0.0, FREE, 0, -1
     if best >= 0:
+        if sizes[at_kind + best] in (OFFSET, SCALE, LATE):
+            best = _likeliest(best, sizes, state)
         kind, channel, other = sizes[at_kind + best], sizes[at_accused + best], sizes[at_partner + best]
         if kind == LOCKED:
             kind = _wheel(channel, slow, sizes, state)
@@ -572,6 +582,19 @@ def _decide(k, out, absent, slow, sizes, numbers, state):  # type: ignore[no-unt
         state[at_flags + 1] = state[at_flags + 1] - 1.0 if highest < CLEAR else float(hold)
         level, found = state[at_flags + 3], state[at_flags + 2]
     out[0, k], out[1, k], out[2, k] = level, found, highest
+
+
+@part()
+def _likeliest(best, sizes, state):  # type: ignore[no-untyped-def]
+    """The form and channel with the largest likelihood ratio over the time of one that was exceeded."""
+    C, G, E, at_statistics = sizes[N_CHANNELS], sizes[N_RATIOS], sizes[N_ENERGIES], sizes[AT_STATISTICS]
+    first = C * (4 + E)
+    found = best
+    for n in range(N_FORMS * C):
+        m = first + n * G + (best - first) % G
+        if state[at_statistics + m] > state[at_statistics + found]:
+            found = m
+    return found
 
 
 @part()
@@ -618,8 +641,8 @@ def _contradiction(sizes, numbers, state):  # type: ignore[no-untyped-def]
     for i in range(C):
         explains = True
         for j in range(R):
-            judged, involved = _judged(j, sizes, numbers, state), sizes[at_involved + j * C + i] == 1
-            if (judged > FREE and not involved) or (judged == FREE and involved):
+            judged, involved = _judged(j, sizes, numbers, state), sizes[at_involved + j * C + i]
+            if (judged > FREE and involved == 0) or (judged == FREE and involved == 1):
                 explains = False
         if explains:
             suspects, culprit = suspects + 1, i

@@ -9,7 +9,8 @@ signature to the channels adds s_k to the innovations, the signature through the
 
 ε being the innovations of the healthy drive. It detects where the sum first exceeds log A; A bounds the chance of a false alarm by 1/A
 (Wald, Sequential Analysis, 1947; Basseville & Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have
-heavier tails than a normal distribution, so A is raised to what the same test reaches anywhere on healthy drives.
+heavier tails than a normal distribution, so A is raised to what the same test reaches anywhere on healthy drives, with the reserve for longer
+times that limits of the detector have (`vehest.trust.health.margin`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from scipy import signal
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.trust.autoregression import Autoregression, NoiseLevels, fit_autoregression, learn_noise_levels
+from vehest.trust.health import margin
 from vehest.trust.relations import Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
 
 N_LEVELS = 5  # speeds at which the noise is looked at
@@ -62,7 +64,7 @@ class Oracle:
         levels: of the noise at each speed.
         healthy: innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each.
         false_alarms_per_hour: that the test may have.
-        reserve: how many times as large the innovations of healthy drives may be without an alarm, the margin of the detector.
+        reserve: how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector.
     """
 
     channels: tuple[str, ...]
@@ -180,7 +182,6 @@ def learn_oracle(
     channels: Sequence[str],
     rate_hz: float,
     false_alarms_per_hour: float = 1.0,
-    reserve: float = 1.5,
 ) -> Oracle:
     """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
 
@@ -188,7 +189,7 @@ def learn_oracle(
         train, validation: at ``rate_hz``.
         channels: that an estimator reads.
         rate_hz: [Hz].
-        false_alarms_per_hour, reserve: those of the detector that it is compared with.
+        false_alarms_per_hour: those of the detector that it is compared with.
 
     Raises:
         DataError: a channel is missing or there are too few samples.
@@ -203,5 +204,6 @@ def learn_oracle(
     speeds = [recording[speed] if speed else np.zeros(len(recording)) for recording in (*train, *validation)]
     seen = len(train)
     levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
+    reserve = margin(STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz)
     healthy = tuple(own / levels.at(at) for own, at in zip(innovations, speeds, strict=True))
     return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour, reserve)

@@ -27,6 +27,11 @@ SPEEDS = ("vx", "motor_speed", "wheel_speed_rl", "wheel_speed_rr", "wheel_speed_
 
 FEATURES = ("1", "r", "u", "u r", "(u r)³/100", "r/u", "ay", "ay/u²", "ay³/100", "r²", "u²", "ax")
 RATE = "du/dt"
+DRAG = ("r²", "u²")
+_SYMBOLS = dict(
+    zip(FEATURES, ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",)), strict=True)
+)
+_SYMBOLS[RATE] = "u"
 
 LOW_PASS_SECONDS = 0.5
 HUBER = 1.5  # robust standard deviations
@@ -50,11 +55,15 @@ class Relation:
     terms: dict[str, float] = field(default_factory=dict)
     instant: bool = False
 
-    def channels(self, speed: str | None) -> set[str]:
-        """Those that it takes: the target and what is in its terms, but for the small ones of drag."""
-        parts = " ".join(name for name in self.terms if name not in ("r²", "u²", RATE)).replace("/100", "").split()
-        named = {"yaw_rate": {"r", "(u", "r/u"}, "ay": {"ay", "ay/u²", "ay³"}, speed: {"u", "(u", "r/u", "ay/u²"}}
-        return {self.target, self.partner, *(name for name, words in named.items() if name and words & set(parts))}
+    def involves(self, channel: str, speed: str | None) -> int:
+        """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all; ``speed`` is the channel that u stands for."""
+        if channel in (self.target, self.partner):
+            return 1
+        symbol = {"yaw_rate": "r", "ay": "ay", "ax": "ax", speed: "u"}.get(channel)
+        if symbol is None:
+            return 0
+        large, small = ({part for name in self.terms if (name in DRAG) == drag for part in _SYMBOLS[name]} for drag in (False, True))
+        return 1 if symbol in large else 2 if symbol in small else 0
 
 
 def speed_channel(channels: Sequence[str]) -> str | None:

@@ -1,0 +1,133 @@
+"""The oracle against closed forms, and the autoregression against a planted one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from measured_drive import CHANNELS, RATE, measured_drive
+
+from vehest.data.errors import DataError
+from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
+from vehest.trust.oracle import Oracle, learn_oracle, likelihood_ratio_delay, motion_of
+
+COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
+COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
+
+
+def planted(samples: int, seed: int = 0) -> np.ndarray:
+    """Samples of an autoregression of order 2 around (3, -1)."""
+    generator = np.random.default_rng(seed)
+    noise = generator.multivariate_normal(np.zeros(2), COVARIANCE, samples)
+    found = np.zeros((samples, 2))
+    for k in range(2, samples):
+        found[k] = COEFFICIENTS[0] @ found[k - 1] + COEFFICIENTS[1] @ found[k - 2] + noise[k]
+    return found + np.array([3.0, -1.0])
+
+
+def test_the_planted_autoregression_is_found_with_its_order() -> None:
+    model = fit_autoregression([planted(20_000, seed) for seed in range(2)], max_order=6)
+    assert model.order == 2
+    np.testing.assert_allclose(model.coefficients, COEFFICIENTS, atol=0.03)
+    np.testing.assert_allclose(model.covariance, COVARIANCE, atol=0.03)
+    np.testing.assert_allclose(np.linalg.solve(np.eye(2) - model.coefficients.sum(0), model.constant), [3.0, -1.0], atol=0.4)
+
+
+def test_outliers_hardly_move_the_coefficients() -> None:
+    samples = planted(20_000)
+    samples[[500, 7000, 12_000], 0] += 500.0
+    np.testing.assert_allclose(fit_autoregression([samples], max_order=4).coefficients[:2], COEFFICIENTS, atol=0.05)
+
+
+def test_a_signature_moves_innovations_by_what_the_filter_makes_of_it() -> None:
+    model = fit_autoregression([planted(5000)], max_order=4)
+    healthy, signature = planted(300, seed=5), np.zeros((300, 2))
+    signature[100:, 1] = np.linspace(0.0, 5.0, 200)
+    moved = model.innovations(healthy + signature) - model.innovations(healthy)
+    np.testing.assert_allclose(moved[model.order :], model.filtered(signature)[model.order :], atol=1e-9)
+
+
+def test_too_few_samples_are_refused() -> None:
+    with pytest.raises(DataError, match="too few for an autoregression of order 10 in 2 channels"):
+        fit_autoregression([planted(60)], max_order=10)
+
+
+def test_noise_that_grows_with_the_speed_is_found() -> None:
+    generator = np.random.default_rng(0)
+    speed = generator.uniform(10.0, 50.0, 50_000)
+    levels = learn_noise_levels((speed / 30.0 * generator.standard_normal(50_000))[:, None], np.ones((1, 1)), speed, 5)
+    np.testing.assert_allclose(levels.at(np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
+
+
+def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form() -> None:
+    """Wald: the drift of the log-likelihood ratio is Δ²/(2 σ²) a sample, so that log A takes 2 log A σ²/Δ² samples on average."""
+    generator = np.random.default_rng(1)
+    step, deviation, threshold, drives = 0.3, 1.5, 6.0, 400
+    signature = np.full((6000, 1), step)
+    delays = [
+        likelihood_ratio_delay(signature, deviation * generator.standard_normal((6000, 1)), np.array([[deviation**2]]), threshold)
+        for _ in range(drives)
+    ]
+    assert None not in delays
+    found = np.array(delays, np.float64)
+    expected = 2.0 * threshold * deviation**2 / step**2
+    overshoot = 0.583 * step / deviation / (0.5 * (step / deviation) ** 2)  # Siegmund, Sequential Analysis, 1985, Section 8.5
+    assert abs(found.mean() - expected - overshoot) < 3.0 * found.std() / math.sqrt(drives)
+
+
+def test_a_correlated_channel_shortens_the_delay_as_the_information_says() -> None:
+    generator = np.random.default_rng(2)
+    covariance = np.array([[1.0, 0.9], [0.9, 1.0]])
+    signature = np.tile([0.1, 0.0], (6000, 1))
+    power = float(signature[0] @ np.linalg.solve(covariance, signature[0]))
+    delays = [
+        likelihood_ratio_delay(signature, generator.multivariate_normal(np.zeros(2), covariance, 6000), covariance, 6.0) for _ in range(200)
+    ]
+    found = np.array(delays, np.float64)
+    assert abs(found.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))) < 3.0 * found.std() / math.sqrt(len(found))
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Oracle:
+    return learn_oracle([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
+
+
+def test_the_oracle_sees_larger_faults_sooner_and_small_ones_not_at_all(oracle: Oracle) -> None:
+    drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
+    ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
+    seen = [oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000) for slope in (1e-4, 0.3, 1.0, 5.0)]
+    assert [each.visible for each in seen] == [False, True, True, True]
+    assert seen[1].delay > seen[2].delay > seen[3].delay > 0.0
+
+
+def test_what_is_not_finite_is_seen_at_its_first_sample(oracle: Oracle) -> None:
+    drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
+    lost = np.array(drive["yaw_rate"])
+    lost[2010:2020] = np.nan
+    assert oracle.sees(drive, {**drive, "yaw_rate": lost}, 2000).delay == pytest.approx(11 / RATE)
+
+
+def test_random_noise_is_seen_by_its_size_and_not_by_its_draws(oracle: Oracle) -> None:
+    drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
+    added = np.random.default_rng(0).standard_normal(len(drive["ay"])) * (np.arange(len(drive["ay"])) >= 2000)
+    loud, faint = (oracle.sees(drive, {**drive, "ay": drive["ay"] + size * added}, 2000, drawn=True) for size in (1.0, 0.01))
+    assert loud.visible
+    assert not faint.visible
+    known = oracle.sees(drive, {**drive, "ay": drive["ay"] + 1.0 * added}, 2000)
+    assert known.delay <= loud.delay
+
+
+def test_motion_keeps_swerves_and_drops_noise() -> None:
+    time = np.arange(2000) / 100.0
+    noise = np.random.default_rng(0).standard_normal(2000)
+    swerve = 3.0 * np.sin(2.0 * np.pi * 0.4 * time)
+    left = motion_of({"ay": swerve + noise}, 100.0)["ay"] - swerve
+    assert left[200:-200].std() < 0.4
+
+
+def test_innovations_of_an_order_are_missing_for_as_many_samples() -> None:
+    model = Autoregression(np.zeros(1), np.array([[[0.5]], [[0.1]]]), np.ones((1, 1)))
+    found = model.innovations(np.arange(5.0)[:, None])[:, 0]
+    np.testing.assert_allclose(found[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2])
+    assert np.isnan(found[:2]).all()
