@@ -50,7 +50,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         axes = figure.add_subplot()
         axes.plot([0.0, 1.0], [0.0, 1.0], color=REFERENCE.colour, linewidth=0.7)
         for position, row in enumerate(rows):
-            at = nominal + SIDESTEP * (position - 0.5 * (len(rows) - 1))
+            at = nominal + _aside(position, len(rows))
             axes.vlines(at, row.low, row.high, color=row.line.colour, linewidth=0.8, alpha=0.6)
             axes.plot(at, row.coverage, color=row.line.colour, linestyle=row.line.dash, marker=row.line.marker)
         lowest = float(np.nanmin([[row.coverage.min(), np.nanmin(row.low, initial=1.0)] for row in rows]))
@@ -61,18 +61,23 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         axes.set_yticks(ticks := np.arange(np.ceil(10 * bottom) / 10, 1.01, 0.1), [f"{100 * tick:.0f}" for tick in ticks])
         axes.set_xlabel("nominal level [%]")
         axes.set_ylabel("errors of β inside [%]")
-        for row, height in zip(rows, _apart([float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0), strict=True):
+        heights = _apart([float(row.coverage[-1]) for row in rows], LABEL_STEP * (1.01 - bottom), 1.0)
+        for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
             axes.annotate(
                 row.label,
-                (float(nominal[-1]), float(row.coverage[-1])),
-                (1.01, height),
+                (float(nominal[-1]) + _aside(position, len(rows)), float(row.coverage[-1])),
+                (1.02, height),
                 color=row.line.colour,
                 fontsize=6.5,
                 va="center",
                 annotation_clip=False,
-                arrowprops={"arrowstyle": "-", "color": row.line.colour, "linewidth": 0.4, "shrinkA": 0, "shrinkB": 2},
+                arrowprops={"arrowstyle": "-", "color": row.line.colour, "linewidth": 0.4, "shrinkA": 1, "shrinkB": 2, "relpos": (0, 0.5)},
             )
     return figure
+
+
+def _aside(position: int, count: int) -> float:
+    return SIDESTEP * (position - 0.5 * (count - 1))
 
 
 def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:
