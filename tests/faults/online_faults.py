@@ -36,7 +36,6 @@ from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.stages.downsample import transforms_of
-from vehest.trust.contract import GuardedStepper
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import GuardLimits, learn_limits
 from vehest.trust.watch import STARTED
@@ -154,7 +153,7 @@ def sideslip(vy: np.ndarray, vx: np.ndarray) -> np.ndarray:
 
 def walk(estimator: Estimator, limits: GuardLimits, samples: Mapping[str, np.ndarray]) -> tuple[np.ndarray, int, int, bool]:
     """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
-    stepper = GuardedStepper(estimator, limits)
+    stepper = vehest.online(estimator)
     names, steps = list(samples), len(next(iter(samples.values())))
     said, exceptions, starts = np.full(steps, np.nan), 0, 0
     rows = np.stack([samples[name] for name in names], 1).tolist()
