@@ -217,7 +217,7 @@ def train(
         _say(as_json, {"model": str(model.folder), "status": model.status, "skipped": model.skipped, **read_fit_metrics(model.folder)})
 
 
-@app.command("eval", epilog=_offered("split", "estimator"))
+@app.command("eval", epilog=_offered("split", "estimator", "fault"))
 def evaluate(
     overrides: Annotated[list[str] | None, _overrides("eval")] = None,
     model: Annotated[
@@ -236,18 +236,22 @@ def evaluate(
 ) -> None:
     """Score a fitted estimator on the test ranges of a split: `vehest eval estimator=ksnn seed=7`, with the overrides of its training.
 
-    Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`.
+    Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
+    `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
     from vehest.stages.artefacts import find, read_artefact
     from vehest.stages.comparison import plain_resampling
     from vehest.stages.estimate import find_model, preparation_of
-    from vehest.stages.evaluate import plan_evaluate, protocol_from_config, write_evaluation
+    from vehest.stages.evaluate import protocol_from_config
+    from vehest.stages.evaluate_faults import fault_figures, write_faulted
+    from vehest.stages.faults import check_channels, faults_of
     from vehest.stages.fitting import fitted_evaluation
     from vehest.stages.group import Evaluation
     from vehest.stages.train import trained_rate
     from vehest.stages.workshop import test_figures
 
     config = _compose("eval", overrides or [])
+    faults = faults_of(config)
     with _workshop(config, force={"evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
         split = workshop.split(config)
         if model is not None:
@@ -266,10 +270,11 @@ def evaluate(
             trained = found
         protocol = protocol_from_config(config["evaluation"])
         data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-        scoring = plan_evaluate(trained, split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
-        artefact = workshop.ensure(scoring.plan, lambda folder: write_evaluation(scoring, folder))
-        figures = test_figures(artefact)
-        how = Evaluation(split, data, references, scoring.kinds, protocol, workshop.output)
+        check_channels(faults, split, data)
+        how = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output, faults)
+        scoring = how.of(trained)
+        artefact = workshop.ensure(scoring.plan, lambda folder: write_faulted(scoring, folder))
+        figures = test_figures(artefact) | fault_figures(artefact.folder)
         workshop.log_evaluation(artefact, trained, how)
     _say(as_json, {"folder": str(artefact.folder), "skipped": artefact.skipped, **figures})
 
@@ -411,7 +416,7 @@ def _check_published(words: list[str], as_json: bool) -> None:
         raise typer.Exit(3)
 
 
-@app.command(epilog=_offered("split", "estimator", "training", "tracking"))
+@app.command(epilog=_offered("split", "estimator", "training", "fault", "tracking"))
 def sweep(
     overrides: Annotated[list[str] | None, _overrides("eval")] = None,
     name: Annotated[

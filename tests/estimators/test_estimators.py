@@ -6,86 +6,11 @@ import numpy as np
 import pytest
 import yaml
 
-from conftest import planar_drive
-from dugoff_drive import TYRES
-from single_track_drive import linear_drive
-from small_car_drive import small_car_drive
+from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
-from vehest.estimators.base import FitData
-from vehest.estimators.cnn_ukf import EndToEndSettings
-from vehest.estimators.ensemble_ukf import EnsembleSettings
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
-from vehest.training.identification import IdentificationSettings
-from vehest.training.noise_tuning import NoiseTuningSettings
-from vehest.training.nothing import NoTraining
-from vehest.training.samples import SampleSettings
-from vehest.training.search import DirectSearchSettings
-from vehest.training.sequences import PhaseSettings
-from vehest.training.supervised import SupervisedSettings
-from vehest.training.through_filter import ThroughFilterSettings
-
-VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
-SMALL = {"inputs": "imu", "hidden": [8, 4]}
-DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
-CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
-    "factor_graph": {"window": 0.05},
-    "data_sheet": {"wheelbase": 2.7},
-    "velocity_gru": VELOCITIES,
-    "velocity_lstm": VELOCITIES,
-    "learned_ukf": {"width": 8},
-    "dugoff_ukf": {"inputs": "imu", **DUGOFF},
-    "sideslip_ffnn": SMALL,
-    "ensemble_ukf": {"members": 2, **SMALL, **DUGOFF},
-    "cnn_ukf": {**SMALL, **DUGOFF},
-    "rational_ekf": {"curves": {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}},
-}
-ONCE, GIVEN = PhaseSettings(max_epochs=1), IdentificationSettings(method="data")
-SAMPLED = {
-    SampleSettings: lambda dtype: SampleSettings(ONCE, 256, dtype),
-    EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
-    EndToEndSettings: lambda dtype: EndToEndSettings(ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype),
-}
-
-
-def _fitted(name, dtype="float64", **config):
-    if name == "factor_graph":
-        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
-    estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
-    estimator.seed(0)
-    if estimator.training_type is NoTraining:
-        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), NoTraining())
-    elif estimator.training_type is SequenceSettings:
-        training = SequenceSettings(PhaseSettings(max_epochs=1), 100, 100, 20, dtype=dtype)
-        estimator.fit(FitData([planar_drive(3.0, 100.0, noise=0.05)], [planar_drive(3.0, 100.0, seed=1)]), training)
-    elif estimator.training_type is ThroughFilterSettings:
-        once = PhaseSettings(learning_rate=5e-3, max_epochs=1)
-        training = ThroughFilterSettings(once, 100, once, once, steps=50, validation_steps=100, validation_drop_steps=20, dtype=dtype)
-        estimator.fit(FitData([small_car_drive(2.0)], [small_car_drive(1.5, 1)]), training)
-    elif estimator.training_type is NoiseTuningSettings:
-        estimator.fit(FitData([linear_drive(20.0, 20.0)[0]], [linear_drive(10.0, 20.0)[0]]), NoiseTuningSettings(method="data"))
-    elif estimator.training_type is IdentificationSettings:
-        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0)[0]]), IdentificationSettings(method="data"))
-    elif estimator.training_type in SAMPLED:
-        training = SAMPLED[estimator.training_type](dtype)
-        estimator.fit(FitData([linear_drive(20.0)[0]], [linear_drive(10.0, seed=1)[0]]), training)
-    elif name == "luenberger":
-        data = FitData([planar_drive(20.0, 100.0, noise=0.05)], [planar_drive(10.0, 100.0, seed=1)])
-        estimator.fit(data, DirectSearchSettings(grid=2, max_evaluations=40))
-    else:
-        data = FitData([planar_drive(20.0, noise=0.05)], [planar_drive(10.0, seed=1)])
-        estimator.fit(data, SupervisedSettings(max_epochs=2, dtype=dtype))
-    return estimator
-
-
-def _drive_for(estimator):
-    if "motor_current" in estimator.channels:
-        return small_car_drive(3.0, 4).without_references()
-    if "steer" in estimator.channels:
-        return linear_drive(12.0, estimator.settings.rate_hz, seed=4)[0].without_references()
-    return planar_drive(12.0, estimator.settings.rate_hz, seed=4, noise=0.02).without_references()
 
 
 def test_parameter_counts_are_those_of_the_paper():
@@ -110,8 +35,8 @@ def test_parameter_counts_are_those_of_the_paper():
 @pytest.mark.parametrize("name", estimator_names())
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_online_agrees_with_batch(name, dtype, tolerance):
-    estimator = _fitted(name, dtype)
-    drive = _drive_for(estimator)
+    estimator = fitted(name, dtype)
+    drive = drive_for(estimator)
     batch = estimator.estimate([drive])[0]["vy"]
     stepper = estimator.online()
     online = np.full(len(drive) + stepper.horizon_steps, np.nan)
@@ -125,8 +50,8 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", estimator_names())
 def test_estimates_use_no_future_measurements(name):
-    estimator = _fitted(name)
-    drive = _drive_for(estimator)
+    estimator = fitted(name)
+    drive = drive_for(estimator)
     half = len(drive) // 2
     changed = {channel: np.concatenate([samples[:half], samples[half:] + 1.0]) for channel, samples in drive.channels.items()}
     other = type(drive)(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, changed, drive.kind)
@@ -136,10 +61,10 @@ def test_estimates_use_no_future_measurements(name):
 
 @pytest.mark.parametrize("name", estimator_names())
 def test_model_read_back_estimates_the_same(tmp_path, name):
-    estimator = _fitted(name, "float32")
+    estimator = fitted(name, "float32")
     save_model(estimator, tmp_path, {"seed": 0})
     loaded = load_model(tmp_path)
-    drive = _drive_for(estimator)
+    drive = drive_for(estimator)
     one, other = estimator.estimate([drive])[0], loaded.estimate([drive])[0]
     assert np.array_equal(one["vy"], other["vy"], equal_nan=True)
     assert loaded.settings == estimator.settings
@@ -147,7 +72,7 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 
 def test_model_files_execute_nothing(tmp_path):
-    save_model(_fitted("luenberger"), tmp_path)
+    save_model(fitted("luenberger"), tmp_path)
     marker = tmp_path / "executed"
     text = (tmp_path / "model.yaml").read_text()
     (tmp_path / "model.yaml").write_text(text + f"evil: !!python/object/apply:os.mkdir ['{marker}']\n")
@@ -161,7 +86,7 @@ def test_model_files_execute_nothing(tmp_path):
 
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
-    save_model(_fitted("ksnn"), tmp_path)
+    save_model(fitted("ksnn"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
     with pytest.raises(DataError, match="truncated or damaged"):
@@ -169,7 +94,7 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
 
 
 def test_weights_of_another_structure_are_refused(tmp_path):
-    save_model(_fitted("ksnn"), tmp_path)
+    save_model(fitted("ksnn"), tmp_path)
     description = yaml.safe_load((tmp_path / "model.yaml").read_text())
     description["settings"]["n_local"] = 4
     (tmp_path / "model.yaml").write_text(yaml.safe_dump(description))
@@ -183,7 +108,7 @@ def test_folder_without_model_is_one_clear_error(tmp_path):
 
 
 def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
-    estimator = _fitted("ksnn")
+    estimator = fitted("ksnn")
     with pytest.raises(DataError, match="works at 20 Hz; resample it first"):
         estimator.estimate([Resample(10).__call__(drive)])
     with pytest.raises(DataError, match="no channel 'ax'"):
@@ -195,14 +120,14 @@ def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
 
 
 def test_sideslip_is_atan2_of_estimated_vy_and_measured_vx(drive):
-    estimate = _fitted("gru").estimate([drive.without_references()])[0]
+    estimate = fitted("gru").estimate([drive.without_references()])[0]
     assert np.array_equal(estimate["sideslip"], np.arctan2(estimate["vy"], drive["vx"]), equal_nan=True)
 
 
 def test_luenberger_starts_from_a_state_that_is_handed_over():
-    estimator = _fitted("luenberger")
+    estimator = fitted("luenberger")
     estimator.threshold = 0.0
-    drive = _drive_for(estimator)
+    drive = drive_for(estimator)
     free = estimator.estimate([drive])[0]["vy"]
     started = estimator.estimate([drive], {"vy": 2.0})[0]["vy"]
     assert abs(started[0] - free[0]) > 1.0
@@ -210,8 +135,8 @@ def test_luenberger_starts_from_a_state_that_is_handed_over():
 
 
 def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
-    estimator = _fitted("luenberger")
-    drive = _drive_for(estimator)
+    estimator = fitted("luenberger")
+    drive = drive_for(estimator)
     states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
     both = estimator.estimate([drive, drive], states)
     for state, own in zip(states, both, strict=True):
@@ -226,7 +151,7 @@ def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
 
 def test_window_network_has_no_state_to_start_from(drive):
     with pytest.raises(ConfigurationError, match="no state to start from"):
-        _fitted("ksnn").estimate([drive], {"vy": 1.0})
+        fitted("ksnn").estimate([drive], {"vy": 1.0})
 
 
 def test_registry_knows_names_and_modules():

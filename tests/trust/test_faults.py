@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -314,3 +315,35 @@ def test_what_is_no_condition_is_refused(text):
 def test_a_channel_that_is_not_there_is_named(samples):
     with pytest.raises(ConfigurationError, match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate"):
         inject(samples, RATE, Fault("bias", "handwheel", "mild"))
+
+
+# What the page says
+
+
+def cells(start: str) -> list[str]:
+    """Cells of the row of docs/trust.md that begins with this."""
+    text = (Path(__file__).parents[2] / "docs" / "trust.md").read_text(encoding="utf-8")
+    row = next(line for line in text.splitlines() if line.startswith(f"| {start}"))
+    return [cell.strip() for cell in row.strip("|").split("|")]
+
+
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"bias", "drift", "spikes", "noise", "unit", "lost_wheel", "huge"}))
+def test_the_page_states_the_sizes_of_a_kind(kind):
+    assert [float(cell) for cell in cells(f"`{kind}`")[-3:]] == [size_of(kind, "ay", severity) for severity in SEVERITIES]
+
+
+@pytest.mark.parametrize(
+    ("row", "channel", "scale"),
+    [
+        ("`vx`", "vx", 1.0),
+        ("`yaw_rate`", "roll_rate", math.degrees(1.0)),
+        ("`ax`", "ay", 1.0),
+        ("`steer`", "pitch", math.degrees(1.0)),
+        ("`handwheel`", "handwheel", math.degrees(1.0)),
+        ("wheel speeds", "wheel_speed_rl", 1.0),
+        ("any other", "brake_pressure_rear", 1.0 / 4e7),
+    ],
+)
+def test_the_page_states_the_offsets_of_a_channel(row, channel, scale):
+    stated = [float(cell.split()[0]) for cell in cells(row)[-3:]]
+    assert stated == pytest.approx([scale * size_of("bias", channel, severity) for severity in SEVERITIES])

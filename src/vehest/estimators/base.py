@@ -121,6 +121,16 @@ class Estimator(ABC):
         return True
 
     @property
+    def horizon_steps(self) -> int:
+        """How many sampling intervals after a sample the estimate made with it holds."""
+        return 0
+
+    @property
+    def warm_up_steps(self) -> int:
+        """Samples after its first for which it has no estimate yet."""
+        return 0
+
+    @property
     def variant(self) -> str:
         """What the paper calls this configuration."""
         return self.name

@@ -10,6 +10,7 @@ from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, M
 from vehest.stages.config import Config
 from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.failures import Failure, failure_of
+from vehest.stages.faults import all_of, check_channels, faults_of
 from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished
 from vehest.stages.train import TrainJob, new_estimator, plan_train
@@ -165,6 +166,7 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group],
     evaluations: dict[tuple[Any, ...], Evaluation] = {}
     labels: dict[str, str] = {}
     unplanned: dict[int, Failure] = {}
+    faults = all_of(map(faults_of, configs))  # all jobs of a comparison are scored under the same conditions
     for position, config in enumerate(configs):
         split = workshop.split(config)
         if not any(split.tests.values()):
@@ -181,8 +183,11 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group],
             raise ConfigurationError(
                 f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
             )
-        groups.setdefault(job.group, []).append(job)
-        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output)
+        check_channels(faults, split, data)
+        own = groups.setdefault(job.group, [])
+        if all(job.plan.key != other.plan.key for other in own):  # which another job with another fault may be
+            own.append(job)
+        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output, faults)
     if not groups:
         raise DataError(next(iter(unplanned.values())).message)
     failures = _lacking(Fitted(configs, unplanned))

@@ -83,7 +83,7 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     check_local_files()
     try:
         with initialize_config_dir(config_dir=str(packaged_conf()), version_base="1.3"):
-            composed = compose(command, overrides=list(overrides))
+            composed = compose(command, overrides=[override.input_line for override in parsed])
         check_references(OmegaConf.to_container(composed, resolve=False))
         resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, RecursionError, OSError) as error:
@@ -196,7 +196,10 @@ def missing_keys(config: Any, prefix: str = "") -> list[str]:
 def _parsed(text: str) -> Override:
     _check_readable(text)
     try:
-        return OverridesParser.create().parse_override(text)
+        override = OverridesParser.create().parse_override(text)
+        if override.key_or_group in GROUPS and isinstance(override.value(), float):  # a choice called nan or inf
+            return OverridesParser.create().parse_override(f"{override.get_key_element()}='{override.value()}'")
+        return override
     except HydraException as error:
         if "=" not in text:
             raise ConfigurationError(f"'{text}' is not an override; write key=value, for example estimator=ksnn") from None

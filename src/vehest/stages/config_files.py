@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "tracking")
+GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "tracking")
 
 
 def packaged_conf() -> Path:

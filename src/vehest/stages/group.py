@@ -13,7 +13,9 @@ from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
 from vehest.stages.artefacts import Artefact, Status, ensured, find, make
-from vehest.stages.evaluate import plan_evaluate, write_evaluation
+from vehest.stages.evaluate import plan_evaluate
+from vehest.stages.evaluate_faults import FaultedJob, write_faulted
+from vehest.stages.faults import FaultSettings
 from vehest.stages.locks import Waiting, held, held_at_once
 from vehest.stages.train import TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
@@ -31,6 +33,7 @@ class Evaluation:
         kinds: data set -> ``real`` or ``simulated``.
         protocol: how estimates are scored.
         output: the output root.
+        faults: under which they are evaluated too.
     """
 
     split: Split
@@ -39,6 +42,12 @@ class Evaluation:
     kinds: Mapping[str, str]
     protocol: Protocol
     output: Path
+    faults: tuple[FaultSettings, ...] = ()
+
+    def of(self, model: Artefact) -> FaultedJob:
+        """The evaluation of a model."""
+        job = plan_evaluate(model, self.split, self.data, self.references, self.kinds, self.protocol, self.output)
+        return FaultedJob(job, self.faults)
 
 
 @dataclass(frozen=True)
@@ -180,15 +189,13 @@ def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progres
 def _found_evaluation(group: Group, model: Artefact | None) -> Artefact | None:
     if model is None or group.evaluation is None or "evaluate" in group.force:
         return None
-    e = group.evaluation
-    return find(plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output).plan)
+    return find(group.evaluation.of(model).plan)
 
 
 def _evaluated(group: Group, model: Artefact, should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Artefact | None:
     """The evaluation of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
-    e = group.evaluation
-    assert e is not None
-    job = plan_evaluate(model, e.split, e.data, e.references, e.kinds, e.protocol, e.output)
+    assert group.evaluation is not None
+    job = group.evaluation.of(model)
     return _found_evaluation(group, model) or ensured(
-        job.plan, lambda folder: write_evaluation(job, folder), "evaluate" in group.force, should_stop, say
+        job.plan, lambda folder: write_faulted(job, folder), "evaluate" in group.force, should_stop, say
     )

@@ -39,6 +39,7 @@ from vehest.studies.registry import study_module, study_names
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
 
 Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
+Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
 Names = Annotated[tuple[str, ...], "a list of names"]
 
 
@@ -61,7 +62,7 @@ class PipelineFile:
     title: str | None = None
     about: str | None = None
     publish: bool = False
-    evaluation: dict[str, int | float | bool | str | None] | None = None
+    evaluation: dict[str, int | float | bool | str | Faults | None] | None = None
     split: str | None = None
     sweeps: Sweeps | None = None
     parts: Annotated[dict[str, PartFile | None], "a mapping from names to what each has"] | None = None
@@ -181,7 +182,7 @@ def read_pipeline(name: str) -> Pipeline:
         about=" ".join((described.about or "").split()),
         report=described.report,
         parts=_folds_of(made[0], file) if folded else made,
-        evaluation=tuple(f"evaluation.{key}={_as_override(value)}" for key, value in (described.evaluation or {}).items()),
+        evaluation=tuple(_evaluation_override(key, value, file) for key, value in (described.evaluation or {}).items()),
         publish=described.publish,
         file=file,
         datasets=datasets,
@@ -214,6 +215,23 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
     merged = {**base, **{key: value for key, value in content.items() if key != "based_on"}}
     kept = {key: {**(part or {}), **(changes.get(key) or {})} for key, part in parts.items() if changes.get(key, part) is not None}
     return file, merged | ({"parts": kept} if parts else {})
+
+
+def _evaluation_override(key: str, value: Any, file: Path) -> str:
+    """What a pipeline says of its evaluation as an override; the faults of an evaluation are a key of their own."""
+    if key == "faults":
+        if not isinstance(value or (), tuple):
+            raise ConfigurationError(f"'{file}': evaluation.faults must be a list of faults, not {value!r}")
+        return f"faults=[{','.join(_fault_as_override(fault) for fault in value or ())}]"
+    if isinstance(value, tuple):
+        raise ConfigurationError(f"'{file}': evaluation.{key} takes one value; a list of faults is called faults")
+    return f"evaluation.{key}={_as_override(value)}"
+
+
+def _fault_as_override(fault: Mapping[str, int | float | str | None]) -> str:
+    """A mapping in Hydra's grammar, its text in quotes: nan would be a number."""
+    said = {name: f"'{value}'" if isinstance(value, str) else _as_override(value) for name, value in fault.items()}
+    return "{" + ",".join(f"{name}:{value}" for name, value in said.items()) + "}"
 
 
 def _as_override(value: int | float | bool | str | None) -> str:
@@ -321,7 +339,7 @@ def _part_configs(
         for job in expand([f"split={part.split}", *part.overrides, *evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
             shared = tuple(override for override in job if override not in seeds)
-            base = config_of(shared)
+            base = config_of((*shared, *(override for override in overrides if key_of(override) == "fault")))  # which has further keys
             suiting = [override for override in overrides if key_of(override) in GROUPS or has_key(base, key_of(override))]
             used.update(suiting)
             config = dict(config_of((*shared, *suiting)))

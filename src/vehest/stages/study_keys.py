@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from vehest.data.split_files import dataset_names
@@ -18,6 +19,8 @@ from vehest.stages.comparison import resampling_fact, training_facts
 from vehest.stages.config import Config
 from vehest.stages.downsample import code_of_downsampling
 from vehest.stages.evaluate import code_of_evaluation
+from vehest.stages.evaluate_faults import code_of_faults
+from vehest.stages.faults import all_of, faults_of
 from vehest.stages.ingest import PROSE, code_of_ingest
 from vehest.stages.report import code_of_report
 from vehest.stages.train import code_of_training
@@ -69,6 +72,7 @@ def keys_of_study(
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     """Keys of a comparison, one an estimator and stage."""
     first = configs[0]
+    faults = all_of(map(faults_of, configs))
     rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(first["evaluation"]["rate_hz"])})
     yield "split", {CONFIGURATION: _hash(first["split"])}
     yield "downsample", {CODE: code_of_downsampling(), CONFIGURATION: _hash([first["downsample"], rates])}
@@ -77,7 +81,11 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
         module = estimator_module(name)
         yield f"train {name}", {CODE: code_of_training(module), CONFIGURATION: _hash(trained)}
-        yield f"evaluate {name}", {CODE: code_of_evaluation(module), CONFIGURATION: _hash(first["evaluation"])}
+        if not faults:
+            yield f"evaluate {name}", {CODE: code_of_evaluation(module), CONFIGURATION: _hash(first["evaluation"])}
+            continue
+        told = [first["evaluation"], *map(asdict, faults)]
+        yield f"evaluate {name}", {CODE: _hash([code_of_evaluation(module), code_of_faults()]), CONFIGURATION: _hash(told)}
 
 
 def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, str]:

@@ -14,23 +14,25 @@ from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, V
 from vehest.data.limits import use_limits
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import VALIDATION, Split, check_name
+from vehest.evaluation.under_fault import FAULTED
 from vehest.stages.artefacts import Artefact, StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.comparison import plain_resampling, resampling_fact, training_facts
 from vehest.stages.config import Config, check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
 from vehest.stages.evaluate import COLUMNS, METRICS, protocol_from_config
+from vehest.stages.faults import FaultSettings, all_of, check_channels, chosen_fault, faults_of
 from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member
 from vehest.stages.pipeline import content_overrides
 from vehest.stages.train import new_estimator, plan_train
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.artefacts import read_frame
-from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, Value, build, short_names, shown_value, summary
+from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, Value, build, is_of_fault, short_names, shown_value, summary
 
 STAGE = "sweep"
 JOBS = "sweep.csv"
 SUMMARY = "summary.csv"
-ONE_VALUE = ("split", "evaluation", "root", "output", "tracking", "limits")
+ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
@@ -195,6 +197,7 @@ def _combinations(jobs: Sequence[Sequence[str]], swept: Sequence[str]) -> list[C
             config = compose_config("eval", job)
             estimator = new_estimator(config["estimator"])
             settings_from_config(estimator.training_type, config["training"], "training")
+            faults_of(config)
         except ConfigurationError as error:
             combinations.append(Combination(label or "this", values, {}, refusal=str(error)))
             continue
@@ -236,33 +239,53 @@ def _evaluation(sweep: Sweep, workshop: Workshop) -> Evaluation:
 
 
 def _groups(sweep: Sweep, evaluation: Evaluation, workshop: Workshop) -> tuple[dict[int, Group], dict[str, str]]:
-    """Position of a combination -> its jobs, which train together; and what cannot be trained -> why."""
+    """Position of a combination -> its jobs, which train together; and what cannot be trained -> why.
+
+    Combinations that differ in their fault alone share one group: it is trained once, and evaluated under the faults of all.
+    """
     groups: dict[int, Group] = {}
     failures: dict[str, str] = {}
-    owners: dict[str, str] = {}
+    owners: dict[tuple[str, ...], list[int]] = {}
     for position, combination in enumerate(sweep.combinations):
         if combination.refusal:
             continue
-        jobs = []
         try:
             data = workshop.data_for(evaluation.split, new_estimator(combination.config["estimator"]).settings.rate_hz, combination.config)
-            for seed in sweep.seeds:
-                job = plan_train({**combination.config, "seed": seed}, evaluation.split, data)
-                owner = owners.setdefault(job.plan.key, combination.label)
-                if owner != combination.label:
-                    raise ConfigurationError(f"it is the same training as {owner}")
-                jobs.append(job)
+            jobs = [plan_train({**combination.config, "seed": seed}, evaluation.split, data) for seed in sweep.seeds]
+            faults = faults_of(combination.config)
+            check_channels(faults, evaluation.split, data)
+            together = owners.setdefault(tuple(job.plan.key for job in jobs), [])
+            for other in together:
+                if _fault_values(combination) == _fault_values(sweep.combinations[other]):
+                    raise ConfigurationError(f"it is the same training as {sweep.combinations[other].label}")
+            if together:
+                faults = all_of([groups[together[0]].evaluation.faults, faults])  # type: ignore[union-attr]
         except VehestError as error:
             failures[combination.label] = str(error)
             workshop.messages.line("fail", "sweep", combination.label, str(error))
             continue
-        groups[position] = Group(jobs, replace(evaluation, data=data), workshop.force, combination.label)
+        together.append(position)
+        group = Group(jobs, replace(evaluation, data=data, faults=faults), workshop.force, _label_of(combination))
+        groups |= dict.fromkeys(together, group)
     return groups, failures
+
+
+def _fault_values(combination: Combination) -> dict[str, Value]:
+    return {key: value for key, value in combination.values.items() if is_of_fault(key)}
+
+
+def _label_of(combination: Combination) -> str:
+    """What is trained for a combination, for people: its label without its fault."""
+    if not _fault_values(combination):
+        return combination.label
+    trained = {key: value for key, value in combination.values.items() if not is_of_fault(key)}
+    names = short_names(list(trained))
+    return ", ".join(f"{names[key]}={shown_value(value)}" for key, value in trained.items()) or combination.title
 
 
 def _run(groups: Mapping[int, Group], workshop: Workshop) -> tuple[list[Member], dict[str, str]]:
     """Train and evaluate; where seeds that train together fail, each is tried alone, so that one takes no other with it."""
-    members, failed = workshop.run_groups(list(groups.values()))
+    members, failed = workshop.run_groups(list({id(group): group for group in groups.values()}.values()))
     finished = {member.job.plan.key for member in members}
     failures: dict[str, str] = {}
     alone: list[Group] = []
@@ -297,8 +320,9 @@ def _job_table(
         for seed, job in zip(sweep.seeds, jobs, strict=True):
             member = done.get(job.plan.key) if job is not None else None
             row: dict[str, Any] = {"combination": position, "title": combination.title, **combination.values, "seed": seed}
-            row |= {"status": DONE if member else FAILED, "error": "" if member else _reason(failures, combination.label, seed)}
-            row |= _figures(member, sets)
+            label = groups[position].label if position in groups else combination.label
+            row |= {"status": DONE if member else FAILED, "error": "" if member else _reason(failures, label, seed)}
+            row |= _figures(member, sets, None if combination.refusal else chosen_fault(combination.config))
             rows.append(row)
     return pd.DataFrame(rows)
 
@@ -309,16 +333,22 @@ def _reason(failures: Mapping[str, str], label: str, seed: Any) -> str:
     return next((reason for name, reason in failures.items() if name in own or name.startswith(f"{label} seeds ")), "")
 
 
-def _figures(member: Member | None, sets: Sequence[str]) -> dict[str, Any]:
-    """Figures of a job, ``METRIC.SET``; NaN where it failed."""
+def _figures(member: Member | None, sets: Sequence[str], fault: FaultSettings | None) -> dict[str, Any]:
+    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one; NaN where it failed."""
     columns = ["n_parameters", "epochs", *(f"{metric}.{name}" for name in sets for metric in SCORES)]
     if member is None or member.model is None or member.evaluation is None:
         return dict.fromkeys(columns, float("nan"))
     table = read_frame(member.evaluation.folder / METRICS, COLUMNS, numbers=("value",))
-    table = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
-    found = {f"{metric}.{name}": value for metric, name, value in zip(table["metric"], table["test_set"], table["value"], strict=True)}
+    found = _found(table, "all", "nominal")
     own = {metric: next(value for name, value in found.items() if name.startswith(f"{metric}.")) for metric in ("n_parameters", "epochs")}
+    found = found if fault is None else _found(table, FAULTED, fault.condition)
     return {**own, **{column: found.get(column, float("nan")) for column in columns[2:]}, "model": member.model.folder.name}
+
+
+def _found(table: pd.DataFrame, subset: str, condition: str) -> dict[str, float]:
+    """``METRIC.SET`` -> value, of an evaluation's samples in a subset under a condition."""
+    own = table[(table["subset"] == subset) & (table["condition"] == condition)]
+    return {f"{metric}.{name}": float(value) for metric, name, value in zip(own["metric"], own["test_set"], own["value"], strict=True)}
 
 
 def _artefacts(
@@ -335,10 +365,16 @@ def _artefacts(
         protocol=evaluation.protocol,
         kinds=evaluation.kinds,
         data_titles=titles,
-        facts=[*training_facts(configs), resampling_fact(configs), *facts],
+        facts=[*training_facts(configs), resampling_fact(configs), *facts, *_fault_facts(configs)],
         failures=failures,
         patented=any(config["estimator"]["name"] == "ksnn" for config in configs),
     )
+
+
+def _fault_facts(configs: Sequence[Config]) -> list[str]:
+    """What errors count where there are faults; nothing where there are none."""
+    faults = dict.fromkeys(fault.condition for config in configs if (fault := chosen_fault(config)) is not None)
+    return [f"Faults: {', '.join(faults)}; RMSE(β) under one counts the samples while it lasts"] if faults else []
 
 
 def _plan(artefacts: SweepArtefacts, members: Sequence[Member], output: Path) -> StagePlan:

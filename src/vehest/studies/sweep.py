@@ -36,7 +36,8 @@ class SweepArtefacts:
         command: the command that makes it.
         keys: those that take several values, the seed aside, in the order of the command.
         jobs: a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
-            ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`.
+            ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`;
+            those of a combination with a fault count the samples while it lasts.
         split: training, validation and test ranges.
         protocol: how estimates are scored.
         kinds: data set -> ``real`` or ``simulated``.
@@ -85,7 +86,8 @@ def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.
 
     Columns: ``combination``, ``title``, the keys, ``n_parameters``, ``n_seeds`` (of the jobs that are done), ``n_failed``; for each set
     ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed) [deg]; ``chosen``.
-    Chosen is the lowest mean on the validation range among the combinations of which no seed failed; none where nothing was validated.
+    Chosen is the lowest mean on the validation range among the combinations of which no seed failed; none where nothing was validated, or
+    where combinations differ in faults, the mildest of which would win.
     """
     rows = []
     for number, own in jobs.groupby("combination", sort=False):
@@ -98,11 +100,16 @@ def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.
         rows.append(row)
     table = pd.DataFrame(rows)
     table["chosen"] = False
-    if VALIDATION in sets:
+    if VALIDATION in sets and not any(is_of_fault(key) for key in keys):
         mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
         if np.isfinite(mean).any():
             table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
     return table
+
+
+def is_of_fault(key: str) -> bool:
+    """Whether a key says under which fault is evaluated, rather than what is trained."""
+    return key.split(".")[0] == "fault"
 
 
 def interval(values: FloatArray) -> tuple[float, float]:
@@ -221,6 +228,8 @@ def _kind_sentence(artefacts: SweepArtefacts) -> str:
 
 
 def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
+    if any(is_of_fault(key) for key in artefacts.keys):
+        return "No combination is chosen: the combinations differ in faults, which are conditions of the evaluation and no settings."
     if not table["chosen"].any():
         return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
     row = table[table["chosen"]].iloc[0]

@@ -72,6 +72,16 @@ class WindowedEstimator(Estimator):
         """A network as it is built, to load weights into."""
 
     @property
+    def horizon_steps(self) -> int:
+        """One: a window predicts the velocity one sample after it."""
+        return WindowStepper.horizon_steps
+
+    @property
+    def warm_up_steps(self) -> int:
+        """Until the window is full."""
+        return self.settings.window - 1
+
+    @property
     def n_parameters(self) -> int:
         """Numbers that training determines; ranges taken from the data do not count."""
         return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)

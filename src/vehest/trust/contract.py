@@ -1,0 +1,354 @@
+"""The contract of every estimator that runs along with a drive, whatever its family.
+
+What is received goes through `vehest.trust.guard`, what is estimated through `vehest.trust.watch`:
+
+1. Values that are not finite, beyond physics, jumping or standing still count as not measured, and so do samples that are missing.
+2. Gaps up to 0.5 s are bridged; after longer ones the estimator starts anew.
+3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
+4. The estimate stays within what the last believed speed allows. One that does not for 0.3 s, is not finite or raises starts anew, and
+   takes states that adapt, such as tyres, back to what they were fitted to.
+
+`GuardedStepper` holds it online, `estimate_guarded` for a recording: both by the same compiled recursions, so that they agree.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate, Mode
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator, Stepper
+from vehest.trust.front_end import FrontEnd
+from vehest.trust.guard import BRIDGED_SECONDS, RESTART, WAIT, Cleaned, Guard, GuardLimits, usual_limits
+from vehest.trust.watch import Watch
+
+FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
+"""What an estimator may end in on samples that mean nothing to it; it then starts anew."""
+
+MOTION = ("vx", "yaw_rate", "ay")
+RATE_INTERVALS, RATE_TOLERANCE = 20, 0.2
+"""After how many intervals, and from what share on, a clock is said not to be the estimator's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guarded:
+    """An estimate that kept the contract, and what it took.
+
+    Args:
+        estimate: on the recording's clock.
+        cleaned: what the estimator saw of each row.
+        marks: of `vehest.trust.watch` for each row, (T,).
+    """
+
+    estimate: Estimate
+    cleaned: Cleaned
+    marks: NDArray[np.int8]
+
+
+def limits_for(estimator: Estimator, limits: GuardLimits | None) -> GuardLimits:
+    """The limits that were learnt with an estimator, or those of any car."""
+    return limits or usual_limits(estimator.channels, estimator.settings.rate_hz)
+
+
+def estimate_guarded(
+    estimator: Estimator,
+    samples: Mapping[str, FloatArray],
+    recording: Recording,
+    limits: GuardLimits | None = None,
+    initial_state: Mapping[str, float] | None = None,
+) -> Guarded:
+    """Estimate a recording under the contract.
+
+    Args:
+        estimator: fitted.
+        samples: channels that it reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
+        recording: whose clock, name and vehicle it is; its own samples do not count.
+        limits: learnt with the estimator; by default those of any car.
+        initial_state: that a protocol hands over at the first sample.
+
+    Raises:
+        DataError: a channel is missing.
+    """
+    missing = [name for name in estimator.channels if name not in samples]
+    if missing:
+        raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
+    rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
+    limits = limits_for(estimator, limits)
+    rate = estimator.settings.rate_hz
+    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate)(rows)
+    run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
+    run.go()
+    return run.outcome()
+
+
+class _Run:
+    """A recording's way through an estimator, piece by piece between its starts."""
+
+    def __init__(
+        self, estimator: Estimator, recording: Recording, cleaned: Cleaned, watch: Watch, initial_state: Mapping[str, float] | None
+    ) -> None:
+        self.estimator, self.recording, self.cleaned, self.watch = estimator, recording, cleaned, watch
+        self.initial_state = initial_state
+        self.horizon = estimator.horizon_steps
+        steps = len(cleaned.rows)
+        self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
+        self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
+        self.motion = motion_of(estimator.channels, cleaned)
+
+    def go(self) -> None:
+        """From the first row to the last."""
+        at, steps = 0, len(self.out)
+        while at < steps:
+            waits = self.cleaned.flow[at:] == WAIT
+            if waits[0]:
+                end = at + (int(np.argmin(waits)) if not waits.all() else len(waits))
+                at = self._watched(at, end, np.full(end - at, np.nan))[0]
+                continue
+            end = at + int(np.argmax(waits)) if waits.any() else steps
+            at = self._piece(at, end)
+
+    def _piece(self, start: int, end: int) -> int:
+        """Estimate from a start on, up to ``end`` or until the estimator is lost; returns the row to go on with.
+
+        After a loss the next attempt is short at first, so that an estimator that is lost again and again takes no quadratic time.
+        """
+        short = start > 0 and self.watch.state[5] > 0
+        reach = min(start + self._first_reach, end) if short else end
+        while True:
+            before = self.watch.state.copy()
+            at, lost = self._watched(start, reach, self._raw(start, reach))
+            if lost or reach == end:
+                return at
+            self.watch.state[:] = before
+            reach = min(start + 2 * (reach - start), end)
+
+    @property
+    def _first_reach(self) -> int:
+        return self.estimator.warm_up_steps + math.ceil(2.0 * self.estimator.settings.rate_hz)
+
+    def _watched(self, start: int, end: int, raw: FloatArray) -> tuple[int, bool]:
+        motion = self.motion[start:end]
+        motion = np.where(np.isnan(motion), np.stack([self.vx[start:end], motion[:, 1], motion[:, 2]], axis=1), motion)
+        watched = self.watch(raw, np.ascontiguousarray(motion), self.cleaned.flow[start:end])
+        done = start + watched.done
+        self.out[start:done], self.marks[start:done] = watched.vy, watched.marks
+        return done, watched.lost
+
+    def _raw(self, start: int, end: int) -> FloatArray:
+        """What the estimator says after each row of a piece that it begins anew, (T,)."""
+        extra = self.horizon  # rows after the last, whose values no estimate at their time depends on
+        rows = np.concatenate([self.cleaned.rows[start:end], np.repeat(self.cleaned.rows[end - 1 : end], extra, axis=0)])
+        channels = dict(zip(self.estimator.channels, rows.T, strict=True))
+        r = self.recording
+        gappy = frozenset(self.estimator.skippable)
+        piece = Recording(r.id, r.vehicle, self.estimator.settings.rate_hz, r.start_time, channels, r.kind, gappy)
+        state = self.initial_state if start == 0 else None
+        try:
+            estimate = self.estimator.estimate([piece], state)[0]
+        except FAILURES:
+            if not self.estimator.causal:
+                return np.full(end - start, np.nan)
+            return self._stepped(start, end)
+        shift = slice(extra, extra + end - start)
+        if "vx" in estimate.channels:
+            self.vx[start:end] = estimate["vx"][shift]
+        if "vy" in estimate.covariance_of and estimate.covariance is not None:
+            row = estimate.covariance_of.index("vy")
+            self.variance[start:end] = estimate.covariance[shift, row, row]
+        return np.asarray(estimate["vy"][shift])
+
+    def _stepped(self, start: int, end: int) -> FloatArray:
+        """The same one sample at a time, for pieces that cannot be estimated in one go."""
+        stepper = self.estimator.online()
+        raw = np.full(end - start, np.nan)
+        for k in range(start, end):
+            try:
+                found = stepper.step(dict(zip(self.estimator.channels, self.cleaned.rows[k].tolist(), strict=True)))
+            except FAILURES:
+                stepper = self.estimator.online()
+                continue
+            raw[k - start] = found["vy"]
+            self.vx[k] = found.get("vx", math.nan)
+            self.variance[k] = found.get("vy_variance", math.nan)
+        return raw
+
+    def outcome(self) -> Guarded:
+        """The estimate on the recording's clock: what was said after row k holds ``horizon`` samples later."""
+        vy, variance = (np.concatenate([np.full(self.horizon, np.nan), values])[: len(values)] for values in (self.out, self.variance))
+        vx = np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])
+        vx = np.where(np.isnan(vx), held(vx), vx)
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx)}
+        mode: Mode = "causal" if self.estimator.causal else "offline"
+        known = np.isfinite(variance).any()
+        covariance = np.where(np.isnan(variance), np.inf, variance)[:, None, None] if known else None
+        r = self.recording
+        estimate = Estimate(
+            r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode, covariance, ("vy",) if known else ()
+        )  # type: ignore[arg-type]
+        return Guarded(estimate, self.cleaned, self.marks)
+
+
+def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
+    """Believed `MOTION` of each row, (T, 3); NaN what is not known. What is bridged counts as known."""
+    columns = []
+    for name in MOTION:
+        if name in channels:
+            at = channels.index(name)
+            columns.append(np.where(cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan))
+        else:
+            columns.append(np.full(len(cleaned.rows), np.nan))
+    return np.stack(columns, axis=1)
+
+
+def held(values: FloatArray) -> FloatArray:
+    """The last value that is known, (T,); NaN before the first."""
+    last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
+    return np.where(last < 0, np.nan, values[last])
+
+
+class GuardedStepper(Stepper):
+    """Any estimator online, under the contract.
+
+    Args:
+        estimator: fitted, causal.
+        limits: learnt with the estimator; by default those of any car.
+        bus_rate_hz: rate at which samples come, if it is above the estimator's: they then go through a causal anti-aliasing filter first.
+
+    Raises:
+        ConfigurationError: the estimator is not causal, or the bus is slower than it.
+    """
+
+    def __init__(self, estimator: Estimator, limits: GuardLimits | None = None, bus_rate_hz: float | None = None) -> None:
+        self.estimator = estimator
+        self._stepper = estimator.online()
+        rate = estimator.settings.rate_hz
+        self._limits = limits_for(estimator, limits)
+        self._front = FrontEnd(estimator.channels, estimator.skippable, self._limits, bus_rate_hz, rate) if bus_rate_hz else None
+        self._rate = bus_rate_hz or rate
+        self._guard = Guard(estimator.channels, estimator.skippable, self._limits, rate)
+        self._watch = Watch(self._limits, estimator.warm_up_steps, rate)
+        self._used = 0
+        self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)
+        self._raw = np.empty(1)
+        self._places = [estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION]
+        self._fresh = True
+        self._clock = _Clock(self._rate)
+        self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
+        self.marks = 0
+
+    @property
+    def horizon_steps(self) -> int:  # type: ignore[override]
+        """How many sampling intervals after the sample the estimate holds."""
+        return self.estimator.horizon_steps
+
+    def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:
+        """Take what was received at one instant.
+
+        Args:
+            sample: channel -> value [SI]; a channel missing, None or no number counts as not measured; None: all.
+            time: of the sample [s], where it is known: samples that are repeated are passed over, those that are missing bridged.
+
+        Returns:
+            ``vy`` [m/s] and ``sideslip`` [rad]; NaN only before the first estimate.
+        """
+        if time is not None:
+            skipped = self._clock.skipped(time)
+            if skipped < 0:
+                return self.last
+            for _ in range(min(skipped, math.ceil(BRIDGED_SECONDS * self._rate) + 1)):
+                self._received(None)
+        return self._received(sample)
+
+    def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
+        row = self._row
+        for at, name in enumerate(self.estimator.channels):
+            row[0, at] = _number(sample.get(name)) if sample is not None else math.nan
+        if self._front is not None:
+            due = self._front(row)
+            if due is None:
+                return self.last
+            row = due
+        return self._stepped(row)
+
+    def _stepped(self, row: FloatArray) -> dict[str, float]:
+        cleaned = self._guard(row)
+        flow = cleaned.flow[0]
+        raw, vx, failed = math.nan, math.nan, False
+        if flow != WAIT:
+            if flow == RESTART and not self._fresh:
+                self._stepper = self.estimator.online()
+            self._fresh = False
+            try:
+                found = self._stepper.step(dict(zip(self.estimator.channels, cleaned.rows[0].tolist(), strict=True)))
+                raw, vx = found["vy"], found.get("vx", math.nan)
+            except FAILURES:
+                failed = True
+        motion = self._motion
+        for column, at in enumerate(self._places):
+            known = at >= 0 and (flow != WAIT or cleaned.measured[0, at])
+            motion[0, column] = cleaned.rows[0, at] if known else math.nan
+        if math.isnan(motion[0, 0]):
+            motion[0, 0] = vx
+        self._raw[0] = raw
+        watched = self._watch(self._raw, motion, cleaned.flow)
+        if watched.lost or failed:
+            self._stepper, self._fresh = self.estimator.online(), True
+        self.marks = int(watched.marks[0])
+        vy = float(watched.vy[0])
+        speed = motion[0, 0]
+        if not math.isnan(speed):
+            self._speed = float(speed)
+        self.last = {"vy": vy, "sideslip": math.atan2(vy, self._speed) if not math.isnan(self._speed) else math.nan}
+        return self.last
+
+    _speed = math.nan
+
+
+class _Clock:
+    """Times of samples: which are repeated, how many are missing, and whether their rate is the one that was said."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate = rate_hz
+        self._last = math.nan
+        self._gaps: list[float] = []
+        self._said = False
+
+    def skipped(self, time: float) -> int:
+        """Samples that are missing before this one; -1 if it is a repeated one."""
+        if math.isnan(self._last):
+            self._last = time
+            return 0
+        gap = time - self._last
+        if gap <= 0.5 / self._rate and gap > -1.0:
+            self._note(gap)
+            return -1
+        self._last = time
+        self._note(gap)
+        return max(round(gap * self._rate) - 1, 0) if math.isfinite(gap) and gap > 0 else 0
+
+    def _note(self, gap: float) -> None:
+        if self._said or len(self._gaps) > RATE_INTERVALS:
+            return
+        self._gaps.append(gap)
+        if len(self._gaps) == RATE_INTERVALS:
+            middle = float(np.median(self._gaps))
+            if middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
+                self._said = True
+                found = f"{1.0 / middle:.3g}"
+                warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan

@@ -1,0 +1,110 @@
+"""From the rate of a vehicle's bus to that of an estimator, causally and without aliasing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import signal
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.kernels.compiling import entry
+from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
+
+ORDER = 4
+CUTOFF = 0.4  # of the estimator's rate, below its Nyquist frequency
+SLACK = 1e-9
+
+
+class FrontEnd:
+    """Believed samples of a bus through a causal low-pass, of which as many are passed on as the estimator's rate asks for.
+
+    A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. What is not measured holds its last value in the
+    filter, and is passed on as not measured. After longer gaps the filter starts from the first sample that is back.
+
+    Args:
+        channels: in the order of the columns.
+        skippable: those that the estimator can do without.
+        limits: of the guard, learnt at the estimator's rate.
+        bus_rate_hz: rate of the samples [Hz].
+        rate_hz: of the estimator [Hz].
+
+    Raises:
+        ConfigurationError: the bus is slower than the estimator.
+
+    Attributes:
+        delay: of slow signals through the filter [s].
+    """
+
+    def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
+        if not (math.isfinite(bus_rate_hz) and bus_rate_hz >= rate_hz * (1 - SLACK)):
+            raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz")
+        self.channels = tuple(channels)
+        usual = usual_limits(channels, bus_rate_hz)  # jumps are those of another rate; ranges are the same
+        merged = {
+            name: type(own)(own.low, own.high, max(usual.channels[name].jump, own.jump), own.run)
+            for name, own in (limits.channels or usual.channels).items()
+        }
+        self._guard = Guard(channels, skippable, GuardLimits(merged, limits.top_speed, limits.steepest), bus_rate_hz)
+        self._ratio = rate_hz / bus_rate_hz
+        self._phase = 1.0 - self._ratio  # the first sample is passed on
+        if bus_rate_hz > rate_hz * (1 + 1e-6):
+            self._sections = signal.butter(ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos")
+        else:
+            self._sections = np.zeros((0, 6))
+        self._state = np.full((len(self._sections), len(channels), 2), math.nan)
+        self._held = np.full(len(channels), math.nan)
+
+    @property
+    def delay(self) -> float:
+        """Of slow signals through the filter [s]."""
+        if not len(self._sections):
+            return 0.0
+        numerator, denominator = signal.sos2tf(self._sections)
+        return float(signal.group_delay((numerator, denominator), w=[1e-6])[1][0]) / self._guard.rate_hz
+
+    def __call__(self, row: FloatArray) -> FloatArray | None:
+        """Take one row, (1, C); returns a row for the estimator where one is due, NaN what was not measured."""
+        cleaned = self._guard(row)
+        waits = bool(cleaned.flow[0] == WAIT)
+        measured = cleaned.measured[0]
+        if waits:
+            self._state[:] = math.nan
+        out = np.where(measured, cleaned.rows[0], self._held)
+        self._held = out.copy()
+        if len(self._sections) and not waits:
+            filter_row(out, self._sections, self._state)
+        self._phase += self._ratio
+        if self._phase < 1.0 - SLACK:
+            return None
+        self._phase -= 1.0
+        return np.where(measured & (not waits), out, math.nan)[None]
+
+
+@entry(nogil=True)
+def filter_row(row, sections, state):  # type: ignore[no-untyped-def]
+    """Second-order sections, direct form II transposed, in place; a channel whose state is NaN starts as if its value had always stood.
+
+    Args:
+        row: (C,), replaced by its filtered values; NaN stays.
+        sections: (S, 6), as SciPy has them.
+        state: (S, C, 2).
+    """
+    for c in range(row.shape[0]):
+        x = row[c]
+        if math.isnan(x):
+            continue
+        for s in range(sections.shape[0]):
+            b0, b1, b2, _, a1, a2 = sections[s]
+            if math.isnan(state[s, c, 0]):
+                gain = (b0 + b1 + b2) / (1.0 + a1 + a2)
+                steady = gain * x
+                state[s, c, 1] = b2 * x - a2 * steady
+                state[s, c, 0] = b1 * x - a1 * steady + state[s, c, 1]
+            y = b0 * x + state[s, c, 0]
+            state[s, c, 0] = b1 * x - a1 * y + state[s, c, 1]
+            state[s, c, 1] = b2 * x - a2 * y
+            x = y
+        row[c] = x

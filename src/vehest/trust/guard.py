@@ -1,0 +1,258 @@
+"""What is believed of a measured sample before an estimator sees it.
+
+A value that is not finite, that no car reaches, that jumps further than a car can, or that has stood still for longer than it ever did
+where the estimator learnt counts as not measured. Channels that a method can do without become NaN then; the others hold the last value
+that was believed, for half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels are back.
+
+The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.recording import Recording
+from vehest.estimators.kernels.compiling import entry
+
+BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
+PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is believed
+MARGIN = 3.0  # beyond what was seen in training
+LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training says nothing by standing still
+LEAST_RUN = 0.3  # s
+
+REACHED = {"m/s²": 25.0, "rad/s": 4.0, "rad": 1.0, "m/s": 100.0}
+"""Unit -> size that some road car reaches; angular speeds of wheels and the angle of the steering wheel go by their own ranges."""
+
+FASTEST = {"m/s²": 200.0, "rad/s": 15.0, "rad": 15.0, "m/s": 25.0}
+"""Unit -> change a second that some road car reaches, the sensors' noise left aside."""
+
+NOISE = {"m/s²": 6.0, "rad/s": 0.5, "rad": 0.1, "m/s": 2.0}
+"""Unit -> what the sensors' noise may add to a change, where nothing was learnt about it."""
+
+FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
+"""Starts of names whose ranges and changes differ too much between cars; what they may do has to be learnt."""
+
+STANDSTILL_SPEED, STANDSTILL_YAW_RATE = 0.5, 0.05  # m/s, rad/s: below both, nothing is expected to move
+
+USE, WAIT, RESTART = 0, 1, 2
+"""What an estimator does with a row: use it; nothing, for too much is missing; start anew with it."""
+
+
+@dataclass(frozen=True)
+class ChannelLimits:
+    """What is believed of one channel.
+
+    Args:
+        low, high: smallest and largest value [unit of the channel].
+        jump: largest change from one sample to the next [unit].
+        run: longest time that it may stand still while the car moves [s]; 0 if any.
+    """
+
+    low: float
+    high: float
+    jump: Annotated[float, "a positive number"]
+    run: float = 0.0
+
+
+@dataclass(frozen=True)
+class GuardLimits:
+    """What is believed of each channel, and of the estimate.
+
+    Args:
+        channels: name -> limits.
+        top_speed: that the car reaches [m/s].
+        steepest: largest |v| over max(u, 1 m/s) that is believed of an estimate; 1 is a sideslip of 45°.
+        learnt: whether training recordings set them, rather than what any car reaches.
+    """
+
+    channels: Mapping[str, ChannelLimits] = field(default_factory=dict)
+    top_speed: float = 140.0
+    steepest: float = 1.0
+    learnt: bool = False
+
+
+def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
+    """Limits that hold for any car."""
+    return GuardLimits({name: _usual(name, rate_hz) for name in channels})
+
+
+def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> GuardLimits:
+    """Limits from what the channels do in training.
+
+    A range is what any car reaches or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for
+    twice its longest run while the car moved.
+
+    Args:
+        recordings: at the estimator's rate, with references where they have them.
+        channels: that the estimator reads.
+        rate_hz: of the estimator [Hz].
+    """
+    found = {}
+    for name in channels:
+        usual = _usual(name, rate_hz)
+        own = [recording[name] for recording in recordings if name in recording]
+        size = max((float(np.nanmax(np.abs(part), initial=0.0)) for part in own), default=0.0)
+        jump = max((float(np.nanmax(np.abs(np.diff(part)), initial=0.0)) for part in own if len(part) > 1), default=0.0)
+        table = CHANNELS[name]
+        found[name] = ChannelLimits(
+            low=max(table.low, min(usual.low, -MARGIN * size)),
+            high=min(table.high, max(usual.high, MARGIN * size)),
+            jump=max(_fastest(name, rate_hz), MARGIN * jump),
+            run=_run_limit([recording for recording in recordings if name in recording], name),
+        )
+    speeds = [np.abs(recording[name]) for recording in recordings for name in ("vx", "vx_ref") if name in recording]
+    top = max((float(np.nanmax(part, initial=0.0)) for part in speeds), default=0.0)
+    steep = [_steepness(recording) for recording in recordings]
+    return GuardLimits(found, MARGIN * top if top > 0 else 140.0, max(1.0, 1.2 * max(steep, default=0.0)), learnt=True)
+
+
+def _usual(name: str, rate_hz: float) -> ChannelLimits:
+    table = CHANNELS[name]
+    if name.startswith(FREE):
+        return ChannelLimits(table.low, table.high, table.high - table.low)
+    size = REACHED.get(table.unit, max(abs(table.low), abs(table.high)))
+    return ChannelLimits(max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + NOISE.get(table.unit, 0.0))
+
+
+def _fastest(name: str, rate_hz: float) -> float:
+    """Change from one sample to the next that a car reaches."""
+    table = CHANNELS[name]
+    span = table.high - table.low
+    return span if name.startswith(FREE) else FASTEST.get(table.unit, span) / rate_hz
+
+
+def _steepness(recording: Recording) -> float:
+    if "vy_ref" not in recording:
+        return 0.0
+    name = "vx_ref" if "vx_ref" in recording else "vx"
+    if name not in recording:
+        return 0.0
+    return float(np.nanmax(np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0), initial=0.0))
+
+
+def _run_limit(recordings: Sequence[Recording], name: str) -> float:
+    """Twice the longest time that a channel stood still while the car moved [s]; 0 if that says nothing."""
+    if CHANNELS[name].rests or not recordings:
+        return 0.0
+    longest = 0.0
+    for recording in recordings:
+        samples = recording[name]
+        same = np.concatenate([[False], samples[1:] == samples[:-1]]) & _moves(recording)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
+        if len(edges):
+            longest = max(longest, float((edges[1::2] - edges[::2]).max()) / recording.rate_hz)
+    return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
+
+
+def _moves(recording: Recording) -> NDArray[np.bool_]:
+    """Samples at which the car moves, as far as speed and yaw rate tell."""
+    moving = np.zeros(len(recording), np.bool_)
+    if "vx" not in recording:
+        return ~moving
+    moving |= ~(np.abs(recording["vx"]) < STANDSTILL_SPEED)
+    if "yaw_rate" in recording:
+        moving |= ~(np.abs(recording["yaw_rate"]) < STANDSTILL_YAW_RATE)
+    return moving
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """Rows as an estimator may see them.
+
+    Args:
+        rows: (T, C), finite, or NaN in channels that the method can skip; whatever where ``flow`` is `WAIT`.
+        measured: what was believed, (T, C).
+        flow: `USE`, `WAIT` or `RESTART` at each row, (T,).
+    """
+
+    rows: FloatArray
+    measured: NDArray[np.bool_]
+    flow: NDArray[np.int8]
+
+
+class Guard:
+    """Believes samples or not, row after row; keeps the state between calls.
+
+    Args:
+        channels: in the order of the columns.
+        skippable: those of them that the estimator can do without.
+        limits: of each channel; what any car reaches for those that they do not name.
+        rate_hz: of the rows [Hz].
+    """
+
+    def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float) -> None:
+        self.channels, self.rate_hz = tuple(channels), rate_hz
+        rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
+        runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
+        self._limits = np.array([(row.low, row.high, row.jump, run) for row, run in zip(rows, runs, strict=True)])
+        self._skippable = np.array([name in skippable for name in channels])
+        places = [self.channels.index(name) if name in self.channels else -1 for name in ("vx", "yaw_rate")]
+        persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
+        self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists], np.int64)
+        self.state = np.zeros((len(channels) + 1, 6))
+        self.state[:-1, [0, 3, 4]] = np.nan  # nothing believed, no last value, no candidate
+        self.state[-1, 0] = WAIT
+
+    def __call__(self, rows: FloatArray) -> Cleaned:
+        """Go on with further rows, (T, C)."""
+        clean, measured, flow = np.empty_like(rows), np.empty(rows.shape, np.bool_), np.empty(len(rows), np.int8)
+        guard_rows(rows, self.state, self._limits, self._skippable, self._settings, clean, measured, flow)
+        return Cleaned(clean, measured, flow)
+
+
+@entry(nogil=True)
+def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):  # type: ignore[no-untyped-def]
+    """Decide row by row what is believed.
+
+    Args:
+        rows: (T, C), whatever was received.
+        state: (C + 1, 6), of each channel: last believed value, samples since, length of the present run, last value, candidate after a
+            jump, how often it was confirmed; last row: whether the estimator waits.
+        limits: (C, 4): low, high, jump, longest run in samples.
+        skippable: (C,).
+        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand.
+        clean, measured, flow: output, as in `Cleaned`.
+    """
+    n_channels = rows.shape[1]
+    vx_at, yaw_at, bridged, persists = settings
+    for k in range(rows.shape[0]):
+        still = vx_at >= 0 and abs(state[vx_at, 0]) < STANDSTILL_SPEED and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
+        most_needed, least_skippable, any_skippable = 0.0, math.inf, False
+        for c in range(n_channels):
+            x = rows[k, c]
+            own = state[c]
+            believed = limits[c, 0] <= x <= limits[c, 1]  # false for NaN
+            if believed:
+                own[2] = own[2] + 1.0 if x == own[3] else 0.0
+                own[3] = x
+                if own[2] > limits[c, 3] and not still:
+                    believed = False
+                elif own[1] <= bridged and abs(x - own[0]) > limits[c, 2]:  # a jump from what is not long gone
+                    own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0
+                    own[4] = x
+                    believed = own[5] >= persists
+            if believed:
+                own[0], own[1], own[4], own[5] = x, 0.0, math.nan, 0.0
+            else:
+                own[1] += 1.0
+            measured[k, c] = believed
+            clean[k, c] = x if believed else (math.nan if skippable[c] else own[0])
+            missing = math.inf if math.isnan(own[0]) else own[1]
+            if skippable[c]:
+                any_skippable = True
+                least_skippable = min(least_skippable, missing)
+            else:
+                most_needed = max(most_needed, missing)
+        if most_needed > bridged or (any_skippable and least_skippable > bridged):
+            flow[k] = WAIT
+        else:
+            flow[k] = RESTART if state[n_channels, 0] == WAIT else USE
+        state[n_channels, 0] = flow[k]

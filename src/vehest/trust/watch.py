@@ -1,0 +1,127 @@
+"""What is believed of an estimate: it stays finite, within what the car's speed allows, and a lost estimator starts anew.
+
+The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.estimators.kernels.compiling import entry
+from vehest.trust.guard import RESTART, WAIT, GuardLimits
+
+LEAST_SPEED = 1.0  # m/s, below which a bound on the angle says nothing
+SPIN_RATE = 4.0  # m/s²: |a_y - u r|, the change of v, beyond which a car that keeps it up spins
+SPIN_SECONDS = 0.3
+REMEMBERED_SECONDS = 3.0  # for which a spinning car is taken to be as fast as before
+LOST_SECONDS = 0.3  # beyond the bound, after which an estimator starts anew
+FADE_SECONDS = 1.0  # time constant with which v goes to 0 where there is no estimate
+
+EXTRAPOLATED, CLIPPED, SPINNING, STARTED = 1, 2, 4, 8
+"""Marks of a sample: no estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew at it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Estimates as they are passed on.
+
+    Args:
+        vy: (T,) [m/s]; NaN before the first estimate only.
+        marks: sum of marks at each row, (T,).
+        done: how many rows count; fewer than there are where the estimator was lost at the last of them.
+        lost: whether it has to start anew with the next row.
+    """
+
+    vy: FloatArray
+    marks: NDArray[np.int8]
+    done: int
+    lost: bool
+
+
+class Watch:
+    """Watches estimates row after row; keeps the state between calls.
+
+    Args:
+        limits: top speed, largest believed ratio of v to u.
+        warm_up: samples after a start for which an estimator may have no estimate.
+        rate_hz: of the rows [Hz].
+    """
+
+    def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
+        self._settings = np.array([limits.top_speed, limits.steepest, float(warm_up), 1.0 / rate_hz])
+        self.state = np.zeros(6)
+        self.state[0] = math.nan  # no estimate yet
+
+    def __call__(self, vy: FloatArray, motion: FloatArray, flow: NDArray[np.int8]) -> Watched:
+        """Go on with further rows.
+
+        Args:
+            vy: what the estimator says, (T,) [m/s]; NaN where it says nothing.
+            motion: believed vx [m/s], yaw rate [rad/s] and lateral acceleration [m/s²], (T, 3); NaN what is not known.
+            flow: what it was told of each row (`vehest.trust.guard`), (T,).
+        """
+        out, marks = np.empty(len(vy)), np.zeros(len(vy), np.int8)
+        done, lost = watch_rows(vy, motion, flow, self.state, self._settings, out, marks)
+        return Watched(out[:done], marks[:done], int(done), bool(lost))
+
+
+@entry(nogil=True)
+def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[no-untyped-def]
+    """Bound, bridge and judge estimates, up to the row at which the estimator is lost.
+
+    Args:
+        vy, motion, flow: as in `Watch`.
+        state: last value passed on, speed that is remembered, seconds of spinning, seconds beyond the bound, samples since the
+            estimator's start, whether it was lost at the last row.
+        settings: top speed, steepest, warm-up in samples, sampling interval [s].
+        out, marks: output, (T,).
+
+    Returns:
+        How many rows were done, and whether the estimator was lost at the last of them.
+    """
+    top_speed, steepest, warm_up, step = settings
+    for k in range(vy.shape[0]):
+        begins = flow[k] == RESTART or (state[5] > 0.0 and flow[k] != WAIT)
+        state[4] = 0.0 if begins else state[4] + 1.0
+        state[5] = 1.0 if state[5] > 0.0 and flow[k] == WAIT else 0.0
+        if begins:
+            marks[k] += STARTED
+            state[3] = 0.0
+        u, r, ay = motion[k, 0], motion[k, 1], motion[k, 2]
+        spins = abs(ay - u * r) > SPIN_RATE  # false where one is not known
+        state[2] = min(state[2] + step, 2.0 * SPIN_SECONDS) if spins else max(state[2] - step, 0.0)
+        remembered = state[1] * math.exp(-step / REMEMBERED_SECONDS) if state[1] > 0.0 else top_speed * math.isnan(u)
+        speed = remembered if math.isnan(u) else min(abs(u), top_speed)
+        state[1] = max(speed, remembered)
+        bound = steepest * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)
+        if state[2] > SPIN_SECONDS:
+            marks[k] += SPINNING
+        told, lost = math.nan, False
+        if flow[k] != WAIT:
+            if math.isfinite(vy[k]):
+                told = vy[k]
+                if abs(told) > bound:
+                    state[3] += step
+                    marks[k] += CLIPPED
+                    told = math.copysign(bound, told)
+                    lost = state[3] > LOST_SECONDS
+                else:
+                    state[3] = 0.0
+            else:
+                lost = state[4] >= warm_up
+        if math.isnan(told):
+            told = state[0] * math.exp(-step / FADE_SECONDS)
+            if abs(told) > bound:
+                told = math.copysign(bound, told)
+            marks[k] += EXTRAPOLATED
+        out[k] = told
+        state[0] = told
+        if lost:
+            state[5] = 1.0
+            return k + 1, True
+    return vy.shape[0], False

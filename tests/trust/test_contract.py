@@ -1,0 +1,262 @@
+"""The contract of running online, held for every family by one wrapper."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from conftest import planar_drive
+from every_estimator import drive_for, fitted
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator, Stepper
+from vehest.estimators.registry import estimator_names
+from vehest.trust.contract import GuardedStepper, estimate_guarded
+from vehest.trust.front_end import FrontEnd
+from vehest.trust.guard import usual_limits
+from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, STARTED, Watch
+
+HOSTILE = (math.nan, math.inf, -math.inf, 1e6, -1e30, 0.0)
+
+
+@cache
+def ready(name: str) -> Estimator:
+    return fitted(name)
+
+
+def columns(estimator: Estimator, drive: Recording) -> dict[str, np.ndarray]:
+    return {name: drive[name].copy() for name in estimator.channels}
+
+
+def hostile_columns(estimator: Estimator, drive: Recording, seed: int) -> dict[str, np.ndarray]:
+    """Bursts of senseless values of 1 sample to 1.5 s, the drive's last third left whole."""
+    generator = np.random.default_rng(seed)
+    samples, rate = columns(estimator, drive), estimator.settings.rate_hz
+    for _ in range(12):
+        name = generator.choice(list(samples))
+        first = generator.integers(len(drive) // 6, len(drive) // 2)
+        last = min(first + generator.integers(1, round(1.5 * rate)), 2 * len(drive) // 3)
+        samples[name][first:last] = generator.choice(HOSTILE)
+    return samples
+
+
+def online(estimator: Estimator, samples: dict[str, np.ndarray]) -> np.ndarray:
+    stepper = GuardedStepper(estimator)
+    steps = len(next(iter(samples.values())))
+    vy = [stepper.step({name: values[k] for name, values in samples.items()})["vy"] for k in range(steps)]
+    return np.concatenate([np.full(estimator.horizon_steps, np.nan), vy])[:steps]
+
+
+@pytest.mark.parametrize("name", estimator_names())
+def test_a_drive_without_faults_is_estimated_as_without_the_contract(name):
+    estimator = ready(name)
+    drive = drive_for(estimator)
+    plain = estimator.estimate([drive])[0]
+    guarded = estimate_guarded(estimator, columns(estimator, drive), drive).estimate
+    np.testing.assert_allclose(guarded["vy"], plain["vy"], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", estimator_names())
+@pytest.mark.parametrize("seed", range(3))
+def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_online_as_in_batch(name, seed):
+    estimator = ready(name)
+    drive = drive_for(estimator)
+    samples = hostile_columns(estimator, drive, seed)
+    batch = estimate_guarded(estimator, samples, drive)
+    one_by_one = online(estimator, samples)
+    np.testing.assert_allclose(batch.estimate["vy"], one_by_one, rtol=0.0, atol=1e-9)
+    after = estimator.warm_up_steps + estimator.horizon_steps
+    assert np.isfinite(one_by_one[after:]).all()
+    assert "vx" not in drive or np.abs(one_by_one[after:]).max() <= max(np.abs(drive["vx"]).max(), 1.0)
+
+
+@pytest.mark.parametrize("name", [name for name in estimator_names() if name != "learned_ukf"])
+def test_one_bad_sample_does_no_lasting_harm(name):
+    estimator = ready(name)
+    drive = drive_for(estimator)
+    whole = online(estimator, columns(estimator, drive))
+    at, later = len(drive) // 3, len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
+    for channel in estimator.channels:
+        for value in HOSTILE[:-1]:  # 0 is a value like any other
+            samples = columns(estimator, drive)
+            samples[channel][at] = value
+            difference = np.abs(online(estimator, samples) - whole)
+            assert np.nanmax(difference[later:]) < 0.05, (channel, value)
+
+
+class Constant(Stepper):
+    """Says what it is told to; counts how often it was begun."""
+
+    def __init__(self, owner: Saying) -> None:
+        self.owner, self.steps = owner, 0
+        owner.begun += 1
+
+    def step(self, sample):
+        value = self.owner.says(self.steps)
+        self.steps += 1
+        return {"vy": value}
+
+
+class Saying:
+    """As much of an estimator as the wrapper asks of one."""
+
+    channels, skippable, causal, warm_up_steps, horizon_steps, name = ("yaw_rate", "vx", "ay"), (), True, 0, 0, "saying"
+
+    def __init__(self, says) -> None:
+        self.says, self.begun = says, 0
+        self.settings = type("Settings", (), {"rate_hz": 20.0})()
+
+    def online(self) -> Constant:
+        return Constant(self)
+
+
+SAMPLE = {"yaw_rate": 0.2, "vx": 20.0, "ay": 4.0}
+
+
+def moving(k: int) -> dict[str, float]:
+    return {"yaw_rate": 0.2 + 1e-4 * k, "vx": 20.0 + 1e-3 * k, "ay": 4.0 + 1e-3 * k}
+
+
+def test_an_estimate_never_exceeds_what_the_speed_allows_and_a_lost_estimator_starts_anew():
+    estimator = Saying(lambda step: 0.5 if step < 10 else 500.0)
+    stepper = GuardedStepper(estimator)
+    said = [stepper.step(moving(k))["vy"] for k in range(40)]
+    assert max(said) <= 20.1
+    assert estimator.begun == 3  # 10 good samples and 0.3 s beyond the bound each
+    assert said[10] == pytest.approx(20.0, abs=0.1)
+    assert said[17] == 0.5
+
+
+def test_an_estimator_that_raises_starts_anew():
+    def says(step: int) -> float:
+        if step == 5:
+            raise RuntimeError("singular")
+        return float(step)
+
+    estimator = Saying(says)
+    stepper = GuardedStepper(estimator)
+    said = [stepper.step(moving(k))["vy"] for k in range(8)]
+    assert np.isfinite(said).all()
+    assert said[4] == 4.0
+    assert 3.5 < said[5] < 4.0  # fades from the last one
+    assert said[6] == 0.0
+    assert estimator.begun == 2
+
+
+def test_programming_errors_are_not_swallowed():
+    def says(step: int) -> float:
+        raise KeyError("a name")
+
+    with pytest.raises(KeyError):
+        GuardedStepper(Saying(says)).step(SAMPLE)
+
+
+def test_none_missing_channels_and_words_count_as_not_measured():
+    estimator = Saying(lambda step: 1.0)
+    stepper = GuardedStepper(estimator)
+    for sample in (SAMPLE, None, {}, {"vx": None, "yaw_rate": "?"}, SAMPLE):
+        assert stepper.step(sample)["vy"] == 1.0
+    assert estimator.begun == 1
+
+
+def test_v_fades_over_a_long_gap_and_a_new_start_follows():
+    estimator = Saying(lambda step: 2.0)
+    stepper = GuardedStepper(estimator)
+    for k in range(5):
+        stepper.step(moving(k))
+    said = [stepper.step(None)["vy"] for _ in range(40)]
+    assert said[:10] == [2.0] * 10  # bridged
+    assert said[10:] == pytest.approx([2.0 * math.exp(-0.05 * k) for k in range(1, 31)])
+    assert stepper.marks & EXTRAPOLATED
+    assert stepper.step(moving(60))["vy"] == 2.0
+    assert stepper.marks & STARTED
+    assert estimator.begun == 2
+
+
+def test_repeated_samples_are_passed_over_and_missing_ones_counted():
+    estimator = Saying(float)
+    stepper = GuardedStepper(estimator)
+    times = [0.0, 0.05, 0.05, 0.1, 0.3, 0.35]
+    assert [stepper.step(moving(k), time)["vy"] for k, time in enumerate(times)] == [0.0, 1.0, 1.0, 2.0, 6.0, 7.0]
+    assert stepper.step(moving(6), 10.0)["vy"] == 0.0  # starts anew after a gap of 10 s
+    assert estimator.begun == 2
+
+
+def test_a_clock_at_another_rate_is_said_once():
+    stepper = GuardedStepper(Saying(lambda step: 0.0))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for k in range(60):
+            stepper.step(moving(k), 0.1 * k)
+    assert [str(warning.message) for warning in said] == ["samples come at 10 Hz instead of 20 Hz; set bus_rate_hz=10"]
+
+
+def test_a_spinning_car_may_slide_as_fast_as_it_drove_and_is_marked():
+    watch = Watch(usual_limits(("vx", "yaw_rate", "ay"), 20.0), 0, 20.0)
+    drive = np.tile([20.0, 0.2, 4.0], (20, 1))
+    spin = np.tile([3.0, 2.5, 0.5], (20, 1))  # ay - u r = -7 m/s²
+    said = watch(np.full(40, 15.0), np.concatenate([drive, spin]), np.zeros(40, np.int8))
+    assert (said.vy[26:36] == 15.0).all()  # the speed before is remembered for seconds
+    assert (said.marks[26:] & SPINNING > 0).all()
+    assert not (said.marks[26:36] & CLIPPED).any()
+    calm = Watch(usual_limits(("vx", "yaw_rate", "ay"), 20.0), 0, 20.0)
+    slow = np.tile([3.0, 0.2, 0.6], (20, 1))
+    assert calm(np.full(26, 15.0), np.concatenate([drive, slow]), np.zeros(40, np.int8)).vy[20] == 3.0
+
+
+def test_an_offline_estimator_does_not_run_online():
+    estimator = ready("factor_graph") if "factor_graph" in estimator_names() else None
+    if estimator is None:
+        pytest.skip("there is no factor graph")
+    offline = fitted("factor_graph", window=None)
+    with pytest.raises(ConfigurationError):
+        GuardedStepper(offline)
+
+
+def test_a_missing_channel_is_said():
+    estimator = ready("zero")
+    drive = planar_drive(5.0)
+    with pytest.raises(DataError, match="recording 'drive' has no channel 'vx'"):
+        estimate_guarded(estimator, {"ay": drive["ay"]}, drive)
+
+
+def test_front_end_filters_as_scipy_does_and_passes_on_at_the_estimators_rate():
+    time = np.arange(2000) / 200.0
+    samples = np.sin(2 * np.pi * 0.7 * time) + 0.3 * np.sin(2 * np.pi * 17.0 * time)
+    front = FrontEnd(("ay",), (), usual_limits(("ay",), 20.0), 200.0, 20.0)
+    passed = [front(np.array([[value]])) for value in samples]
+    rows = np.array([row[0, 0] for row in passed if row is not None])
+    sections = signal.butter(4, 0.4 * 20.0, fs=200.0, output="sos")
+    state = signal.sosfilt_zi(sections) * samples[0]
+    expected, _ = signal.sosfilt(sections, samples, zi=state)
+    np.testing.assert_allclose(rows, expected[::10], rtol=0.0, atol=1e-12)
+    late = np.sin(2 * np.pi * 0.7 * (time[::10] - front.delay))
+    assert np.sqrt(np.mean((rows - late)[20:] ** 2)) < 0.02  # the signal comes late by the stated delay, the noise is gone
+
+
+def test_front_end_of_an_uneven_ratio_keeps_the_estimators_rate():
+    front = FrontEnd(("ay",), (), usual_limits(("ay",), 30.0), 100.0, 30.0)
+    passed = [front(np.array([[0.01 * k]])) is not None for k in range(1000)]
+    assert sum(passed) == 300
+    assert passed[0]
+
+
+def test_front_end_starts_from_the_first_sample_after_a_gap():
+    front = FrontEnd(("ay",), (), usual_limits(("ay",), 20.0), 200.0, 20.0)
+    for _ in range(400):
+        front(np.array([[1.0]]))
+    for _ in range(300):
+        row = front(np.array([[math.nan]]))
+        assert row is None or math.isnan(row[0, 0]) or row[0, 0] == pytest.approx(1.0)
+    after = [front(np.array([[3.0 + 1e-6 * k]])) for k in range(40)]
+    assert [row[0, 0] for row in after if row is not None] == pytest.approx([3.0] * 4, abs=1e-3)
+
+
+def test_a_bus_slower_than_the_estimator_is_refused():
+    with pytest.raises(ConfigurationError, match="samples at 10 Hz are too slow for an estimator that works at 20 Hz"):
+        GuardedStepper(ready("ksnn"), bus_rate_hz=10.0)

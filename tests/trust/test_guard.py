@@ -1,0 +1,124 @@
+"""What is believed of a sample before an estimator sees it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from conftest import planar_drive
+from vehest.data.recording import Recording
+from vehest.trust.guard import RESTART, USE, WAIT, ChannelLimits, Guard, GuardLimits, learn_limits, usual_limits
+
+CHANNELS = ("yaw_rate", "vx", "ay", "ax")
+RATE = 20.0
+
+
+def rows_of(drive: Recording) -> np.ndarray:
+    return np.ascontiguousarray(drive.stack(CHANNELS))
+
+
+def guard(skippable: tuple[str, ...] = (), limits: GuardLimits | None = None) -> Guard:
+    return Guard(CHANNELS, skippable, limits or usual_limits(CHANNELS, RATE), RATE)
+
+
+def test_a_drive_without_faults_passes_as_it_is(drive):
+    cleaned = guard()(rows_of(drive))
+    assert np.array_equal(cleaned.rows, rows_of(drive))
+    assert cleaned.measured.all()
+    assert cleaned.flow[0] == RESTART
+    assert (cleaned.flow[1:] == USE).all()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e6, -70.0, 30.0])
+def test_a_value_that_no_car_reaches_holds_the_last_one(drive, value):
+    rows = rows_of(drive)
+    rows[100, 2] = value
+    cleaned = guard()(rows)
+    assert not cleaned.measured[100, 2]
+    assert cleaned.rows[100, 2] == rows[99, 2]
+    assert cleaned.measured.sum() == rows.size - 1
+
+
+def test_a_channel_that_can_be_skipped_becomes_nan(drive):
+    rows = rows_of(drive)
+    rows[100, 2] = math.inf
+    assert math.isnan(guard(("ay", "yaw_rate"))(rows).rows[100, 2])
+
+
+def test_a_spike_is_left_aside_and_a_new_level_believed_once_it_stands(drive):
+    rows = rows_of(drive)
+    rows[100, 2] += 12.0
+    rows[200:, 2] += 12.0
+    measured = guard(limits=learn_limits([drive], CHANNELS, RATE))(rows).measured[:, 2]
+    assert np.flatnonzero(~measured).tolist() == [100, 200]
+
+
+@pytest.mark.parametrize(("samples", "restarts"), [(10, 0), (11, 1), (60, 1)])
+def test_gaps_up_to_half_a_second_are_bridged_and_longer_ones_start_anew(drive, samples, restarts):
+    rows = rows_of(drive)
+    rows[300 : 300 + samples, 1] = math.nan
+    flow = guard()(rows).flow
+    assert (flow[1:] == RESTART).sum() == restarts
+    assert (flow == WAIT).sum() == max(samples - 10, 0)
+
+
+def test_one_of_two_channels_that_can_be_skipped_may_be_missing_for_long(drive):
+    rows = rows_of(drive)
+    rows[300:400, 0] = math.nan
+    assert (guard(("ay", "yaw_rate"))(rows).flow[1:] == USE).all()
+    rows[300:400, 2] = math.nan
+    assert (guard(("ay", "yaw_rate"))(rows).flow == WAIT).sum() == 90
+
+
+def test_nothing_is_used_before_every_needed_channel_was_there_once(drive):
+    rows = rows_of(drive)
+    rows[:5, 3] = math.nan
+    flow = guard()(rows).flow
+    assert (flow[:5] == WAIT).all()
+    assert flow[5] == RESTART
+
+
+def test_a_frozen_channel_counts_as_not_measured_after_its_longest_run(drive):
+    limits = learn_limits([drive], CHANNELS, RATE)
+    rows = rows_of(drive)
+    rows[300:400, 0] = rows[299, 0]
+    measured = guard(limits=limits)(rows).measured[:, 0]
+    first = 300 + round(limits.channels["yaw_rate"].run * RATE)
+    assert np.flatnonzero(~measured).tolist() == list(range(first, 400))
+
+
+def test_a_car_that_stands_has_no_frozen_channels():
+    still = planar_drive(20.0)
+    rows = rows_of(still)
+    rows[100:300] = 0.0
+    limits = learn_limits([still], CHANNELS, RATE)
+    one_by_one = guard(limits=limits)
+    measured = np.concatenate([one_by_one(rows[k : k + 1]).measured for k in range(len(rows))])
+    assert measured[110:300].all()
+
+
+def test_limits_are_never_tighter_than_what_a_car_reaches(drive):
+    gentle = Recording("gentle", "car", RATE, 0.0, {name: 0.1 * drive[name] for name in CHANNELS})
+    limits = learn_limits([gentle], CHANNELS, RATE)
+    usual = usual_limits(CHANNELS, RATE)
+    for name, own in limits.channels.items():
+        assert own.low <= usual.channels[name].low
+        assert own.high >= usual.channels[name].high
+        assert own.jump >= usual.channels[name].jump - {"vx": 2.0, "yaw_rate": 0.5}.get(name, 6.0) - 1e-12
+
+
+def test_rows_one_by_one_and_all_at_once_agree_to_the_last_bit(drive):
+    generator = np.random.default_rng(3)
+    rows = rows_of(drive)
+    for _ in range(60):
+        k, c = generator.integers(0, len(rows)), generator.integers(0, 4)
+        rows[k : k + generator.integers(1, 30), c] = generator.choice([math.nan, math.inf, 0.0, 1e6, 3.0])
+    limits = GuardLimits({"ay": ChannelLimits(-20.0, 20.0, 2.0, 0.2)})
+    at_once, one_by_one = guard(("ay",), limits), guard(("ay",), limits)
+    together, parts = at_once(rows), [one_by_one(rows[k : k + 1]) for k in range(len(rows))]
+    for name in ("rows", "measured", "flow"):
+        assert np.array_equal(getattr(together, name), np.concatenate([getattr(part, name) for part in parts]), equal_nan=name == "rows")
+    assert (together.flow == WAIT).any()
+    assert not together.measured.all()
