@@ -141,6 +141,26 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once() -> None:
     assert np.isfinite(whole.ratio).all()
 
 
+def test_senseless_values_leave_nothing_behind() -> None:
+    model, drive = model_of(), measured_drive(4)
+    rows = np.ascontiguousarray(drive.stack(CHANNELS))
+    healthy = health_rows(model.packed(), rows, np.isfinite(rows), model.start())
+    for place, value in enumerate((1e200, -1e300, math.inf, math.nan, 1e7)):
+        rows[1000 + 10 * place, place] = value
+    found = health_rows(model.packed(), rows, np.ones(rows.shape, bool), model.start())
+    assert (found.status[[1000, 1010, 1020, 1030, 1040]] > VALID).all()
+    assert np.isfinite(found.ratio).all()
+    later = slice(1040 + round(30 * RATE), None)
+    np.testing.assert_allclose(found.ratio[later], healthy.ratio[later], rtol=0.2, atol=0.05)
+
+
+def test_a_channel_that_never_moved_in_training_can_be_learnt_and_watched() -> None:
+    drives = [replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))}) for drive in map(measured_drive, range(4))]
+    model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
+    assert not judged(model, drives[3]).status.any()
+    assert (judged(model, drives[3], steer=after(drives[3]["steer"], 0.01)).status[ONSET:] > VALID).any()
+
+
 def test_a_car_without_a_measured_speed_is_judged_by_its_motor() -> None:
     channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
     drives = [small_car_drive(60.0, seed) for seed in range(4)]

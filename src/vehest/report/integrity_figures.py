@@ -42,8 +42,8 @@ def stanford_figure(families: Mapping[str, Integrity], quantity: str = "sideslip
             end = REACH * own.alert_limit
             level = np.where(own.flagged | ~np.isfinite(own.level), np.inf, own.level)
             edges = np.linspace(0.0, end, BINS + 1)
-            within = [np.clip(values, 0.0, end * (1.0 - 1e-9)) for values in (own.error, level)]
-            counts, _, _ = np.histogram2d(*within, bins=(edges, edges))
+            across, up = (np.clip(values, 0.0, end * (1.0 - 1e-9)) for values in (own.error, level))
+            counts = np.histogram2d(across, up, bins=[edges, edges])[0]
             shown = np.ma.masked_equal(counts.T, 0)
             axes.pcolormesh(edges, edges, shown, cmap="Greys", norm=LogNorm(1, max(counts.max(), 2.0)), rasterized=True)
             _draw_regions(axes, own)

@@ -50,6 +50,7 @@ RELATION_SECONDS = (0.25, 1.0, 4.0, 12.0)
 
 BLOCK_SECONDS = 5.0  # whose largest values set the limits
 HOURS = 100.0  # in which healthy drives are to exceed a limit about once
+BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: tyres, track, wind
 LEAST_VALUES = 10.0  # independent ones that any time holds
 LEAST_Z = 4.5  # below which no statistic that is N(0, 1) while all is well counts
 LEAST_RUN = 4.0  # equal samples in a row
@@ -375,16 +376,17 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         usual=tuple(float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0 for name in names),
         largest=tuple(largest.values()),
         longest_gap=tuple(_longest_gap([part[name] for part in received], rate_hz) for name in names),
-        standstill=(least_speed, *(min(usual, 0.1 * largest.get(name, np.inf)) for name, usual in _STILL)),
+        standstill=(
+            least_speed,
+            min(STILL_YAW_RATE, 0.1 * largest.get("yaw_rate", np.inf)),
+            min(STILL_AY, 0.1 * largest.get("ay", np.inf)),
+        ),
         spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
         speeds=tuple(noise.speeds.tolist()),
         levels=_plain(levels),
     )
     found = _with_healthy(_with_healthy(found, train), train)
     return replace(found, limits=limits_from(block_maxima(found, [*train, *validation]), found.statistics, 1.0 / rate_hz))
-
-
-_STILL = (("yaw_rate", STILL_YAW_RATE), ("ay", STILL_AY))
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:
@@ -441,14 +443,16 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
 
 
 def margin(seconds: float, healthy_seconds: float) -> float:
-    """By how much what is seen in a short time is exceeded in `HOURS`, if it is normal: the ratio of the largest of N values, √(2 ln N).
+    """By how much what is seen in a short time may be exceeded in `HOURS`.
+
+    The ratio of the largest of N normal values, √(2 ln N), times `BETWEEN_DRIVES`.
 
     Args:
         seconds: after which a statistic is about independent of what it was.
         healthy_seconds: in which it was seen.
     """
     seen, wanted = (max(time / seconds, LEAST_VALUES) for time in (healthy_seconds, 3600.0 * HOURS))
-    return max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
+    return BETWEEN_DRIVES * max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
 
 
 def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float) -> tuple[float, ...]:

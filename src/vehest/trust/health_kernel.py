@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 from vehest.estimators.kernels.compiling import entry, part
 
+BELIEVED = 1000.0  # times the largest size in training, beyond which a value is none
 CLIP = 4.0  # standard deviations
 STEP_CLIP = 8.0  # the same for steps
 CALM = 0.3  # of the mean energy, that a calm stretch counts as at least
@@ -223,10 +224,11 @@ def _receive(k, rows, measured, sizes, numbers, state):  # type: ignore[no-untyp
     C, p = sizes[N_CHANNELS], sizes[N_LAGS]
     at_flags, at_last, at_usual, at_low_passed = sizes[AT_FLAGS], sizes[AT_LAST], sizes[AT_USUAL], sizes[AT_LOW_PASSED]
     at_run, at_share, at_settings, at_gap = sizes[AT_RUN], sizes[AT_SHARE], sizes[AT_SETTINGS], sizes[AT_GAP]
-    at_gap_limit, at_x = sizes[AT_GAP_LIMIT], sizes[AT_X]
+    at_gap_limit, at_x, at_largest = sizes[AT_GAP_LIMIT], sizes[AT_X], sizes[AT_LARGEST]
     first, longest, absent = state[at_flags] == 0.0, 0.0, -1
     for i in range(C):
-        value, known = rows[k, i], measured[k, i] and math.isfinite(rows[k, i])
+        value = rows[k, i]
+        known = measured[k, i] and abs(value) <= BELIEVED * numbers[at_largest + i]  # false for NaN
         if first:
             state[at_last + i] = value if known else numbers[at_usual + i]
             state[at_low_passed + i] = state[at_last + i]

@@ -9,8 +9,8 @@ signature to the channels adds s_k to the innovations, the signature through the
 
 ε being the innovations of the healthy drive. It detects where the sum first exceeds log A; A bounds the chance of a false alarm by 1/A
 (Wald, Sequential Analysis, 1947; Basseville & Nikiforov, Detection of Abrupt Changes, 1993, Section 4.2). Innovations of real drives have
-heavier tails than a normal distribution, so A is raised to what the same test reaches anywhere on healthy drives, with the reserve for longer
-times that limits of the detector have (`vehest.trust.health.margin`).
+heavier tails than a normal distribution, so A is raised to what the same test reaches anywhere on healthy drives, with the reserve that
+limits of the detector have (`vehest.trust.health.margin`).
 """
 
 from __future__ import annotations
