@@ -137,6 +137,11 @@ class KalmanFilter(SingleTrackEstimator):
         return self.settings.noise.read_from == "training" and bool(self.settings.noise.unknown)
 
     @property
+    def adapts(self) -> bool:
+        """Whether offsets are states."""
+        return bool(self.settings.offsets.given)
+
+    @property
     def variant(self) -> str:
         """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"

@@ -169,6 +169,11 @@ class LearnedUkf(Estimator):
         self._seed = 0
 
     @property
+    def adapts(self) -> bool:
+        """Friction is a state."""
+        return True
+
+    @property
     def variant(self) -> str:
         """The paper's name: nntf_uh and so on; a star for another start of friction."""
         s = self.settings

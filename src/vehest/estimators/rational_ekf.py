@@ -214,6 +214,11 @@ class RationalFilter(SingleTrackEstimator):
         self._seed = 0
 
     @property
+    def adapts(self) -> bool:
+        """Whether tyres are states."""
+        return self.settings.tyres != "rational"
+
+    @property
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")

@@ -96,7 +96,7 @@ def estimate_guarded(
     rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
     limits = limits_for(estimator, trust)
     rate = estimator.settings.rate_hz
-    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate)(rows)
+    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=estimator.warm_up_steps == 0)(rows)
     monitor = Monitor(estimator, trust, elsewhere=elsewhere)
     verdict = monitor.before(rows, cleaned)
     run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
@@ -271,7 +271,7 @@ class GuardedStepper(Stepper):
         limits = limits_for(estimator, trust)
         self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz else None
         self._rate = bus_rate_hz or rate
-        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate)
+        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=estimator.warm_up_steps == 0)
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
         self._monitor = Monitor(estimator, trust, elsewhere=elsewhere)
         self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)

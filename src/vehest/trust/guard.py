@@ -186,9 +186,13 @@ class Guard:
         skippable: those of them that the estimator can do without.
         limits: of each channel; what any car reaches for those that they do not name.
         rate_hz: of the rows [Hz].
+        remembers: whether the estimator has more memory than a window: it then starts anew at a jump that is believed after all, since what
+            it remembers belongs to another level.
     """
 
-    def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float) -> None:
+    def __init__(
+        self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float, *, remembers: bool = False
+    ) -> None:
         self.channels, self.rate_hz = tuple(channels), rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
@@ -196,7 +200,7 @@ class Guard:
         self._skippable = np.array([name in skippable for name in channels])
         places = [self.channels.index(name) if name in self.channels else -1 for name in ("vx", "yaw_rate")]
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
-        self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists], np.int64)
+        self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64)
         self.state = np.zeros((len(channels) + 1, 6))
         self.state[:-1, [0, 3, 4]] = np.nan  # nothing believed, no last value, no candidate
         self.state[-1, 0] = WAIT
@@ -218,14 +222,15 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
             jump, how often it was confirmed; last row: whether the estimator waits.
         limits: (C, 4): low, high, jump, longest run in samples.
         skippable: (C,).
-        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand.
+        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand, whether a jump
+            that is believed makes the estimator start anew.
         clean, measured, flow: output, as in `Cleaned`.
     """
     n_channels = rows.shape[1]
-    vx_at, yaw_at, bridged, persists = settings
+    vx_at, yaw_at, bridged, persists, remembers = settings
     for k in range(rows.shape[0]):
         still = vx_at >= 0 and abs(state[vx_at, 0]) < STANDSTILL_SPEED and (yaw_at < 0 or abs(state[yaw_at, 0]) < STANDSTILL_YAW_RATE)
-        most_needed, least_skippable, any_skippable = 0.0, math.inf, False
+        most_needed, least_skippable, any_skippable, jumped = 0.0, math.inf, False, False
         for c in range(n_channels):
             x = rows[k, c]
             own = state[c]
@@ -239,6 +244,7 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
                     own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0
                     own[4] = x
                     believed = own[5] >= persists
+                    jumped = jumped or believed
             if believed:
                 own[0], own[1], own[4], own[5] = x, 0.0, math.nan, 0.0
             else:
@@ -254,5 +260,5 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
         if most_needed > bridged or (any_skippable and least_skippable > bridged):
             flow[k] = WAIT
         else:
-            flow[k] = RESTART if state[n_channels, 0] == WAIT else USE
+            flow[k] = RESTART if state[n_channels, 0] == WAIT or (jumped and remembers) else USE
         state[n_channels, 0] = flow[k]

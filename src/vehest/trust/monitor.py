@@ -10,7 +10,7 @@ from vehest.trust.bands import band_rows
 from vehest.trust.guard import Cleaned
 from vehest.trust.health import health_rows
 from vehest.trust.record import Trust
-from vehest.trust.verdict import Verdict, heed_rows, numbers_of, verdict_rows, widen_rows
+from vehest.trust.verdict import ROLLED_BACK_SECONDS, Verdict, heed_rows, numbers_of, verdict_rows, widen_rows
 from vehest.trust.watch import Watched
 
 
@@ -33,7 +33,9 @@ class Monitor:
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
         self._remembers = estimator.warm_up_steps == 0
-        self._fault = np.zeros(1)
+        adapts = bool(getattr(estimator, "adapts", False))
+        self._often = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if adapts else 0
+        self._fault = np.zeros(2)
 
     @property
     def has_bands(self) -> bool:
@@ -56,6 +58,7 @@ class Monitor:
             self._numbers,
             self._skippable,
             self._remembers,
+            self._often,
             cleaned.rows,
             cleaned.measured,
             cleaned.flow,
