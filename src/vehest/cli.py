@@ -310,7 +310,7 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    Beside v and β stand half widths of their calibrated 90 % bands, and the health of the estimate: 0 valid, 1 degraded, 2 invalid, and why.
+    Beside v and β stand half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid.
 
     For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest and says so.
 
