@@ -10,6 +10,7 @@ Each has the errors of the same estimator on the same samples without the fault 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,10 @@ UNITS = {
     "rmse_sideslip_nominal": "deg",
     "rmse_vy_nominal": "m/s",
     "max_error_sideslip_nominal": "deg",
+    "coverage_90": "1",
+    "coverage_90_unflagged": "1",
+    "detection_delay": "s",
+    "missed_detections": "1",
 }
 """Metrics under a fault, with units."""
 
@@ -52,6 +57,50 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
             usual = {f"{name}_nominal": value for name, value in _errors(nominal, masks).items()}
             found[subset] = _errors(parts, masks) | usual
     return found
+
+
+@dataclass(frozen=True, eq=False)
+class Flagged:
+    """What is said of an estimate besides its value, on the grid that errors are read on.
+
+    Args:
+        band: half width of the 90 % band of β, (K,) [rad]; NaN where there is none.
+        health: 0 valid, 1 degraded, 2 invalid, (K,).
+    """
+
+    band: FloatArray
+    health: FloatArray
+
+
+def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window]) -> dict[str, float]:
+    """Whether bands hold and faults are flagged while they last, over all parts together.
+
+    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those said to be valid;
+    ``detection_delay`` mean time from a fault's start to the first sample that is not valid [s], of ranges that were valid before, as the
+    grid tells; ``missed_detections`` share of these in which none is before the fault's end. Only figures that there is something for.
+    """
+    inside, valid, delays = [], [], []
+    for part, own, window in zip(parts, flagged, windows, strict=True):
+        during = _during(part.time, window)
+        turned = np.abs(np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi)
+        known = during & np.isfinite(own.band)
+        inside.append((turned <= own.band)[known])
+        valid.append(own.health[known] == 0)
+        before = np.flatnonzero(part.time < window[0] - _CLOCK)
+        if during.any() and (not len(before) or own.health[before[-1]] == 0):
+            at = np.flatnonzero(during & (own.health > 0))
+            delays.append(part.time[at[0]] - window[0] if len(at) else np.inf)
+    held, calm, late = np.concatenate(inside), np.concatenate(valid), np.array(delays)
+    figures = {}
+    if len(held):
+        figures["coverage_90"] = float(held.mean())
+    if calm.any():
+        figures["coverage_90_unflagged"] = float(held[calm].mean())
+    if np.isfinite(late).any():
+        figures["detection_delay"] = float(late[np.isfinite(late)].mean())
+    if len(late):
+        figures["missed_detections"] = float(np.mean(~np.isfinite(late)))
+    return figures
 
 
 def _during(time: FloatArray, window: Window) -> NDArray[np.bool_]:

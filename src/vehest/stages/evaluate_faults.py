@@ -21,7 +21,7 @@ from vehest.data.store import read_estimate, read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored, reference_state, score_all, sequences
-from vehest.evaluation.under_fault import UNITS, Window, errors_under_fault
+from vehest.evaluation.under_fault import FAULTED, UNITS, Flagged, Window, errors_under_fault, flags_under_fault
 from vehest.stages.artefacts import StagePlan
 from vehest.stages.code_version import code_version
 from vehest.stages.evaluate import COLUMNS, METRICS, EvaluateJob, test_sets, write_evaluation
@@ -103,18 +103,29 @@ class _Ranges:
     def errors(self, settings: FaultSettings) -> dict[str, dict[str, float]]:
         """Subset -> metric -> value under a fault."""
         estimates: list[Estimate] = []
+        said: list[Estimate] = []
         windows: list[Window] = []
         for position, (piece, recording, state) in enumerate(zip(self.pieces, self.recordings, self.states, strict=True)):
             start = max(piece.start - recording.start_time, 0.0)
             fault = settings.within(start, recording.duration - start, position)
             onset = recording.start_time + fault.onset
             estimate = _estimated_under_fault(self.estimator, self.trust, recording, fault, state)
+            said.append(estimate)
             estimates.append(_lost_from(onset, estimate))
             windows.append((onset, onset + fault.duration))
-        return errors_under_fault(self._scored(estimates), self.nominal, windows)
+        scored = self._scored(estimates)
+        found = errors_under_fault(scored, self.nominal, windows)
+        if self.trust is not None and FAULTED in found:
+            found[FAULTED] |= flags_under_fault(scored, [_flags(*pair) for pair in zip(said, scored, strict=True)], windows)
+        return found
 
     def _scored(self, estimates: Sequence[Estimate]) -> list[Scored]:
         return score_all(estimates.__getitem__, self.spans, self.reference, self.protocol)
+
+
+def _flags(estimate: Estimate, part: Scored) -> Flagged:
+    band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
+    return Flagged(band, estimate.held_at(part.time, "health"))
 
 
 def _measured(job: EvaluateJob, piece: Span) -> Recording:

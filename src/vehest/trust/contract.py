@@ -59,6 +59,11 @@ class Guarded:
     marks: NDArray[np.int8]
 
 
+def starts_anew(estimator: Estimator) -> bool:
+    """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
+    return estimator.warm_up_steps == 0 and not getattr(estimator, "adapts", False)
+
+
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
     """The limits that were learnt with an estimator, or those of any car."""
     own = trust.guard if trust is not None else None
@@ -96,7 +101,7 @@ def estimate_guarded(
     rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
     limits = limits_for(estimator, trust)
     rate = estimator.settings.rate_hz
-    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=estimator.warm_up_steps == 0)(rows)
+    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))(rows)
     monitor = Monitor(estimator, trust, elsewhere=elsewhere)
     verdict = monitor.before(rows, cleaned)
     run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
@@ -271,7 +276,7 @@ class GuardedStepper(Stepper):
         limits = limits_for(estimator, trust)
         self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz else None
         self._rate = bus_rate_hz or rate
-        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=estimator.warm_up_steps == 0)
+        self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
         self._monitor = Monitor(estimator, trust, elsewhere=elsewhere)
         self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)

@@ -1,8 +1,9 @@
 """What follows from health: which channels an estimator gets, when it starts anew, what is said of its estimate, how wide its band is.
 
 - A channel that health accuses of a fault counts as not measured where the method can do without it, so that nothing adapts to it.
-- States that adapt, such as tyres and friction, go back every second to what they were fitted to while a fault is suspected, and once it
-  is over: the estimator starts anew. So does any estimator that remembers more than a window, once a fault is over.
+- An estimator that remembers more than a window starts anew once a fault is over.
+- One with states that adapt, such as tyres and friction, does not, since it would forget them. But if the accused channel is one that it
+  needs, these states go back to what they were fitted to, every second until nothing is suspected any more.
 - The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
   least as far as sideslip did in training. These factors were set before their effect was looked at.
 
@@ -31,7 +32,7 @@ NO_ESTIMATE, BEYOND_SPEED = 30, 31
 WIDER = (1.0, 2.0, 4.0)
 """Factor of the band of a valid, a degraded, an invalid estimate."""
 
-ROLLED_BACK_SECONDS = 1.0  # between two starts of an estimator that adapts, while a fault is suspected
+ROLLED_BACK_SECONDS = 1.0
 
 NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 """Kinds of reasons that accuse no sensor of anything that an estimator could do without."""
@@ -72,9 +73,10 @@ def heed_rows(status, reason, numbers, skippable, remembers, often, rows, measur
         numbers: of the channels, (C,).
         skippable: which of them the estimator can do without, (C,).
         remembers: whether the estimator has more memory than a window.
-        often: samples after which one that adapts starts anew while there is a fault; 0 where it does not adapt.
+        often: samples after which one with states that adapt goes back to what was fitted, while a channel that it needs is accused; 0
+            where nothing adapts.
         rows, measured, flow: as in `vehest.trust.guard.Cleaned`.
-        state: whether there was a fault since health was last valid, and for how many samples, (2,).
+        state: whether there was a fault since health was last valid, and for how many samples one in a needed channel, (2,).
     """
     for k in range(rows.shape[0]):
         kind, channel = int(reason[k]) // 10000, int(reason[k]) % 10000 // 100
@@ -82,17 +84,19 @@ def heed_rows(status, reason, numbers, skippable, remembers, often, rows, measur
         for other in NO_FAULTS:
             at_fault = at_fault and kind != other
         if at_fault:
-            state[0] = 1.0
+            state[0], needs = 1.0, True
             for c in range(rows.shape[1]):
                 if skippable[c] and numbers[c] == channel:
-                    rows[k, c], measured[k, c] = math.nan, False
-        if state[0] > 0.0 and status[k] != VALID:
-            state[1] += 1.0
-            if often > 0 and flow[k] == USE and state[1] % often == 0.0:
-                flow[k] = RESTART
+                    rows[k, c], measured[k, c], needs = math.nan, False, False
+            if needs and state[1] == 0.0:
+                state[1] = 1.0
         elif status[k] == VALID and state[0] > 0.0:
             state[0], state[1] = 0.0, 0.0
-            if remembers and flow[k] == USE:
+            if remembers and often == 0 and flow[k] == USE:
+                flow[k] = RESTART
+        if state[1] > 0.0:
+            state[1] += 1.0
+            if often > 0 and flow[k] == USE and state[1] % often == 0.0:
                 flow[k] = RESTART
 
 
