@@ -154,10 +154,11 @@ def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked: Place) -> No
 
 def test_estimators_that_come_and_go_are_named(checked: Place) -> None:
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
-    code, line = verdict(checked)
+    code, out, _ = checked("report", "--check", "small", "--json")
     assert code == 3
-    for what in ("train zero added", "evaluate zero added", "train luenberger removed", "evaluate luenberger removed"):
-        assert what in line
+    named = {change["what"] for change in json.loads(out)[0]["changes"]}
+    for stage in ("train", "calibrate", "evaluate"):
+        assert {f"{stage} zero added", f"{stage} luenberger removed"} <= named
 
 
 def test_changed_split_and_title_are_named(checked: Place) -> None:
