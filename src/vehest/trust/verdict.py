@@ -135,7 +135,7 @@ def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyp
         marks: of `vehest.trust.watch`, (T,).
         vy: what is passed on, (T,) [m/s].
         vx: speed that it goes with, (T,) [m/s].
-        farthest: largest |v| of estimates in training [m/s].
+        farthest: 99.9th percentile of |v| of estimates in training [m/s].
         bands: half widths of v [m/s] and β [rad], (T, 2).
     """
     for k in range(vy.shape[0]):
