@@ -15,11 +15,10 @@ from vehest.evaluation.bands import (
     crps_of_levels,
     figures_by_regime,
     interval_score,
-    intraclass_correlation,
     proportion_interval,
 )
 from vehest.evaluation.metrics import UNITS, Scored
-from vehest.trust.bands import LEVELS, Bands, Quantity
+from vehest.trust.bands import LEVELS, Bands, Quantity, intraclass_correlation
 
 GAUSSIAN = stats.norm.ppf([0.5 + 0.5 * level for level in LEVELS])
 UNIT = Quantity({"one": 1.0}, 0.01, tuple(GAUSSIAN.tolist()), (False,) * 4, 9.0)

@@ -16,7 +16,7 @@ from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, effective_blocks, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, Mask
-from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands
+from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, intraclass_correlation
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
@@ -165,31 +165,6 @@ def crps_of_levels(errors: FloatArray, half: FloatArray, levels: Sequence[float]
     missed = -errors[:, None] - quantiles  # reference - quantile, both less the estimate
     pinball = missed * (orders - (missed < 0.0))
     return np.asarray(2.0 * pinball @ shares)
-
-
-def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> float:
-    """How alike values of one group are, one-way analysis of variance: 0 where a group says nothing, 1 where it says all.
-
-    Args:
-        values: (N,).
-        labels: group of each, (N,).
-
-    Returns:
-        NaN where there are fewer than two groups, or no group has two.
-
-    Source: Donner, A review of inference procedures for the intraclass correlation coefficient in the one-way random effects model,
-    International Statistical Review 54 (1), 1986, for groups of unlike sizes.
-    """
-    _, own, sizes = np.unique(labels, return_inverse=True, return_counts=True)
-    groups, n = len(sizes), len(values)
-    if groups < 2 or n <= groups:
-        return float("nan")
-    means = np.bincount(own, weights=values) / sizes
-    between = float(sizes @ np.square(means - values.mean())) / (groups - 1)
-    within = float(np.sum(np.square(values - means[own]))) / (n - groups)
-    typical = (n - float(np.sum(np.square(sizes))) / n) / (groups - 1)
-    total = between + (typical - 1.0) * within
-    return (between - within) / total if total > 0 else float("nan")
 
 
 def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:

@@ -62,7 +62,7 @@ class Quantity:
         weights: term -> its weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]; the others have none.
         floor: s is never below [m/s, or rad].
         factors: q of each level.
-        beyond: of each level, whether there are too few blocks for it: q is then the largest score times 1 + 1/K.
+        beyond: of each level, whether there are too few blocks for it (`pooled_quantile`).
         effective_blocks: how many equal blocks the squared scores are spread over (Kish 1965).
     """
 
@@ -444,10 +444,12 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
 
 
 def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float) -> tuple[float, bool]:
-    """The level's quantile of scores pooled over K blocks, each of weight 1/(K + 1), with as much at infinity.
+    """The level's quantile of scores pooled over K blocks, each of the same weight, with 1/(n + 1) of the weight at infinity.
 
-    A further block, exchangeable with these, has on average at least the level of its samples below: with its own distribution in
-    the place of infinity the pooled one would be symmetric in all K + 1, and the quantile is no smaller than that one's.
+    n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in blocks of m on average, ρ the intraclass
+    correlation of "below the quantile". If blocks say all (ρ = 1) n is K, and a further block, exchangeable with these, has on average at
+    least the level of its scores below (Lee, Barber & Willett 2023). If they say nothing n is N, as in split conformal prediction. In
+    between the level is met on average, nearly: what is left of the guarantee would otherwise make bands of few blocks far too wide.
 
     Args:
         scores: (N,), none negative.
@@ -455,17 +457,48 @@ def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float)
         level: between 0 and 1.
 
     Returns:
-        The quantile; and whether K is too small for the level, where by rule it is the largest score times 1 + 1/K.
+        The quantile; and whether n is too small for the level, where by rule it is the largest score times 1 + 1/n.
 
-    Source: Dunn, Wasserman & Ramdas 2023; Lee, Barber & Willett 2023.
+    Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4 (design effect).
     """
     _, label, counts = np.unique(blocks, return_inverse=True, return_counts=True)
-    n_blocks = len(counts)
-    if level > n_blocks / (n_blocks + 1) + 1e-12:
-        return float(scores.max()) * (1.0 + 1.0 / n_blocks), True
-    order = np.argsort(scores, kind="stable")
-    below = np.cumsum(1.0 / ((n_blocks + 1) * counts[label[order]]))
-    return float(scores[order][min(int(np.searchsorted(below, level - 1e-9)), len(scores) - 1)]), False
+    n_blocks, order = len(counts), np.argsort(scores, kind="stable")
+    below = np.cumsum(1.0 / (n_blocks * counts[label[order]]))
+
+    def quantile(share: float) -> float:
+        return float(scores[order][min(int(np.searchsorted(below, share - 1e-9)), len(scores) - 1)])
+
+    alike = intraclass_correlation((scores <= quantile(level)).astype(np.float64), label)
+    alike = 1.0 if math.isnan(alike) else min(max(alike, 0.0), 1.0)
+    independent = len(scores) / (1.0 + (len(scores) / n_blocks - 1.0) * alike)
+    if level > independent / (independent + 1.0) + 1e-12:
+        return float(scores.max()) * (1.0 + 1.0 / independent), True
+    return quantile(level * (1.0 + 1.0 / independent)), False
+
+
+def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> float:
+    """How alike values of one group are, one-way analysis of variance: 0 where a group says nothing, 1 where it says all.
+
+    Args:
+        values: (N,).
+        labels: group of each, (N,).
+
+    Returns:
+        NaN where there are fewer than two groups, or no group has two.
+
+    Source: Donner, A review of inference procedures for the intraclass correlation coefficient in the one-way random effects model,
+    International Statistical Review 54 (1), 1986, for groups of unlike sizes.
+    """
+    _, own, sizes = np.unique(labels, return_inverse=True, return_counts=True)
+    groups, n = len(sizes), len(values)
+    if groups < 2 or n <= groups:
+        return float("nan")
+    means = np.bincount(own, weights=values) / sizes
+    between = float(sizes @ np.square(means - values.mean())) / (groups - 1)
+    within = float(np.sum(np.square(values - means[own]))) / (n - groups)
+    typical = (n - float(np.sum(np.square(sizes))) / n) / (groups - 1)
+    total = between + (typical - 1.0) * within
+    return (between - within) / total if total > 0 else float("nan")
 
 
 def block_labels(yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float) -> tuple[list[NDArray[np.int64]], Blocks]:
