@@ -98,6 +98,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published:
 def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(published)
     monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
     before = contents(published / "results")
     assert {"small/report.md", "small/metrics.csv", f"small/{PROVENANCE}", "small/figures/learning.svg"} <= set(before)
     for command in (["init", "--quiet"], ["add", "results"], ["-c", "user.name=a", "-c", "user.email=a", "commit", "--quiet", "-m", "a"]):
