@@ -324,6 +324,7 @@ def estimate(
         SUFFIXES,
         estimate_recording,
         find_model,
+        finding_in_words,
         findings_for,
         preparation_of,
         pretrained_note,
@@ -353,13 +354,13 @@ def estimate(
         drive = read_table(file, overrides)
         findings = findings_for(drive, fitted, config["dataset"].get("accept") or ())
         if strict and findings:
-            raise DataError(f"'{file}': {findings[0].channel}: {findings[0].message}")
+            raise DataError(f"'{file}': {finding_in_words(findings[0])}")
         result = estimate_recording(fitted, drive, downsample, trust)
     for finding in findings:
-        typer.echo(f"warning: {finding.channel}: {finding.message}", err=True)
+        typer.echo(f"warning: {finding_in_words(finding)}", err=True)
     write_estimate_table(result, out)
     note = {"note": pretrained_note()} if name == PRETRAINED else {}
-    said = {"verdict": verdict_of(result, drive, trust), "findings": [f"{finding.channel}: {finding.message}" for finding in findings]}
+    said = {"verdict": verdict_of(result, drive, trust), "findings": [finding_in_words(finding) for finding in findings]}
     _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
 
 

@@ -24,6 +24,7 @@ from place import DATASET, PIPELINE, Place, write_csv
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
 from vehest.stages.artefacts import read_artefact
+from vehest.trust.verdict import reason_in_words
 
 
 def _statuses(err: str) -> list[tuple[str, str]]:
@@ -131,8 +132,10 @@ def test_train_eval_estimate_report_one_by_one(place):
         assert code == 0, err
         assert json.loads(out)["estimated"] == 600 - 30
     frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
-    assert list(frame.columns) == ["time", "vy", "sideslip"]
-    assert np.allclose(frame["vy"], text["vy"], equal_nan=True)
+    assert list(frame.columns) == ["time", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"]
+    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
+        assert np.allclose(frame[column], text[column], equal_nan=True), column
+    assert [reason_in_words(code) for code in frame["health_reason"]] == text["health_reason"].fillna("").tolist()
 
     model = vehest.load_model(trained["model"])
     estimate = vehest.estimate(model, vehest.read_recording("lap.csv", ["dataset=lap"]))

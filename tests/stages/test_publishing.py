@@ -98,6 +98,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published:
 def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(published)
     monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
     before = contents(published / "results")
     assert {"small/report.md", "small/metrics.csv", f"small/{PROVENANCE}", "small/figures/learning.svg"} <= set(before)
     for command in (["init", "--quiet"], ["add", "results"], ["-c", "user.name=a", "-c", "user.email=a", "commit", "--quiet", "-m", "a"]):
@@ -154,11 +155,13 @@ def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked: Place) -> No
 
 def test_estimators_that_come_and_go_are_named(checked: Place) -> None:
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
-    code, out, _ = checked("report", "--check", "small", "--json")
+    code, line = verdict(checked)
     assert code == 3
-    named = {change["what"] for change in json.loads(out)[0]["changes"]}
-    for stage in ("train", "calibrate", "evaluate"):
-        assert {f"{stage} zero added", f"{stage} luenberger removed"} <= named
+    assert "train zero added" in line
+    [study] = json.loads(verdict(checked, "--json")[1])
+    named = {change["what"] for change in study["changes"]}
+    stages = ("train", "calibrate", "evaluate")
+    assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
 
 
 def test_changed_split_and_title_are_named(checked: Place) -> None:

@@ -213,6 +213,11 @@ def findings_for(recording: Recording, model: Estimator, accepted: Sequence[str]
     return findings
 
 
+def finding_in_words(finding: Finding) -> str:
+    """What a check found, after the channel's name where it is about one."""
+    return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
+
+
 def verdict_of(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
     """How far an estimate can be trusted, in a line."""
     if trust is None or trust.health is None:

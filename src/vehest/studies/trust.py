@@ -1,0 +1,322 @@
+"""The study of trust: do bands hold what they say, on cars that were learnt on and on others, and which faults of sensors are flagged in time.
+
+A part of the pipeline is a comparison on one car, or a lap of it. Test sets of cars and tyres that bands were calibrated on stand apart from
+those of others. Faults are tried on each part's test ranges at the evaluation rate, with health learnt on its training and validation ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vehest.evaluation.ranking import Name
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.integrity_figures import stanford_figure
+from vehest.report.reliability import Reliability, reliability_figure
+from vehest.report.style import lines_of, listed
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.drive import how_it_was_made
+from vehest.studies.kit.runs import by_name
+from vehest.studies.trust_faults import FaultTrials, health_of, trials_of
+from vehest.trust.bands import ELSEWHERE, LEVELS
+
+TAKES = "parts"
+SHOWS_FAILED = True
+
+LEARNT, OTHER = "learnt on", "another"
+FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "error_icc", "band_blocks", "rmse_sideslip")
+COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
+SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
+"""Families of the figures."""
+
+
+def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
+    """The report: bands on cars learnt on, bands elsewhere, faults against what could be seen, integrity, then how it was made."""
+    parts = artefacts.parts
+    board = coverage_board(parts)
+    trials = [trials_of(name, part) for name, part in parts.items() if _tries_faults(part)]
+    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    blocks.append(f"{_bands_in_words(board)}\n\n{_faults_in_words(trials)}")
+    blocks += ["## Bands on cars and tyres that were learnt on", *_bands(board[board["car"] == LEARNT], "learnt")]
+    blocks += [_reliability(board), _by_acceleration(parts, board)]
+    blocks += ["## Bands on another car or tyre", _widening_in_words(board), *_bands(board[board["car"] == OTHER], "elsewhere")]
+    blocks += ["## Faults", *_faults(trials)]
+    stanford = _stanford(parts)
+    blocks += ["## Integrity", stanford] if stanford is not None else []
+    for name, part in parts.items():
+        made = how_it_was_made(part)
+        lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
+        blocks += [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
+    if (board["estimator"] == "ksnn").any():
+        blocks.append(PATENT_NOTE)
+    return {REPORT: Document(artefacts.title, blocks)}
+
+
+def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
+    """One row an estimator, part and test set: what its 90 % band of β holds, with the 95 % interval over blocks, and how wide it is."""
+    rows = []
+    for key, part in parts.items():
+        metrics = part.metrics
+        metrics = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
+        for name, models in by_name(part.models).items():
+            for test_set in part.split.tests:
+                own = metrics[(metrics["estimator"] == name[0]) & (metrics["variant"].fillna("") == name[1])]
+                own = own[own["test_set"] == test_set].set_index("metric")
+                if "coverage_90" not in own.index:
+                    continue
+                row: dict[str, Any] = {"part": key, "title": as_text(part.title), "test_set": test_set, "estimator": name[0]}
+                row |= {"variant": name[1], "estimator_title": as_text(models[0].title)}
+                row |= {"car": OTHER if _elsewhere(part, test_set) else LEARNT}
+                row |= {figure: float(own.loc[figure, "value"]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
+                row |= {end: float(own.loc["coverage_90", end]) for end in ("low", "high")}
+                row |= {"inside": _holds(row["low"], row["high"])}
+                row |= {"without_widening": _without_widening(part, models[0], test_set) if row["car"] == OTHER else math.nan}
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _holds(low: float, high: float) -> str:
+    return "no interval" if math.isnan(low) else "yes" if low <= 0.9 <= high else "too wide" if low > 0.9 else "too narrow"
+
+
+def _elsewhere(part: PartArtefacts, test_set: str) -> bool:
+    """Whether a test set is of another car, or other tyres, than training and validation."""
+    learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
+    return test_set in part.protocol.sets_elsewhere or not {span.dataset for span in part.split.tests[test_set]} <= learnt
+
+
+def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
+    """Coverage if the band were not widened for another car."""
+    inside = []
+    for position, scored in enumerate(part.scored(model, test_set)):
+        band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / ELSEWHERE
+        turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+        inside.append(np.abs(turned) <= band)
+    return float(np.concatenate(inside).mean())
+
+
+def _bands_in_words(board: pd.DataFrame) -> str:
+    learnt = board[(board["car"] == LEARNT) & (board["inside"] != "no interval")]
+    sentences = []
+    for label, own in (("All", learnt), *learnt.groupby("title", sort=False)):
+        counts = own["inside"].value_counts()
+        wide, narrow = (int(counts.get(word, 0)) for word in ("too wide", "too narrow"))
+        words = f"{int(counts.get('yes', 0))} of {len(own)} (too wide {wide}, too narrow {narrow})"
+        sentences.append(f"**{label}: {words}**" if label == "All" else f"{label}: {words}")
+    return (
+        "On how many test sets does 0.90 lie inside the 95 % interval of what a 90 % band of β holds, test sets counted once an estimator, on cars "
+        f"and tyres that were learnt on? {'; '.join(sentences)}. A wide band earns nothing in the interval score, which stands beside."
+    )
+
+
+def _widening_in_words(board: pd.DataFrame) -> str:
+    own = board[board["car"] == OTHER]
+    if own.empty:
+        return "There is no such test set."
+    with_it, without = own["coverage_90"].median(), own["without_widening"].median()
+    return (
+        f"Bands are {ELSEWHERE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold {100 * with_it:.0f} % of the "
+        f"errors (median, lowest {100 * own['coverage_90'].min():.0f} %); without the widening {100 * without:.0f} % (lowest "
+        f"{100 * own['without_widening'].min():.0f} %)."
+    )
+
+
+def _bands(board: pd.DataFrame, name: str) -> list[Block]:
+    if board.empty:
+        return []
+    shown = board.assign(
+        interval=[f"{100 * low:.0f} … {100 * high:.0f}" for low, high in zip(board["low"], board["high"], strict=True)],
+        where=board["title"] + ", " + board["test_set"],
+        **{column: 100 * board[column] for column in ("coverage_90", "coverage_90_p10", "coverage_90_p90", "without_widening")},
+    )
+    columns = {
+        "where": Column("test set"),
+        "estimator_title": Column("estimator"),
+        "rmse_sideslip": Column("RMSE(β) [deg]"),
+        "coverage_90": Column("inside [%]", decimals=1),
+        "interval": Column("95 % interval [%]"),
+        "inside": Column("0.90 in it"),
+        "coverage_90_p10": Column("of manoeuvres, 10 % [%]", decimals=0),
+        "coverage_90_p90": Column("90 % [%]", decimals=0),
+        "width_90": Column("width [deg]"),
+        "interval_score": Column("interval score [deg]"),
+        "error_icc": Column("correlation", decimals=2),
+        "band_blocks": Column("manoeuvres", decimals=1),
+    }
+    if name == "elsewhere":
+        columns = {**columns, "without_widening": Column("inside without the factor [%]", decimals=1)}
+    caption = (
+        "90 % bands of β: errors inside, with the 95 % interval over blocks of the drive and the 10 and 90 % quantiles over manoeuvres; mean full width; "
+        "interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how many equal manoeuvres "
+        "the errors are spread over."
+    )
+    return [Table(f"bands_{name}", caption, shown, columns)]
+
+
+def _reliability(board: pd.DataFrame) -> Figure:
+    """Coverage over level, test sets of cars learnt on together, a line a data set and family."""
+    learnt = board[board["car"] == LEARNT]
+    families = [name for name in SHOWN if name in set(learnt["estimator"])]
+    lines, rows = lines_of([(name, "") for name in families]), []
+    for family in families:
+        own = learnt[learnt["estimator"] == family]
+        values = own[list(COVERAGES)].to_numpy(dtype=float)
+        low, high = (np.quantile(values, share, axis=0) for share in (0.1, 0.9))
+        rows.append(Reliability(family, lines[family, ""], values.mean(axis=0), low, high))
+    caption = (
+        "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a family, "
+        "bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."
+    )
+    return Figure("reliability", caption, reliability_figure(LEVELS, rows))
+
+
+def _by_acceleration(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) -> Table:
+    """Coverage by lateral acceleration, test sets of cars learnt on, mean over estimators."""
+    rows = []
+    for title, own in board[board["car"] == LEARNT].groupby("title", sort=False):
+        part = next(part for part in parts.values() if as_text(part.title) == title)
+        tests = set(own["test_set"])
+        metrics = part.metrics[part.metrics["test_set"].isin(tests) & (part.metrics["metric"] == "coverage_90")]
+        by_regime = metrics[metrics["subset"].str.startswith("ay_")].groupby("subset")["value"]
+        rows.append({"title": title, **{str(regime): 100 * float(values.median()) for regime, values in by_regime}})
+    frame = pd.DataFrame(rows)
+    columns = {"title": Column("part")} | {
+        name: Column(f"{name.removeprefix('ay_').replace('_', ' to ').removesuffix(' to ')} m/s² [%]", decimals=0)
+        for name in sorted(set(frame) - {"title"})
+    }
+    return Table(
+        "bands_by_acceleration",
+        "Errors inside the 90 % band of β by size of the lateral acceleration, median over estimators.",
+        frame,
+        columns,
+    )
+
+
+# Faults
+
+
+def _tries_faults(part: PartArtefacts) -> bool:
+    """Whether a part's tests are of the car that was learnt on, so that its channels can be held against what is normal for it."""
+    return any(not _elsewhere(part, test_set) for test_set in part.split.tests)
+
+
+def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
+    sentences = []
+    for kind in dict.fromkeys(own.kind for own in trials):
+        table = pd.concat([own.table for own in trials if own.kind == kind])
+        seen = table[table["visible"]]
+        unseen = table[~table["visible"]]
+        rate = _alarms_in_words([own for own in trials if own.kind == kind])
+        sentences.append(
+            f"{kind.capitalize()} drives: of {len(table)} faults in channels a likelihood-ratio test that knows fault, size and onset sees {len(seen)} within "
+            f"10 s. Of these health flags **{int(seen['in_time'].sum())} ({100 * seen['in_time'].mean():.1f} %)** within twice its time plus 0.5 s, and "
+            f"{int(seen['flagged'].sum())} while they last; of the {len(unseen)} others {int(unseen['flagged'].sum())}. {rate}"
+        )
+    return "\n\n".join(sentences)
+
+
+def _alarms_in_words(trials: Sequence[FaultTrials]) -> str:
+    from vehest.evaluation.integrity import false_alarms_per_hour
+
+    rate = false_alarms_per_hour([drive for own in trials for drive in own.nominal], trials[0].rate_hz)
+    return (
+        f"Without faults {rate.alarms} alarms in {rate.hours:.2f} h: {rate.per_hour:.1f} an hour, 95 % interval {rate.low:.1f} to {rate.high:.1f}; "
+        "a sample outside what the model learnt counts as one."
+    )
+
+
+def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
+    table = pd.concat([own.table.assign(part=own.part, data=own.kind) for own in trials], ignore_index=True)
+    blocks: list[Block] = []
+    for column, caption in (("fault", "By kind of fault"), ("channel", "By channel"), ("severity", "By severity")):
+        rows = []
+        for (data, value), own in table.groupby(["data", column], sort=False):
+            seen = own[own["visible"]]
+            rows.append(
+                {
+                    "data": data,
+                    "value": value,
+                    "cases": len(own),
+                    "visible": len(seen),
+                    "in_time": int(seen["in_time"].sum()),
+                    "share": 100 * float(seen["in_time"].mean()) if len(seen) else math.nan,
+                    "oracle": float(seen["oracle_delay"].median()) if len(seen) else math.nan,
+                    "delay": float(seen.loc[seen["flagged"], "delay"].median()) if seen["flagged"].any() else math.nan,
+                    "unseen_flagged": int(own.loc[~own["visible"], "flagged"].sum()),
+                }
+            )
+        columns = {
+            "data": Column("data"),
+            "value": Column(column),
+            "cases": Column("cases", decimals=0),
+            "visible": Column("can be seen", decimals=0),
+            "in_time": Column("of these in time", decimals=0),
+            "share": Column("in time [%]", decimals=1),
+            "oracle": Column("oracle's delay, median [s]", decimals=2),
+            "delay": Column("delay of health, median [s]", decimals=2),
+            "unseen_flagged": Column("flagged though not seen", decimals=0),
+        }
+        blocks.append(
+            Table(
+                f"faults_by_{column}",
+                f"{caption}: what can be seen within 10 s, and what health flags in time.",
+                pd.DataFrame(rows),
+                columns,
+            )
+        )
+    blocks.append("Every case stands in [`tables/faults.csv`](tables/faults.csv).")
+    blocks.append(Table("faults", "The first cases; the file holds all.", table.head(3)))
+    return blocks
+
+
+def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
+    """Errors over protection levels, real laps of cars learnt on together."""
+    from vehest.evaluation.integrity import Integrity, integrity_of
+
+    found: dict[str, list[Integrity]] = {}
+    for part in parts.values():
+        if "real" not in set(part.kinds.values()) or not _tries_faults(part) or "vx" not in _channels_of(part):
+            continue
+        status = health_of(part)
+        for name, models in by_name(part.models).items():
+            if name[0] not in ("ksnn", "rational_ekf", "static_map"):
+                continue
+            for test_set in part.split.tests:
+                for position, scored in enumerate(part.scored(models[0], test_set)):
+                    band = models[0].estimate(test_set, position).held_at(scored.time, "band_sideslip")
+                    turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
+                    invalid = status[test_set, position][-len(scored.time) :] == 2
+                    own = integrity_of(np.degrees(turned), np.degrees(band), invalid)
+                    found.setdefault(as_text(models[0].title), []).append(own)
+    if not found:
+        return None
+    joined = {
+        title: Integrity(
+            np.concatenate([own.error for own in parts]),
+            np.concatenate([own.level for own in parts]),
+            np.concatenate([own.flagged for own in parts]),
+        )
+        for title, parts in found.items()
+    }
+    shares = [
+        f"{title}: " + listed([f"{100 * share:.2g} % {region}" for region, share in own.shares().items()]) for title, own in joined.items()
+    ]
+    caption = (
+        "Stanford diagrams of β on the real Ferrari, all laps, without faults: size of the error over the protection level, which is the 90 % band; alert limit 2°. "
+        "Misleading: the error exceeds the level and nothing is flagged. " + "; ".join(shares) + "."
+    )
+    return Figure("stanford", caption, stanford_figure(joined))
+
+
+def _channels_of(part: PartArtefacts) -> set[str]:
+    from vehest.data.store import read_recording
+
+    return set(read_recording(next(iter(part.references.values()))).channels)
+
+
+__all__ = ["Name", "coverage_board", "documents"]

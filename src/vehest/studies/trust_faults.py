@@ -1,0 +1,145 @@
+"""Faults on the test ranges of a study's part: what a likelihood-ratio test that knows them sees, and when health flags them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.recording import Recording
+from vehest.data.store import read_recording
+from vehest.evaluation.integrity import detection_delay
+from vehest.studies.artefacts import PartArtefacts
+from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
+from vehest.trust.guard import Guard, learn_limits
+from vehest.trust.health import HealthModel, health_rows, learn_health
+from vehest.trust.oracle import HORIZON_SECONDS, Oracle, learn_oracle, motion_of
+
+WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current")
+"""Channels that faults are tried in, of those that a car has."""
+
+DRAWN = ("noise", "spikes")
+LASTS = 10.0  # s
+TIMES, PLUS = 2.0, 0.5  # of the oracle's delay, and s beyond it, within which a flag is in time
+LEAST_SECONDS = 25.0  # of a range that faults are tried on
+MOST_RANGES = 6  # of a part, so that a set of many manoeuvres takes minutes
+
+
+@dataclass(frozen=True)
+class FaultTrials:
+    """Faults on the tests of a part.
+
+    Args:
+        part: its name.
+        kind: ``real`` or ``simulated``.
+        rate_hz: of the samples [Hz].
+        table: a row a case: fault, channel, severity, onset [s], whether the oracle sees it, its delay [s], whether and when health flags it.
+        nominal: flags without faults on every test range, (T,) each.
+    """
+
+    part: str
+    kind: str
+    rate_hz: float
+    table: pd.DataFrame
+    nominal: list[NDArray[np.bool_]]
+
+
+def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
+    """Try every kind of fault in every channel at three severities, each once a test range, at a third of it.
+
+    Health and oracle learn on the part's training and validation ranges.
+    """
+    train, validation, tests = (_ranges(part, spans) for spans in (part.split.train, part.split.validation, _tested(part)))
+    channels = tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in (*train, *validation, *tests)))
+    rate = part.protocol.rate_hz
+    model, oracle = learn_health(train, validation, channels, rate), learn_oracle(train, validation, channels, rate)
+    limits = learn_limits(train, channels, rate)
+    nominal = [_flags(model, Guard(channels, (), limits, rate), recording.stack(channels)) for recording in tests]
+    long = [(recording, flags) for recording, flags in zip(tests, nominal, strict=True) if recording.duration >= LEAST_SECONDS]
+    rows = []
+    for recording, flags in long[:: max(math.ceil(len(long) / MOST_RANGES), 1)]:
+        onset = round(recording.duration / 3.0, 2)
+        clean = {channel: recording[channel] for channel in channels}
+        motion = motion_of(clean, rate)
+        for kind in KINDS:
+            for channel in channels:
+                if applies(kind, channel):
+                    for severity in SEVERITIES:
+                        fault = Fault(kind, channel, severity, onset, LASTS)
+                        found = _case(model, oracle, Guard(channels, (), limits, rate), clean, motion, fault, flags)
+                        rows.append(
+                            {"recording": recording.id, "fault": kind, "channel": channel, "severity": severity, "onset": onset, **found}
+                        )
+    kinds = sorted({part.kinds[span.dataset] for span in _tested(part)})
+    return FaultTrials(name, " and ".join(kinds), rate, pd.DataFrame(rows), nominal)
+
+
+def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
+    """(test set, number of the range) -> status without faults, (T,), of the channels that the car has."""
+    train, validation = (_ranges(part, spans) for spans in (part.split.train, part.split.validation))
+    found = {}
+    for test_set, spans in part.split.tests.items():
+        tests = _ranges(part, spans)
+        channels = tuple(
+            channel for channel in WATCHED if all(_complete(recording, channel) for recording in (*train, *validation, *tests))
+        )
+        model = learn_health(train, validation, channels, part.protocol.rate_hz)
+        for position, recording in enumerate(tests):
+            rows = np.ascontiguousarray(recording.stack(channels))
+            found[test_set, position] = health_rows(model.packed(), rows, np.isfinite(rows), model.start()).status
+    return found
+
+
+def _case(
+    model: HealthModel,
+    oracle: Oracle,
+    guard: Guard,
+    clean: Mapping[str, FloatArray],
+    motion: Mapping[str, FloatArray],
+    fault: Fault,
+    nominal: NDArray[np.bool_],
+) -> dict[str, Any]:
+    rate, steps = model.rate_hz, len(nominal)
+    faulty = inject(clean, rate, fault)
+    first, end = window(fault, steps, rate)
+    drawn = fault.kind in DRAWN
+    if drawn:
+        seen = oracle.sees(clean, faulty, first, drawn=True)
+    else:
+        seen = oracle.sees(motion, inject(motion, rate, fault), first, drive=clean)
+    flags = _flags(model, guard, np.stack([faulty[name] for name in model.channels], axis=1)) & ~nominal
+    delay = detection_delay(flags, first, min(first + round(HORIZON_SECONDS * rate), steps), rate)
+    return {
+        "visible": seen.visible,
+        "oracle_delay": seen.delay,
+        "flagged": math.isfinite(delay),
+        "delay": delay,
+        "in_time": seen.visible and delay <= TIMES * seen.delay + PLUS,
+    }
+
+
+def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.bool_]:
+    """Samples that are not valid, (T,)."""
+    received = np.ascontiguousarray(rows)
+    return np.asarray(health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0)
+
+
+def _tested(part: PartArtefacts) -> list[Any]:
+    from vehest.studies.trust import _elsewhere
+
+    return [span for name, spans in part.split.tests.items() if not _elsewhere(part, name) for span in spans]
+
+
+def _ranges(part: PartArtefacts, spans: Any) -> list[Recording]:
+    return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
+
+
+def _complete(recording: Recording, channel: str) -> bool:
+    return channel in recording and not CHANNELS[channel].is_reference and bool(np.isfinite(recording[channel]).all())

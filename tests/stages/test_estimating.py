@@ -1,0 +1,150 @@
+"""`vehest estimate` and the Python interface on drives with something wrong, and what goes with a model: bands, health, trust.yaml."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import vehest
+from conftest import planar_drive
+from place import Place
+from vehest.constants import GRAVITY
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.trust.record import TRUST, read_trust
+
+QUICK = ("training.grid=1", "training.max_evaluations=5")
+
+
+def drive_of(seed: int, seconds: float = 30.0) -> Recording:
+    """A drive at the 100 Hz that the observer works at."""
+    return planar_drive(seconds, 100.0, seed=seed, noise=0.02)
+
+
+@pytest.fixture(scope="module")
+def model() -> Estimator:
+    """An observer with what was learnt of how far it can be trusted."""
+    return vehest.train("luenberger", [drive_of(1)], [drive_of(2)], QUICK)
+
+
+@pytest.fixture
+def saved(place: Place, model: Estimator) -> Place:
+    """A place with the model in the folder ``own``."""
+    vehest.save_model(model, place.folder / "own")
+    return place
+
+
+def lap(changes: dict[str, np.ndarray] | None = None) -> None:
+    """Write lap.csv: a drive with some of its channels replaced."""
+    drive = drive_of(4).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels, **(changes or {})}).to_csv("lap.csv", index=False)
+
+
+# What the checks find
+
+
+def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved: Place):
+    lap()
+    code, out, err = saved("estimate", "own", "lap.csv", "--strict", "--json")
+    assert (code, err) == (0, "")
+    said = json.loads(out)
+    assert said["findings"] == []
+    assert "of the drive" in said["verdict"]
+
+
+def test_a_speed_that_stands_at_0_is_a_warning_and_health_accuses_it(saved: Place):
+    lap({"vx": np.zeros(3000)})
+    code, out, err = saved("estimate", "own", "lap.csv", "-o", "out.csv", "--json")
+    assert code == 0
+    assert err.splitlines() == ["warning: vx: never changes: 0 m/s throughout"]
+    assert json.loads(out)["findings"] == ["vx: never changes: 0 m/s throughout"]
+    table = pd.read_csv("out.csv")
+    assert (table["health"] > 0).mean() > 0.9
+    assert np.isfinite(table["vy"]).any()
+
+
+def test_strict_refuses_a_speed_that_stands_at_0_and_writes_nothing(saved: Place):
+    lap({"vx": np.zeros(3000)})
+    assert saved.refused("estimate", "own", "lap.csv", "-o", "out.csv", "--strict") == (
+        3,
+        "error: 'lap.csv': vx: never changes: 0 m/s throughout",
+    )
+    assert not Path("out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("factor", "check", "message"),
+    [(-1.0, "sign", "ay and vx·yaw_rate disagree in sign"), (1.0 / GRAVITY, "unit", "ay is in g; set its unit")],
+)
+def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accepted(saved: Place, factor: float, check: str, message: str):
+    lap({"ay": factor * drive_of(4)["ay"]})
+    code, line = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
+    assert code == 3
+    assert "channels contradict each other" in line
+    assert message in line
+    assert f"dataset.accept=[{check}]" in line
+    assert not Path("out.csv").exists()
+    code, _, err = saved("estimate", "own", "lap.csv", f"dataset.accept=[{check}]", "-o", "out.csv")
+    assert code == 0, err
+    [warning] = [line for line in err.splitlines() if message in line]
+    assert warning.startswith("warning: ay")
+
+
+def test_channels_that_the_model_does_not_read_contradict_nobody(saved: Place):
+    lap({"vx_ref": np.zeros(3000)})
+    code, _, err = saved("estimate", "own", "lap.csv", "--strict")
+    assert (code, err) == (0, "")
+
+
+# What goes with a model
+
+
+def test_online_says_what_estimate_says_of_the_whole_drive(model: Estimator):
+    drive = drive_of(4)
+    channels = {name: drive[name].copy() for name in model.channels}
+    channels["ay"][1000:1100] = channels["ay"][1000]  # a second that stands still
+    faulty = Recording("drive", drive.vehicle, 100.0, 0.0, channels)
+    batch = vehest.estimate(model, faulty)
+    stepper = vehest.online(model)
+    assert stepper.horizon_steps == 0
+    said = [stepper.step({name: values[k] for name, values in channels.items()}) for k in range(len(drive))]
+    assert set(batch.channels) == {"vx", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"} == set(said[-1])
+    assert (batch["health"] > 0).any()
+    for name, values in batch.channels.items():
+        np.testing.assert_allclose([step.get(name, np.nan) for step in said], values, rtol=0.0, atol=1e-9, err_msg=name)
+
+
+def test_a_saved_model_keeps_its_band_and_its_health(model: Estimator, tmp_path: Path):
+    vehest.save_model(model, tmp_path / "own")
+    assert read_trust(tmp_path / "own").bands is not None
+    drive = drive_of(4)
+    before, after = vehest.estimate(model, drive), vehest.estimate(vehest.load_model(tmp_path / "own"), drive)
+    assert {"band_vy", "band_sideslip", "health", "health_reason"} <= set(before.channels)
+    for name, values in before.channels.items():
+        np.testing.assert_array_equal(after[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda text: text[: len(text) // 2].rsplit("\n", 1)[0] + "\n  x: [", "cannot be read as YAML"),
+        (lambda text: "", "does not say how far a model can be trusted"),
+        (lambda text: text.replace("format: 1", "format: 99"), "99"),
+        (lambda text: yaml.safe_dump({**yaml.safe_load(text), "colour": "red"}), "colour"),
+        (lambda text: yaml.safe_dump({**yaml.safe_load(text), "bands": {"vy": "wide"}}), "bands"),
+    ],
+)
+def test_a_damaged_trust_file_is_one_clear_line(saved: Place, damage, message: str):
+    lap()
+    file = saved.folder / "own" / TRUST
+    file.write_text(damage(file.read_text(encoding="utf-8")), encoding="utf-8")
+    code, line = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
+    assert code == 3
+    assert TRUST in line
+    assert message in line
+    assert not Path("out.csv").exists()
