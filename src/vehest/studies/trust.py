@@ -1,7 +1,8 @@
-"""The study of trust: do bands hold what they say, on cars that were learnt on and on others, and which faults of sensors are flagged in time.
+"""The study of trust: do bands hold what they say, on cars learnt on and on others, and which faults of sensors are flagged in time.
 
-A part of the pipeline is a comparison on one car, or a lap of it. Test sets of cars and tyres that bands were calibrated on stand apart from
-those of others. Faults are tried on each part's test ranges at the evaluation rate, with health learnt on its training and validation ranges.
+A part of the pipeline is a comparison on one car, or a lap of it. Test sets of cars and tyres that bands were calibrated on stand apart
+from those of others. Faults are tried on each part's test ranges at the evaluation rate, with health learnt on its training and
+validation ranges.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.evaluation.ranking import Name
+from vehest.data.store import read_recording
+from vehest.evaluation.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
 from vehest.report.integrity_figures import stanford_figure
 from vehest.report.reliability import Reliability, reliability_figure
@@ -22,7 +24,7 @@ from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import how_it_was_made
 from vehest.studies.kit.runs import by_name
-from vehest.studies.trust_faults import FaultTrials, health_of, trials_of
+from vehest.studies.trust_faults import FaultTrials, elsewhere, health_of, trials_of
 from vehest.trust.bands import ELSEWHERE, LEVELS
 
 TAKES = "parts"
@@ -54,7 +56,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks += [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
     if (board["estimator"] == "ksnn").any():
         blocks.append(PATENT_NOTE)
-    return {REPORT: Document(artefacts.title, blocks)}
+    return {REPORT: Document(artefacts.title, blocks, {"faults": _cases(trials)})}
 
 
 def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
@@ -71,9 +73,9 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                     continue
                 row: dict[str, Any] = {"part": key, "title": as_text(part.title), "test_set": test_set, "estimator": name[0]}
                 row |= {"variant": name[1], "estimator_title": as_text(models[0].title)}
-                row |= {"car": OTHER if _elsewhere(part, test_set) else LEARNT}
-                row |= {figure: float(own.loc[figure, "value"]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
-                row |= {end: float(own.loc["coverage_90", end]) for end in ("low", "high")}
+                row |= {"car": OTHER if elsewhere(part, test_set) else LEARNT}
+                row |= {figure: float(own["value"][figure]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
+                row |= {end: float(own[end]["coverage_90"]) for end in ("low", "high")}
                 row |= {"inside": _holds(row["low"], row["high"])}
                 row |= {"without_widening": _without_widening(part, models[0], test_set) if row["car"] == OTHER else math.nan}
                 rows.append(row)
@@ -82,12 +84,6 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
 
 def _holds(low: float, high: float) -> str:
     return "no interval" if math.isnan(low) else "yes" if low <= 0.9 <= high else "too wide" if low > 0.9 else "too narrow"
-
-
-def _elsewhere(part: PartArtefacts, test_set: str) -> bool:
-    """Whether a test set is of another car, or other tyres, than training and validation."""
-    learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
-    return test_set in part.protocol.sets_elsewhere or not {span.dataset for span in part.split.tests[test_set]} <= learnt
 
 
 def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
@@ -109,8 +105,9 @@ def _bands_in_words(board: pd.DataFrame) -> str:
         words = f"{int(counts.get('yes', 0))} of {len(own)} (too wide {wide}, too narrow {narrow})"
         sentences.append(f"**{label}: {words}**" if label == "All" else f"{label}: {words}")
     return (
-        "On how many test sets does 0.90 lie inside the 95 % interval of what a 90 % band of β holds, test sets counted once an estimator, on cars "
-        f"and tyres that were learnt on? {'; '.join(sentences)}. A wide band earns nothing in the interval score, which stands beside."
+        "On how many test sets does 0.90 lie inside the 95 % interval of what a 90 % band of β holds, test sets counted once an estimator, "
+        f"on cars and tyres that were learnt on? {'; '.join(sentences)}. A wide band earns nothing in the interval score, which stands "
+        "beside."
     )
 
 
@@ -120,9 +117,9 @@ def _widening_in_words(board: pd.DataFrame) -> str:
         return "There is no such test set."
     with_it, without = own["coverage_90"].median(), own["without_widening"].median()
     return (
-        f"Bands are {ELSEWHERE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold {100 * with_it:.0f} % of the "
-        f"errors (median, lowest {100 * own['coverage_90'].min():.0f} %); without the widening {100 * without:.0f} % (lowest "
-        f"{100 * own['without_widening'].min():.0f} %)."
+        f"Bands are {ELSEWHERE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold "
+        f"{100 * with_it:.0f} % of the errors (median, lowest {100 * own['coverage_90'].min():.0f} %); without the widening "
+        f"{100 * without:.0f} % (lowest {100 * own['without_widening'].min():.0f} %)."
     )
 
 
@@ -151,9 +148,9 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
     if name == "elsewhere":
         columns = {**columns, "without_widening": Column("inside without the factor [%]", decimals=1)}
     caption = (
-        "90 % bands of β: errors inside, with the 95 % interval over blocks of the drive and the 10 and 90 % quantiles over manoeuvres; mean full width; "
-        "interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how many equal manoeuvres "
-        "the errors are spread over."
+        "90 % bands of β: errors inside, with the 95 % interval over blocks of the drive and the 10 and 90 % quantiles over manoeuvres; "
+        "mean full width; interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how "
+        "many equal manoeuvres the errors are spread over."
     )
     return [Table(f"bands_{name}", caption, shown, columns)]
 
@@ -169,8 +166,8 @@ def _reliability(board: pd.DataFrame) -> Figure:
         low, high = (np.quantile(values, share, axis=0) for share in (0.1, 0.9))
         rows.append(Reliability(family, lines[family, ""], values.mean(axis=0), low, high))
     caption = (
-        "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a family, "
-        "bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."
+        "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a "
+        "family, bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."
     )
     return Figure("reliability", caption, reliability_figure(LEVELS, rows))
 
@@ -185,16 +182,15 @@ def _by_acceleration(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) ->
         by_regime = metrics[metrics["subset"].str.startswith("ay_")].groupby("subset")["value"]
         rows.append({"title": title, **{str(regime): 100 * float(values.median()) for regime, values in by_regime}})
     frame = pd.DataFrame(rows)
-    columns = {"title": Column("part")} | {
-        name: Column(f"{name.removeprefix('ay_').replace('_', ' to ').removesuffix(' to ')} m/s² [%]", decimals=0)
-        for name in sorted(set(frame) - {"title"})
-    }
-    return Table(
-        "bands_by_acceleration",
-        "Errors inside the 90 % band of β by size of the lateral acceleration, median over estimators.",
-        frame,
-        columns,
-    )
+    regimes = sorted(str(name) for name in frame if name != "title")
+    columns = {"title": Column("part"), **{name: Column(_range_in_words(name), decimals=0) for name in regimes}}
+    caption = "Errors inside the 90 % band of β by size of the lateral acceleration, median over estimators."
+    return Table("bands_by_acceleration", caption, frame, columns)
+
+
+def _range_in_words(regime: str) -> str:
+    low, high = regime.removeprefix("ay_").split("_")
+    return f"{low} to {high} m/s² [%]" if high else f"from {low} m/s² [%]"
 
 
 # Faults
@@ -202,7 +198,7 @@ def _by_acceleration(parts: Mapping[str, PartArtefacts], board: pd.DataFrame) ->
 
 def _tries_faults(part: PartArtefacts) -> bool:
     """Whether a part's tests are of the car that was learnt on, so that its channels can be held against what is normal for it."""
-    return any(not _elsewhere(part, test_set) for test_set in part.split.tests)
+    return any(not elsewhere(part, test_set) for test_set in part.split.tests)
 
 
 def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
@@ -213,25 +209,28 @@ def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
         unseen = table[~table["visible"]]
         rate = _alarms_in_words([own for own in trials if own.kind == kind])
         sentences.append(
-            f"{kind.capitalize()} drives: of {len(table)} faults in channels a likelihood-ratio test that knows fault, size and onset sees {len(seen)} within "
-            f"10 s. Of these health flags **{int(seen['in_time'].sum())} ({100 * seen['in_time'].mean():.1f} %)** within twice its time plus 0.5 s, and "
-            f"{int(seen['flagged'].sum())} while they last; of the {len(unseen)} others {int(unseen['flagged'].sum())}. {rate}"
+            f"{kind.capitalize()} drives: of {len(table)} faults in channels a likelihood-ratio test that knows fault, size and onset sees "
+            f"{len(seen)} within 10 s. Of these health flags **{int(seen['in_time'].sum())} ({100 * seen['in_time'].mean():.1f} %)** "
+            f"within twice its time plus 0.5 s, and {int(seen['flagged'].sum())} while they last; of the {len(unseen)} others "
+            f"{int(unseen['flagged'].sum())}. {rate}"
         )
     return "\n\n".join(sentences)
 
 
 def _alarms_in_words(trials: Sequence[FaultTrials]) -> str:
-    from vehest.evaluation.integrity import false_alarms_per_hour
-
     rate = false_alarms_per_hour([drive for own in trials for drive in own.nominal], trials[0].rate_hz)
     return (
-        f"Without faults {rate.alarms} alarms in {rate.hours:.2f} h: {rate.per_hour:.1f} an hour, 95 % interval {rate.low:.1f} to {rate.high:.1f}; "
-        "a sample outside what the model learnt counts as one."
+        f"Without faults {rate.alarms} alarms in {rate.hours:.2f} h: {rate.per_hour:.1f} an hour, 95 % interval {rate.low:.1f} to "
+        f"{rate.high:.1f}; samples outside what the model learnt count as alarms."
     )
 
 
+def _cases(trials: Sequence[FaultTrials]) -> pd.DataFrame:
+    return pd.concat([own.table.assign(part=own.part, data=own.kind) for own in trials], ignore_index=True)
+
+
 def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
-    table = pd.concat([own.table.assign(part=own.part, data=own.kind) for own in trials], ignore_index=True)
+    table = _cases(trials)
     blocks: list[Block] = []
     for column, caption in (("fault", "By kind of fault"), ("channel", "By channel"), ("severity", "By severity")):
         rows = []
@@ -261,23 +260,14 @@ def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
             "delay": Column("delay of health, median [s]", decimals=2),
             "unseen_flagged": Column("flagged though not seen", decimals=0),
         }
-        blocks.append(
-            Table(
-                f"faults_by_{column}",
-                f"{caption}: what can be seen within 10 s, and what health flags in time.",
-                pd.DataFrame(rows),
-                columns,
-            )
-        )
+        caption = f"{caption}: what can be seen within 10 s, and what health flags in time."
+        blocks.append(Table(f"faults_by_{column}", caption, pd.DataFrame(rows), columns))
     blocks.append("Every case stands in [`tables/faults.csv`](tables/faults.csv).")
-    blocks.append(Table("faults", "The first cases; the file holds all.", table.head(3)))
     return blocks
 
 
 def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
     """Errors over protection levels, real laps of cars learnt on together."""
-    from vehest.evaluation.integrity import Integrity, integrity_of
-
     found: dict[str, list[Integrity]] = {}
     for part in parts.values():
         if "real" not in set(part.kinds.values()) or not _tries_faults(part) or "vx" not in _channels_of(part):
@@ -297,26 +287,21 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
         return None
     joined = {
         title: Integrity(
-            np.concatenate([own.error for own in parts]),
-            np.concatenate([own.level for own in parts]),
-            np.concatenate([own.flagged for own in parts]),
+            np.concatenate([own.error for own in laps]),
+            np.concatenate([own.level for own in laps]),
+            np.concatenate([own.flagged for own in laps]),
         )
-        for title, parts in found.items()
+        for title, laps in found.items()
     }
-    shares = [
-        f"{title}: " + listed([f"{100 * share:.2g} % {region}" for region, share in own.shares().items()]) for title, own in joined.items()
-    ]
+    shares = []
+    for title, own in joined.items():
+        shares.append(f"{title}: " + listed([f"{100 * share:.2g} % {region}" for region, share in own.shares().items()]))
     caption = (
-        "Stanford diagrams of β on the real Ferrari, all laps, without faults: size of the error over the protection level, which is the 90 % band; alert limit 2°. "
-        "Misleading: the error exceeds the level and nothing is flagged. " + "; ".join(shares) + "."
+        "Stanford diagrams of β on the real Ferrari, all laps, without faults: size of the error over the protection level, which is the "
+        "90 % band; alert limit 2°. Misleading: the error exceeds the level and nothing is flagged. " + "; ".join(shares) + "."
     )
     return Figure("stanford", caption, stanford_figure(joined))
 
 
 def _channels_of(part: PartArtefacts) -> set[str]:
-    from vehest.data.store import read_recording
-
     return set(read_recording(next(iter(part.references.values()))).channels)
-
-
-__all__ = ["Name", "coverage_board", "documents"]

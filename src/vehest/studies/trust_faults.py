@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
+from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.evaluation.integrity import detection_delay
 from vehest.studies.artefacts import PartArtefacts
@@ -40,7 +41,7 @@ class FaultTrials:
         part: its name.
         kind: ``real`` or ``simulated``.
         rate_hz: of the samples [Hz].
-        table: a row a case: fault, channel, severity, onset [s], whether the oracle sees it, its delay [s], whether and when health flags it.
+        table: a row a case: fault, channel, severity, onset [s], whether and when [s] the oracle sees it, whether and when health flags it.
         nominal: flags without faults on every test range, (T,) each.
     """
 
@@ -57,7 +58,7 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
     Health and oracle learn on the part's training and validation ranges.
     """
     train, validation, tests = (_ranges(part, spans) for spans in (part.split.train, part.split.validation, _tested(part)))
-    channels = tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in (*train, *validation, *tests)))
+    channels = _channels([*train, *validation, *tests])
     rate = part.protocol.rate_hz
     model, oracle = learn_health(train, validation, channels, rate), learn_oracle(train, validation, channels, rate)
     limits = learn_limits(train, channels, rate)
@@ -74,9 +75,8 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
                     for severity in SEVERITIES:
                         fault = Fault(kind, channel, severity, onset, LASTS)
                         found = _case(model, oracle, Guard(channels, (), limits, rate), clean, motion, fault, flags)
-                        rows.append(
-                            {"recording": recording.id, "fault": kind, "channel": channel, "severity": severity, "onset": onset, **found}
-                        )
+                        case = {"recording": recording.id, "fault": kind, "channel": channel, "severity": severity, "onset": onset}
+                        rows.append(case | found)
     kinds = sorted({part.kinds[span.dataset] for span in _tested(part)})
     return FaultTrials(name, " and ".join(kinds), rate, pd.DataFrame(rows), nominal)
 
@@ -87,9 +87,7 @@ def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
     found = {}
     for test_set, spans in part.split.tests.items():
         tests = _ranges(part, spans)
-        channels = tuple(
-            channel for channel in WATCHED if all(_complete(recording, channel) for recording in (*train, *validation, *tests))
-        )
+        channels = _channels([*train, *validation, *tests])
         model = learn_health(train, validation, channels, part.protocol.rate_hz)
         for position, recording in enumerate(tests):
             rows = np.ascontiguousarray(recording.stack(channels))
@@ -108,9 +106,8 @@ def _case(
 ) -> dict[str, Any]:
     rate, steps = model.rate_hz, len(nominal)
     faulty = inject(clean, rate, fault)
-    first, end = window(fault, steps, rate)
-    drawn = fault.kind in DRAWN
-    if drawn:
+    first = window(fault, steps, rate)[0]
+    if fault.kind in DRAWN:
         seen = oracle.sees(clean, faulty, first, drawn=True)
     else:
         seen = oracle.sees(motion, inject(motion, rate, fault), first, drive=clean)
@@ -131,13 +128,21 @@ def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.boo
     return np.asarray(health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0)
 
 
-def _tested(part: PartArtefacts) -> list[Any]:
-    from vehest.studies.trust import _elsewhere
+def elsewhere(part: PartArtefacts, test_set: str) -> bool:
+    """Whether a test set is of another car, or other tyres, than training and validation."""
+    learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
+    return test_set in part.protocol.sets_elsewhere or not {span.dataset for span in part.split.tests[test_set]} <= learnt
 
-    return [span for name, spans in part.split.tests.items() if not _elsewhere(part, name) for span in spans]
+
+def _tested(part: PartArtefacts) -> list[Span]:
+    return [span for name, spans in part.split.tests.items() if not elsewhere(part, name) for span in spans]
 
 
-def _ranges(part: PartArtefacts, spans: Any) -> list[Recording]:
+def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
+    return tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in recordings))
+
+
+def _ranges(part: PartArtefacts, spans: Sequence[Span]) -> list[Recording]:
     return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
 
 
