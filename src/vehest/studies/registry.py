@@ -19,7 +19,7 @@ from types import ModuleType
 from vehest.data.errors import ConfigurationError
 
 ENTRY_POINTS = "vehest.studies"
-OWN = ("drive", "folds", "sweep", "transfer")
+OWN = ("drive", "folds", "sweep", "transfer", "trust")
 
 
 @cache

@@ -152,7 +152,7 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
         "mean full width; interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how "
         "many equal manoeuvres the errors are spread over."
     )
-    return [Table(f"bands_{name}", caption, shown, columns)]
+    return [Table("overview" if name == "learnt" else f"bands_{name}", caption, shown, columns)]
 
 
 def _reliability(board: pd.DataFrame) -> Figure:
