@@ -129,6 +129,24 @@ def test_a_saved_model_keeps_its_band_and_its_health(model: Estimator, tmp_path:
         np.testing.assert_array_equal(after[name], values, err_msg=name)
 
 
+def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_why(saved: Place):
+    zero = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
+    assert set(vehest.estimate(zero, drive_of(4)).channels) == {"vy", "sideslip", "health", "health_reason"}
+    vehest.save_model(zero, saved.folder / "zero")
+    trust = read_trust(saved.folder / "zero")
+    assert (trust.bands, trust.guard, trust.health) == (None, None, None)
+    assert "no training range to learn limits and health from" in trust.about.note
+    lap()
+    code, out, err = saved("estimate", "zero", "lap.csv", "--json")
+    assert (code, err) == (0, "")
+    assert "nobody calibrated this model" in json.loads(out)["verdict"]
+
+
+def test_without_a_validation_recording_there_is_no_band():
+    alone = vehest.train("static_map", [drive_of(1)], [])
+    assert not {"band_vy", "band_sideslip"} & set(vehest.estimate(alone, drive_of(4)).channels)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

@@ -133,6 +133,8 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
     except DataError as error:  # as of a reference that is not there, which is no reason to go without an evaluation
         notes.append(str(error))
     try:
+        if not train:
+            raise DataError("there is no training range to learn limits and health from")
         ranges = [stretch.recording.cut(stretch.start, stretch.recording.end_time) for stretch in train]
         guard = learn_limits(ranges, estimator.channels, estimator.settings.rate_hz)
         learnt, stopped = ([stretch.measured for stretch in part] for part in (train, validation))
