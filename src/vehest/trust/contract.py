@@ -270,7 +270,7 @@ class GuardedStepper(Stepper):
     def __init__(
         self, estimator: Estimator, trust: Trust | None = None, bus_rate_hz: float | None = None, *, elsewhere: bool = False
     ) -> None:
-        self.estimator = estimator
+        self.estimator, self._channels = estimator, tuple(estimator.channels)
         self._stepper, self._fresh = estimator.online(), True
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
@@ -313,8 +313,10 @@ class GuardedStepper(Stepper):
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
         row: FloatArray | None = self._row
-        for at, name in enumerate(self.estimator.channels):
-            self._row[0, at] = _number(sample.get(name)) if sample is not None else math.nan
+        try:
+            self._row[0] = [sample[name] for name in self._channels] if sample is not None else math.nan
+        except (KeyError, TypeError, ValueError, OverflowError):
+            self._row[0] = [_number(sample.get(name)) if sample is not None else math.nan for name in self._channels]
         if self._front is not None:
             row = self._front(self._row)
         if row is not None:
@@ -354,7 +356,7 @@ class GuardedStepper(Stepper):
             self._stepper = self.estimator.online()
         self._fresh = False
         try:
-            found = self._stepper.step(dict(zip(self.estimator.channels, cleaned.rows[0].tolist(), strict=True)))
+            found = self._stepper.step(dict(zip(self._channels, cleaned.rows[0].tolist(), strict=True)))
         except FAILURES:
             return math.nan, math.nan, math.nan, True
         self._others = {name: value for name, value in found.items() if name not in ("vy", "vy_variance")}

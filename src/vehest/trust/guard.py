@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,8 +163,7 @@ def _moves(recording: Recording) -> NDArray[np.bool_]:
     return moving
 
 
-@dataclass(frozen=True, eq=False)
-class Cleaned:
+class Cleaned(NamedTuple):
     """Rows as an estimator may see them.
 
     Args:

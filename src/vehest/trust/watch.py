@@ -6,7 +6,7 @@ The recursion is compiled and takes one row or all of a recording, so that onlin
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,7 @@ EXTRAPOLATED, CLIPPED, SPINNING, STARTED = 1, 2, 4, 8
 """Marks of a sample: no estimate, v fades from the last one; estimate beyond the bound; spin; the estimator started anew at it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Watched:
+class Watched(NamedTuple):
     """Estimates as they are passed on.
 
     Args:
