@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -132,6 +132,9 @@ bench-ingest: $(INSTALLED) ## one official Revs file of 791,000 rows x 55 column
 
 bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data sets on all cores against one (10 minutes)
 	$(BIN)/python benchmarks/simulation.py
+
+bench-trust: $(INSTALLED) ## what contract, band and health cost a step online and a minute in batch, against the estimator alone
+	$(BIN)/python benchmarks/trust.py
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
