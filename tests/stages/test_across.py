@@ -92,6 +92,35 @@ def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> Non
     assert math.isclose(board.loc[board["estimator"] == "zero", "rmse_sideslip"].item(), board["rmse_sideslip"].max(), rel_tol=0.2)
 
 
+def test_bands_and_faults_are_told_apart_by_car(across) -> None:
+    other = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
+    other = {**other, "name": "other", "vehicle": "another car"}
+    (across.folder / "conf" / "dataset" / "other.yaml").write_text(yaml.safe_dump(other, allow_unicode=True), encoding="utf-8")
+    split = yaml.safe_load((across.folder / "conf" / "split" / "back.yaml").read_text())
+    split["tests"] = {"unseen": [{"dataset": "other", "recording": "one"}]}
+    (across.folder / "conf" / "split" / "back.yaml").write_text(yaml.safe_dump({**split, "train": [{"recording": "three"}]}))
+    parts = {name: {"title": name, "split": name, "sweeps": [PLAIN, LUENBERGER]} for name in ("forth", "back")}
+    study = {"study": "trusted", "report": "trust", "parts": parts}
+    (across.folder / "pipelines" / "trusted.yaml").write_text(yaml.safe_dump(study))
+    code, out, err = across("run", "trusted", "tracking=none", "output=out", "--json")
+    assert code == 0, err
+    rows = json.loads(out)["overview"]
+    assert {row["where"] for row in rows} == {"forth, unseen"}
+    assert all(0.0 <= row["coverage_90"] <= 100.0 and row["width_90"] > 0.0 for row in rows)
+    folder = next((across.folder / "out" / "report").glob("trusted-*"))
+    elsewhere = pd.read_csv(folder / "tables" / "bands_elsewhere.csv")
+    assert set(elsewhere["title"]) == {"back"}
+    assert (elsewhere["without_widening"] <= elsewhere["coverage_90"]).all()
+    faults = pd.read_csv(folder / "tables" / "faults.csv")
+    assert set(faults["part"]) == {"forth"}, "faults are tried on the car that was learnt on"
+    assert set(faults["channel"]) == {"yaw_rate", "vx", "ay", "ax"}
+    assert faults.groupby(["fault", "channel"])["severity"].nunique().eq(3).all()
+    assert (faults.loc[faults["in_time"], "delay"] <= 2.0 * faults.loc[faults["in_time"], "oracle_delay"] + 0.5).all()
+    severe = faults[(faults["severity"] == "severe") & faults["fault"].isin(["bias", "nan", "inf", "huge"])]
+    assert severe["visible"].all()
+    assert severe["flagged"].mean() > 0.7
+
+
 def test_missing_files_are_said_before_anything_is_made(across) -> None:
     dataset = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
     elsewhere = {**dataset, "name": "elsewhere", "path": "${root}/elsewhere"}

@@ -203,13 +203,13 @@ def _tries_faults(part: PartArtefacts) -> bool:
 
 def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
     sentences = []
-    for kind in dict.fromkeys(own.kind for own in trials):
-        table = pd.concat([own.table for own in trials if own.kind == kind])
+    for data in dict.fromkeys(own.data for own in trials):
+        table = pd.concat([own.table for own in trials if own.data == data])
         seen = table[table["visible"]]
         unseen = table[~table["visible"]]
-        rate = _alarms_in_words([own for own in trials if own.kind == kind])
+        rate = _alarms_in_words([own for own in trials if own.data == data])
         sentences.append(
-            f"{kind.capitalize()} drives: of {len(table)} faults in channels a likelihood-ratio test that knows fault, size and onset sees "
+            f"{as_text(data)}: of {len(table)} faults in channels a likelihood-ratio test that knows fault, size and onset sees "
             f"{len(seen)} within 10 s. Of these health flags **{int(seen['in_time'].sum())} ({100 * seen['in_time'].mean():.1f} %)** "
             f"within twice its time plus 0.5 s, and {int(seen['flagged'].sum())} while they last; of the {len(unseen)} others "
             f"{int(unseen['flagged'].sum())}. {rate}"
@@ -226,7 +226,7 @@ def _alarms_in_words(trials: Sequence[FaultTrials]) -> str:
 
 
 def _cases(trials: Sequence[FaultTrials]) -> pd.DataFrame:
-    return pd.concat([own.table.assign(part=own.part, data=own.kind) for own in trials], ignore_index=True)
+    return pd.concat([own.table.assign(part=own.part, data=own.data) for own in trials], ignore_index=True)
 
 
 def _faults(trials: Sequence[FaultTrials]) -> list[Block]:

@@ -39,14 +39,14 @@ class FaultTrials:
 
     Args:
         part: its name.
-        kind: ``real`` or ``simulated``.
+        data: data sets of the tests, and whether they are real.
         rate_hz: of the samples [Hz].
         table: a row a case: fault, channel, severity, onset [s], whether and when [s] the oracle sees it, whether and when health flags it.
         nominal: flags without faults on every test range, (T,) each.
     """
 
     part: str
-    kind: str
+    data: str
     rate_hz: float
     table: pd.DataFrame
     nominal: list[NDArray[np.bool_]]
@@ -77,8 +77,8 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
                         found = _case(model, oracle, Guard(channels, (), limits, rate), clean, motion, fault, flags)
                         case = {"recording": recording.id, "fault": kind, "channel": channel, "severity": severity, "onset": onset}
                         rows.append(case | found)
-    kinds = sorted({part.kinds[span.dataset] for span in _tested(part)})
-    return FaultTrials(name, " and ".join(kinds), rate, pd.DataFrame(rows), nominal)
+    data = " and ".join(sorted({f"{part.data_titles[span.dataset]} ({part.kinds[span.dataset]})" for span in _tested(part)}))
+    return FaultTrials(name, data, rate, pd.DataFrame(rows), nominal)
 
 
 def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:

@@ -1,0 +1,112 @@
+"""What follows from health: who still gets a channel, who starts anew, how wide a band is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from vehest.trust import health_kernel as kernel
+from vehest.trust.guard import RESTART, USE
+from vehest.trust.health import NUMBERS
+from vehest.trust.verdict import (
+    BEYOND_SPEED,
+    NO_ESTIMATE,
+    heed_rows,
+    numbers_of,
+    reason_in_words,
+    verdict_rows,
+    widen_rows,
+)
+from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
+
+CHANNELS = ("yaw_rate", "vx", "ay")
+SKIPPABLE = np.array([True, False, True])
+STEPS = 60
+
+
+def code(kind: int, channel: str) -> float:
+    return 10_000.0 * kind + 100.0 * NUMBERS[channel]
+
+
+def heeded(kind: int, channel: str, *, often: int = 0, remembers: bool = True, status: int = 2, first: int = 10, last: int = 40):
+    """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
+    statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
+    statuses[first:last], reasons[first:last] = status, code(kind, channel)
+    rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
+    heed_rows(statuses, reasons, numbers_of(CHANNELS), SKIPPABLE, remembers, often, rows, measured, flow, np.zeros(2))
+    return rows, measured, flow
+
+
+def test_an_accused_channel_is_left_out_where_the_method_can_do_without_it():
+    rows, measured, _ = heeded(kernel.OFFSET, "ay")
+    assert np.isnan(rows[10:40, 2]).all()
+    assert not measured[10:40, 2].any()
+    assert np.isfinite(np.delete(rows, np.s_[10:40], axis=0)).all()
+    assert np.isfinite(rows[:, :2]).all()
+
+
+def test_a_channel_that_is_needed_stays():
+    assert np.isfinite(heeded(kernel.SCALE, "vx")[0]).all()
+
+
+@pytest.mark.parametrize("kind", [kernel.OUTSIDE, kernel.SPIN, kernel.MISSING])
+def test_what_is_no_fault_of_a_sensor_changes_nothing(kind):
+    rows, _, flow = heeded(kind, "ay")
+    assert np.isfinite(rows).all()
+    assert (flow == USE).all()
+
+
+def test_a_suspicion_that_only_degrades_changes_nothing():
+    rows, _, flow = heeded(kernel.OFFSET, "ay", status=1)
+    assert np.isfinite(rows).all()
+    assert (flow == USE).all()
+
+
+def test_what_remembers_starts_anew_once_the_fault_is_over():
+    assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
+    assert not (heeded(kernel.OFFSET, "ay", remembers=False)[2] == RESTART).any()
+
+
+def test_what_adapts_goes_back_every_second_only_while_a_needed_channel_is_accused():
+    assert np.flatnonzero(heeded(kernel.SCALE, "vx", often=10)[2] == RESTART).tolist() == [18, 28, 38]
+    assert not (heeded(kernel.OFFSET, "ay", often=10)[2] == RESTART).any()
+
+
+def test_one_row_at_a_time_heeds_the_same():
+    reasons, statuses = np.zeros(STEPS), np.zeros(STEPS)
+    statuses[10:40], reasons[10:40] = 2.0, code(kernel.SCALE, "vx")
+    rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
+    state = np.zeros(2)
+    for k in range(STEPS):
+        part = slice(k, k + 1)
+        heed_rows(statuses[part], reasons[part], numbers_of(CHANNELS), SKIPPABLE, True, 10, rows[part], measured[part], flow[part], state)
+    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", often=10)[2])
+
+
+def test_the_verdict_names_what_guard_and_watch_know():
+    marks = np.array([0, 0, SPINNING, CLIPPED, EXTRAPOLATED], np.int8)
+    measured = np.ones((5, 3), np.bool_)
+    measured[1, 1] = False
+    status, reason = np.zeros(5), np.zeros(5)
+    verdict_rows(np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, numbers_of(CHANNELS), status, reason)
+    assert status.tolist() == [0, 1, 1, 2, 2]
+    said = [reason_in_words(own) for own in reason]
+    assert said == [
+        "",
+        "vx is not measured",
+        "spin",
+        "the estimate exceeds what the speed allows",
+        "there is no estimate",
+    ]
+    assert reason[3] == BEYOND_SPEED * 10_000
+    assert reason[4] == NO_ESTIMATE * 10_000
+
+
+def test_a_band_is_wider_the_less_an_estimate_is_worth():
+    bands = np.full((4, 2), 0.1)
+    marks = np.array([0, 0, 0, EXTRAPOLATED], np.int8)
+    widen_rows(np.array([0.0, 1.0, 2.0, 2.0]), marks, np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
+    assert bands[:3, 0].tolist() == pytest.approx([0.1, 0.2, 0.4])
+    assert bands[3].tolist() == pytest.approx([2.0, max(0.4, math.atan(2.0 / 20.0))])  # as far as |v| and the farthest in training
