@@ -32,6 +32,7 @@ import numpy as np
 import torch
 
 import vehest
+from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
@@ -217,10 +218,19 @@ def try_family(ground: Ground, name: str, output: Path) -> list[tuple[object, ..
 
 
 def cases(data_root: str | None) -> Iterator[tuple[Ground, str]]:
-    """What is tried, the slow families first."""
-    slow = ("ensemble_ukf", "cnn_ukf", "dugoff_ukf", "factor_graph", "learned_ukf", "kalman")
+    """What is tried, the slow families last."""
+    slow = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
     found = [(ground, name) for ground in grounds(data_root) for name in ground.families]
-    return iter(sorted(found, key=lambda case: slow.index(case[1]) if case[1] in slow else len(slow)))
+    return iter(sorted(found, key=lambda case: slow.index(case[1]) if case[1] in slow else -1))
+
+
+def write_table(path: Path, rows: Sequence[tuple[object, ...]]) -> None:
+    """Write all rows at once, or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(path) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(HEADER)
+        writer.writerows(rows)
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -241,12 +251,8 @@ def main(words: Sequence[str] | None = None) -> int:
             tables[key] = future.result()
             bad = sum(not (row[7] and not row[8] and row[9] and row[14]) for row in tables[key])
             print(f"{key[0]:16s} {key[1]:14s} {len(tables[key]):4d} cases, {bad} not held, {time.monotonic() - started:.0f} s", flush=True)
-    rows = [row for key in sorted(tables) for row in tables[key]]
-    asked.out.parent.mkdir(parents=True, exist_ok=True)
-    with open(asked.out, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(HEADER)
-        writer.writerows(rows)
+            rows = [row for done in sorted(tables) for row in tables[done]]
+            write_table(asked.out, rows)  # so that what is done stands there if the rest is not awaited
     counts = {
         "with a value that is not finite": sum(not row[7] for row in rows),
         "with an exception": sum(row[8] > 0 for row in rows),
