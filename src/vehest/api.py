@@ -145,17 +145,18 @@ def estimate(model: Estimator, recording: Recording) -> Estimate:
     return estimate_recording(model, recording, dict(model.preparation), _TRUST.get(model))
 
 
-def online(model: Estimator, bus_rate_hz: float | None = None) -> GuardedStepper:
+def online(model: Estimator, bus_rate_hz: float | None = None, *, elsewhere: bool = False) -> GuardedStepper:
     """A model that runs along with a drive: ``online(model).step({"vx": 21.3, …})`` a sample.
 
     Args:
         model: fitted, causal.
         bus_rate_hz: rate at which samples come, if it is above the model's: they then go through a causal anti-aliasing filter first.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are wider then.
 
     Raises:
         ConfigurationError: the model is not causal, or the bus is slower than it.
     """
-    return GuardedStepper(model, _TRUST.get(model), bus_rate_hz)
+    return GuardedStepper(model, _TRUST.get(model), bus_rate_hz, elsewhere=elsewhere)
 
 
 def write_estimate(estimate: Estimate, path: str | Path) -> None:

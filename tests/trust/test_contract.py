@@ -257,6 +257,11 @@ def test_front_end_starts_from_the_first_sample_after_a_gap():
     assert [row[0, 0] for row in after if row is not None] == pytest.approx([3.0] * 4, abs=1e-3)
 
 
+def test_a_stepper_says_how_late_its_filter_makes_it():
+    assert GuardedStepper(ready("ksnn"), bus_rate_hz=100.0).delay == pytest.approx(0.0509, abs=1e-3)
+    assert GuardedStepper(ready("ksnn")).delay == 0.0
+
+
 def test_a_bus_slower_than_the_estimator_is_refused():
     with pytest.raises(ConfigurationError, match="samples at 10 Hz are too slow for an estimator that works at 20 Hz"):
         GuardedStepper(ready("ksnn"), bus_rate_hz=10.0)

@@ -292,6 +292,11 @@ class GuardedStepper(Stepper):
         """How many sampling intervals after the sample the estimate holds."""
         return self.estimator.horizon_steps
 
+    @property
+    def delay(self) -> float:
+        """Of slow signals through the filter from the bus's rate [s]; 0 without one."""
+        return self._front.delay if self._front is not None else 0.0
+
     def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:
         """Take what was received at one instant.
 
