@@ -232,7 +232,12 @@ def _cases(trials: Sequence[FaultTrials]) -> pd.DataFrame:
 def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
     table = _cases(trials)
     blocks: list[Block] = []
-    for column, caption in (("fault", "By kind of fault"), ("channel", "By channel"), ("severity", "By severity")):
+    for column, caption in (
+        ("part", "By part of the study"),
+        ("fault", "By kind of fault"),
+        ("channel", "By channel"),
+        ("severity", "By severity"),
+    ):
         rows = []
         for (data, value), own in table.groupby(["data", column], sort=False):
             seen = own[own["visible"]]
