@@ -240,8 +240,10 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root of recordings")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", help="one estimator")
+    parser.add_argument("--data", help="one data set")
     asked = parser.parse_args(words)
-    wanted = [case for case in cases(os.environ.get("VEHEST_DATA")) if asked.only in (None, case[1])]
+    chosen = (case for case in cases(os.environ.get("VEHEST_DATA")) if asked.only in (None, case[1]))
+    wanted = [case for case in chosen if asked.data in (None, case[0].name)]
     for ground in {case[0].name: case[0] for case in wanted}.values():
         recordings(ground, asked.output)
     started, tables = time.monotonic(), {}
