@@ -161,23 +161,28 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 def test_every_split_that_is_shipped_is_one(file: Path) -> None:
     """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
 
-    def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+    def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str] | None], Recording]]:
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
         names = open_source(about).ids() if about["source"] == "simulated" else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
-        speed = np.full(20_000, 20.0)
+        speed, lap = np.full(20_000, 20.0), 2.0 * np.pi * np.arange(20_000) / 2000.0  # a lap of 100 s
         long = {
             "ay": np.full(20_000, 3.0),
             "vx": speed,
             "vx_ref": speed,
-            "yaw_rate": np.full(20_000, 0.15),
+            "yaw_rate": 2.0 * np.pi / 100.0 * (1.0 + np.sin(lap) + 0.5 * np.sin(3.0 * lap)),
             "sideslip_ref": np.zeros(20_000),
         }
-        return {name: Recording(name, "car", 20.0, 0.0, long).select for name in names}
+
+        def reader(name: str) -> Callable[[Iterable[str] | None], Recording]:
+            drive = Recording(name, "car", 20.0, 0.0, long)
+            return lambda channels: drive if channels is None else drive.select(channels)
+
+        return {name: reader(name) for name in names}
 
     text = file.read_text(encoding="utf-8")
     config = yaml.safe_load(text)
     split = split_from_config(config, cruising)
-    assert split.name == file.stem
+    assert split.name == file.stem + ("_fold_1" if "folds" in config else "")
     assert set(dataset_names(config)) == set(split.datasets)
 
 
@@ -211,7 +216,7 @@ def test_a_pattern_names_recordings_in_the_order_of_their_ids() -> None:
 def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it() -> None:
     asked: list[str] = []
 
-    def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+    def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str] | None], Recording]]:
         asked.append(dataset)
         return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
 

@@ -8,9 +8,9 @@ from itertools import product
 
 import numpy as np
 import pytest
-from test_estimators import _fitted as fitted
 from test_gated_filters import estimator as filter_of
 
+from every_estimator import fitted
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import DataError

@@ -103,7 +103,7 @@ SMALL_CAR = {"learned_ukf": ("estimator.dynamics=pacejka", "training.one_step.ma
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a family is tried: a data set, its split's ranges to learn from and to be tried on."""
+    """Where a family is tried: a data set, ranges to learn from and to be tried on, in seconds after the first sample."""
 
     name: str
     dataset: str
@@ -125,10 +125,10 @@ def grounds(data_root: str | None) -> list[Ground]:
     ]
     if data_root:
         ferrari = "20140222_01_01_03_250lm"
-        found.append(Ground("ferrari_250lm", "ferrari_250lm", "real", (ferrari, 150, 450), (ferrari, 450, 550), (ferrari, 600.0), FERRARI))
+        found.append(Ground("ferrari_250lm", "ferrari_250lm", "real", (ferrari, 0, 300), (ferrari, 300, 400), (ferrari, 450.0), FERRARI))
         hoons = "iros_hoons_1_with_friction_run_"
         found.append(
-            Ground("f1tenth", "f1tenth", "real", (f"{hoons}1", 0, 60), (f"{hoons}0", 0, 40), ("hoons_all_test_run_21", 5.0), SMALL_CAR)
+            Ground("f1tenth", "f1tenth", "real", (f"{hoons}1", 0, 60), (f"{hoons}0", 0, 40), ("hoons_all_test_run_4", 10.0), SMALL_CAR)
         )
     return found
 
@@ -139,6 +139,11 @@ def recordings(ground: Ground, output: Path) -> dict[str, Recording]:
     folder = Path(json.loads(subprocess.run(asked, check=True, capture_output=True, text=True).stdout)["folder"])
     wanted = {ground.train[0], ground.validation[0], ground.trial[0]}
     return {path.stem: read_recording(path) for path in sorted(folder.glob("*.parquet")) if path.stem in wanted}
+
+
+def stretch(recording: Recording, start: float, stop: float) -> Recording:
+    """From so many seconds after a recording's first sample to so many."""
+    return recording.cut(recording.start_time + start, recording.start_time + stop)
 
 
 def at_rate(recording: Recording, estimator: Estimator) -> Recording:
@@ -179,12 +184,11 @@ def try_family(ground: Ground, name: str, output: Path) -> list[tuple[object, ..
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
     by_id = recordings(ground, output)
-    train, validation = (by_id[part[0]].cut(part[1], part[2]) for part in (ground.train, ground.validation))
+    train, validation = (stretch(by_id[part[0]], part[1], part[2]) for part in (ground.train, ground.validation))
     estimator = vehest.train(name, [train], [validation], [*ground.overrides, *ground.families[name]])
     rate = estimator.settings.rate_hz
     limits = learn_limits([at_rate(train, estimator)], estimator.channels, rate)
-    start = ground.trial[1]
-    drive = at_rate(by_id[ground.trial[0]], estimator).cut(start, start + SETTLE + LASTS + COMES_BACK)
+    drive = stretch(at_rate(by_id[ground.trial[0]], estimator), ground.trial[1], ground.trial[1] + SETTLE + LASTS + COMES_BACK)
     samples = {channel: drive[channel].copy() for channel in estimator.channels}
     speed = drive["vx_ref"] if "vx_ref" in drive else drive["vx"]
     reference = sideslip(drive["vy_ref"], speed)
