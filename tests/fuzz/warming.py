@@ -45,3 +45,19 @@ def import_everything() -> None:
     from vehest.stages.artefacts import commit
 
     commit()
+    load_kernels()
+
+
+def load_kernels() -> None:
+    """Load what every estimate runs from the compile cache, which is unpickled: later that means that an input asked for it."""
+    import numpy as np
+
+    import vehest
+
+    time = np.arange(1200) / 20.0
+    yaw_rate = 0.3 * np.sin(0.7 * time) + 0.05 * np.sin(2.9 * time)
+    vy, vx = -2.0 * yaw_rate, 20.0 + np.sin(0.2 * time)
+    channels = {"yaw_rate": yaw_rate, "vx": vx, "ay": np.gradient(vy, time) + vx * yaw_rate, "vy_ref": vy}
+    drive = vehest.Recording("drive", "car", 20.0, 0.0, channels, "simulated")
+    for drives in ([drive], []):
+        vehest.estimate(vehest.train("zero", drives, drives), drive.without_references())
