@@ -173,7 +173,7 @@ def walk(estimator: Estimator, limits: GuardLimits, samples: Mapping[str, np.nda
         starts += bool(stepper.marks & STARTED)
         if at >= 0 and math.isfinite(row[at]) and abs(row[at]) < 140.0:
             fastest = max(fastest, abs(row[at]))
-        if math.isfinite(said[k]) and abs(said[k]) > limits.steepest * min(fastest, limits.top_speed) * (1 + 1e-9):
+        if math.isfinite(said[k]) and abs(said[k]) > limits.largest_tan_sideslip * min(fastest, limits.top_speed) * (1 + 1e-9):
             bounded = False
     shift = estimator.horizon_steps
     return np.concatenate([np.full(shift, np.nan), said])[:steps], exceptions, starts, bounded

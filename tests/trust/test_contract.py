@@ -263,5 +263,6 @@ def test_a_stepper_says_how_late_its_filter_makes_it():
 
 
 def test_a_bus_slower_than_the_estimator_is_refused():
-    with pytest.raises(ConfigurationError, match="samples at 10 Hz are too slow for an estimator that works at 20 Hz"):
-        GuardedStepper(ready("ksnn"), bus_rate_hz=10.0)
+    for rate in (10.0, 0.0):
+        with pytest.raises(ConfigurationError, match=f"samples at {rate:g} Hz are too slow for an estimator that works at 20 Hz"):
+            GuardedStepper(ready("ksnn"), bus_rate_hz=rate)

@@ -13,7 +13,7 @@ from vehest.trust.health import NUMBERS
 from vehest.trust.verdict import (
     BEYOND_SPEED,
     NO_ESTIMATE,
-    heed_rows,
+    isolate_rows,
     numbers_of,
     reason_in_words,
     verdict_rows,
@@ -30,12 +30,12 @@ def code(kind: int, channel: str) -> float:
     return 10_000.0 * kind + 100.0 * NUMBERS[channel]
 
 
-def heeded(kind: int, channel: str, *, often: int = 0, remembers: bool = True, status: int = 2, first: int = 10, last: int = 40):
+def heeded(kind: int, channel: str, *, rollback: int = 0, starts_anew: bool = True, status: int = 2, first: int = 10, last: int = 40):
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
     statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
     statuses[first:last], reasons[first:last] = status, code(kind, channel)
     rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
-    heed_rows(statuses, reasons, numbers_of(CHANNELS), SKIPPABLE, remembers, often, rows, measured, flow, np.zeros(2))
+    isolate_rows(statuses, reasons, numbers_of(CHANNELS), SKIPPABLE, starts_anew, rollback, rows, measured, flow, np.zeros(2))
     return rows, measured, flow
 
 
@@ -66,12 +66,12 @@ def test_a_suspicion_that_only_degrades_changes_nothing():
 
 def test_what_remembers_starts_anew_once_the_fault_is_over():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
-    assert not (heeded(kernel.OFFSET, "ay", remembers=False)[2] == RESTART).any()
+    assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
 
 
 def test_what_adapts_goes_back_every_second_only_while_a_needed_channel_is_accused():
-    assert np.flatnonzero(heeded(kernel.SCALE, "vx", often=10)[2] == RESTART).tolist() == [18, 28, 38]
-    assert not (heeded(kernel.OFFSET, "ay", often=10)[2] == RESTART).any()
+    assert np.flatnonzero(heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART).tolist() == [18, 28, 38]
+    assert not (heeded(kernel.OFFSET, "ay", rollback=10, starts_anew=False)[2] == RESTART).any()
 
 
 def test_one_row_at_a_time_heeds_the_same():
@@ -81,8 +81,10 @@ def test_one_row_at_a_time_heeds_the_same():
     state = np.zeros(2)
     for k in range(STEPS):
         part = slice(k, k + 1)
-        heed_rows(statuses[part], reasons[part], numbers_of(CHANNELS), SKIPPABLE, True, 10, rows[part], measured[part], flow[part], state)
-    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", often=10)[2])
+        isolate_rows(
+            statuses[part], reasons[part], numbers_of(CHANNELS), SKIPPABLE, False, 10, rows[part], measured[part], flow[part], state
+        )
+    assert np.array_equal(flow, heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2])
 
 
 def test_the_verdict_names_what_guard_and_watch_know():

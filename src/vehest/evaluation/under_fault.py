@@ -9,6 +9,7 @@ Each has the errors of the same estimator on the same samples without the fault 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.evaluation.integrity import detection_delay, error_while_undetected, missed_detections
 from vehest.evaluation.metrics import Scored
 
 SETTLED_SECONDS = 3.0
@@ -32,6 +34,7 @@ UNITS = {
     "coverage_90_unflagged": "1",
     "detection_delay": "s",
     "missed_detections": "1",
+    "max_error_sideslip_undetected": "deg",
 }
 """Metrics under a fault, with units."""
 
@@ -72,34 +75,39 @@ class Flagged:
     health: FloatArray
 
 
-def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window]) -> dict[str, float]:
+def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together.
 
-    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those said to be valid;
-    ``detection_delay`` mean time from a fault's start to the first sample that is not valid [s], of ranges that were valid before, as the
-    grid tells; ``missed_detections`` share of these in which none is before the fault's end. Only figures that there is something for.
+    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those said to be valid; of
+    ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
+    time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
+    is something for.
+
+    Args:
+        parts: estimate under the fault and reference, of each range or sequence.
+        flagged: band and health of each.
+        windows: of the fault in each.
+        rate_hz: of the scored samples [Hz].
     """
-    inside, valid, delays = [], [], []
+    inside, valid, delays, undetected = [], [], [], []
     for part, own, window in zip(parts, flagged, windows, strict=True):
         during = _during(part.time, window)
-        turned = np.abs(np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi)
+        error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
         known = during & np.isfinite(own.band)
-        inside.append((turned <= own.band)[known])
+        inside.append((np.abs(error) <= own.band)[known])
         valid.append(own.health[known] == 0)
-        before = np.flatnonzero(part.time < window[0] - _CLOCK)
-        if during.any() and (not len(before) or own.health[before[-1]] == 0):
-            at = np.flatnonzero(during & (own.health > 0))
-            delays.append(part.time[at[0]] - window[0] if len(at) else np.inf)
-    held, calm, late = np.concatenate(inside), np.concatenate(valid), np.array(delays)
-    figures = {}
-    if len(held):
-        figures["coverage_90"] = float(held.mean())
-    if calm.any():
-        figures["coverage_90_unflagged"] = float(held[calm].mean())
-    if np.isfinite(late).any():
-        figures["detection_delay"] = float(late[np.isfinite(late)].mean())
-    if len(late):
-        figures["missed_detections"] = float(np.mean(~np.isfinite(late)))
+        at = np.flatnonzero(during)
+        if len(at) and (at[0] == 0 or own.health[at[0] - 1] == 0):
+            flags, onset, end = own.health > 0, int(at[0]), int(at[-1]) + 1
+            delays.append(detection_delay(flags, onset, end, rate_hz))
+            undetected.append(error_while_undetected(np.degrees(error), flags, onset, end)[1])
+    held, calm = np.concatenate(inside), np.concatenate(valid)
+    found = [delay for delay in delays if math.isfinite(delay)]
+    figures = {"coverage_90": float(held.mean())} if len(held) else {}
+    figures |= {"coverage_90_unflagged": float(held[calm].mean())} if calm.any() else {}
+    figures |= {"detection_delay": float(np.mean(found))} if found else {}
+    if delays:
+        figures |= {"missed_detections": missed_detections(delays), "max_error_sideslip_undetected": max(undetected)}
     return figures
 
 

@@ -26,7 +26,7 @@ from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict
-from vehest.trust.record import Trust
+from vehest.trust.record import Trust, is_elsewhere
 from vehest.trust.verdict import reason_in_words
 
 SUFFIXES = (".parquet", ".csv")
@@ -125,6 +125,17 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
+    needed = prepared_recording(model, recording, downsample)
+    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_elsewhere(trust, recording)).estimate
+    return require_estimate(model, recording, estimate)
+
+
+def prepared_recording(model: Estimator, recording: Recording, downsample: dict[str, Any]) -> Recording:
+    """The channels that a model reads, at its rate; see `estimate_recording`.
+
+    Raises:
+        DataError: a channel is missing, or the recording is sampled too slowly.
+    """
     rate = model.settings.rate_hz
     needed = recording.select(model.channels) if all(name in recording for name in model.channels) else recording
     for name in model.channels:
@@ -138,8 +149,15 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
         )
     for transform in transforms_of({"rate_hz": rate, **downsample}):
         needed = transform(needed)
-    elsewhere = trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
-    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=elsewhere).estimate
+    return needed
+
+
+def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
+    """The estimate, if there is any.
+
+    Raises:
+        DataError: there is none, since the recording is too short.
+    """
     if np.isnan(estimate["vy"]).all():
         raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
     return estimate

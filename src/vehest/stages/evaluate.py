@@ -204,7 +204,7 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         if name != VALIDATION:
             figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, job, spans)
             if estimator.causal:
-                figures["step_seconds"] = _step_seconds(estimator, _measured(job, pieces[0]))
+                figures["step_seconds"] = _step_seconds(estimator, measured_range(job, pieces[0]))
         rows += _rows(estimator, about, job, name, spans, figures, figure_intervals(blocks[name]))
         with_lever = lever_arm_figures(scored, pieces_of(spans, job.reference, job.protocol), job.protocol)
         rows += _rows(estimator, about, job, name, spans, with_lever, {}, condition=CONDITION)
@@ -258,7 +258,7 @@ def _with_bands(estimates: list[Estimate], job: EvaluateJob, pieces: Sequence[Sp
         return estimates
     found = []
     for estimate, piece in zip(estimates, pieces, strict=True):
-        measured = _measured(job, piece)
+        measured = measured_range(job, piece)
         elsewhere = measured.vehicle not in bands.vehicles or test_set in job.protocol.sets_elsewhere
         found.append(with_bands(estimate, measured, bands, elsewhere=elsewhere))
     return found
@@ -340,7 +340,7 @@ def scored_spans(split: Split) -> list[Span]:
     return [span for spans in test_sets(split).values() for span in spans]
 
 
-def _measured(job: EvaluateJob, span: Span) -> Recording:
+def measured_range(job: EvaluateJob, span: Span) -> Recording:
     """What the estimator may see of a range: no references, and a warm-up before it."""
     recording = read_recording(recording_file(job.data[span.dataset], span))
     return recording.cut(span.start - job.protocol.warm_up_seconds, span.stop).without_references()
@@ -352,9 +352,9 @@ def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -
     if job.protocol.initial_state:
         states = [reference_state(job.reference(piece), piece) for piece in pieces]
     if job.protocol.sequence_seconds is not None:
-        return estimator.estimate([_measured(job, piece) for piece in pieces], states)
+        return estimator.estimate([measured_range(job, piece) for piece in pieces], states)
     return [
-        estimator.estimate([_measured(job, piece)], states[position] if states is not None else None)[0]
+        estimator.estimate([measured_range(job, piece)], states[position] if states is not None else None)[0]
         for position, piece in enumerate(pieces)
     ]
 

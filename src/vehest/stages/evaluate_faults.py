@@ -17,19 +17,18 @@ import numpy as np
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span
-from vehest.data.store import read_estimate, read_recording
+from vehest.data.store import read_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored, reference_state, score_all, sequences
 from vehest.evaluation.under_fault import FAULTED, UNITS, Flagged, Window, errors_under_fault, flags_under_fault
 from vehest.stages.artefacts import StagePlan
 from vehest.stages.code_version import code_version
-from vehest.stages.evaluate import COLUMNS, METRICS, EvaluateJob, test_sets, write_evaluation
+from vehest.stages.evaluate import COLUMNS, METRICS, EvaluateJob, measured_range, test_sets, write_evaluation
 from vehest.stages.faults import FaultSettings
-from vehest.stages.train import recording_file
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, inject, is_fault
-from vehest.trust.record import Trust, read_trust
+from vehest.trust.record import is_elsewhere, read_trust
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,9 @@ class _Ranges:
         self.estimator, self.spans, self.protocol = estimator, spans, job.protocol
         self.reference = cache(job.reference)
         self.trust = read_trust(job.calibration.folder) if job.calibration is not None else None
+        self.elsewhere = name in job.protocol.sets_elsewhere
         self.pieces = sequences(spans, self.reference, job.protocol)
-        self.recordings = [_measured(job, piece) for piece in self.pieces]
+        self.recordings = [measured_range(job, piece) for piece in self.pieces]
         self.states = [reference_state(self.reference(piece), piece) if job.protocol.initial_state else None for piece in self.pieces]
         self.nominal = self._scored([read_estimate(folder / name / f"{position}.parquet") for position in range(len(self.pieces))])
 
@@ -109,15 +109,22 @@ class _Ranges:
             start = max(piece.start - recording.start_time, 0.0)
             fault = settings.within(start, recording.duration - start, position)
             onset = recording.start_time + fault.onset
-            estimate = _estimated_under_fault(self.estimator, self.trust, recording, fault, state)
+            estimate = self._estimated(recording, fault, state)
             said.append(estimate)
             estimates.append(_lost_from(onset, estimate))
             windows.append((onset, onset + fault.duration))
         scored = self._scored(estimates)
         found = errors_under_fault(scored, self.nominal, windows)
         if self.trust is not None and FAULTED in found:
-            found[FAULTED] |= flags_under_fault(scored, [_flags(*pair) for pair in zip(said, scored, strict=True)], windows)
+            flags = [_flags(*pair) for pair in zip(said, scored, strict=True)]
+            found[FAULTED] |= flags_under_fault(scored, flags, windows, self.protocol.rate_hz)
         return found
+
+    def _estimated(self, recording: Recording, fault: Fault, state: Mapping[str, float] | None) -> Estimate:
+        """The estimate of a recording one of whose channels is faulty, under the contract that holds online."""
+        samples = inject(recording.channels, recording.rate_hz, fault)
+        elsewhere = self.elsewhere or is_elsewhere(self.trust, recording)
+        return estimate_guarded(self.estimator, samples, recording, self.trust, state, elsewhere=elsewhere).estimate
 
     def _scored(self, estimates: Sequence[Estimate]) -> list[Scored]:
         return score_all(estimates.__getitem__, self.spans, self.reference, self.protocol)
@@ -126,20 +133,6 @@ class _Ranges:
 def _flags(estimate: Estimate, part: Scored) -> Flagged:
     band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
     return Flagged(band, estimate.held_at(part.time, "health"))
-
-
-def _measured(job: EvaluateJob, piece: Span) -> Recording:
-    """What the estimator may see of a range: no references, and a warm-up before it."""
-    recording = read_recording(recording_file(job.data[piece.dataset], piece))
-    return recording.cut(piece.start - job.protocol.warm_up_seconds, piece.stop).without_references()
-
-
-def _estimated_under_fault(
-    estimator: Estimator, trust: Trust | None, recording: Recording, fault: Fault, state: Mapping[str, float] | None
-) -> Estimate:
-    """The estimate of a recording one of whose channels is faulty, under the contract that holds online."""
-    samples = inject(recording.channels, recording.rate_hz, fault)
-    return estimate_guarded(estimator, samples, recording, trust, state).estimate
 
 
 def _lost_from(onset: float, estimate: Estimate) -> Estimate:

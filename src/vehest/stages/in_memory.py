@@ -14,7 +14,7 @@ from vehest.evaluation.metrics import accuracy, score
 from vehest.stages.calibrate import Stretch, learn_trust
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
-from vehest.stages.estimate import estimate_recording
+from vehest.stages.estimate import prepared_recording, require_estimate
 from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.train import new_estimator
 from vehest.trust.record import Trust
@@ -43,7 +43,8 @@ def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, flo
     for recording in recordings:
         if "vy_ref" not in recording:
             raise DataError(f"recording '{recording.id}' has no channel 'vy_ref' to score an estimate against")
-        estimate = estimate_recording(model, recording.without_references(), dict(model.preparation))
+        needed = prepared_recording(model, recording.without_references(), dict(model.preparation))
+        estimate = require_estimate(model, recording, model.estimate([needed])[0])
         reference = _resampled(recording, protocol.rate_hz, model)
         parts.append(score(estimate, reference, Span("", recording.id), protocol))
     return accuracy(parts)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -189,6 +189,13 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
         fewest, most = (fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max()))
         words += f"; training took {fewest} epochs a network" if fewest == most else f"; training took {fewest} to {most} epochs a network"
     return words + "."
+
+
+def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
+    """How one of several parts was made; its tables are called after it."""
+    made = how_it_was_made(part)
+    lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
+    return [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
 
 
 def how_it_was_made(artefacts: PartArtefacts) -> list[Block]:

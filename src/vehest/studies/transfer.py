@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from vehest.evaluation.ranking import BASELINES, Name, Ranking
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
 from vehest.report.style import MISSING, decimals_for, fixed, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.drive import budget_sentence, data_sentence, how_it_was_made
+from vehest.studies.drive import appendix_of, budget_sentence, data_sentence
 from vehest.studies.kit.runs import by_name
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
@@ -44,10 +43,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     blocks += [_matrix(board), transfer_figure_of(board)]
     for name, part in parts.items():
         blocks += _part(name, part, board[board["part"] == name], rankings)
-    for name, part in parts.items():
-        made = how_it_was_made(part)
-        lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
-        blocks += [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
+    blocks += [block for name, part in parts.items() for block in appendix_of(name, part)]
     if (board["estimator"] == "ksnn").any():
         blocks.append(PATENT_NOTE)
     return {REPORT: Document(artefacts.title, blocks)}

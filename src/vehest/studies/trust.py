@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from vehest.data.store import read_recording
+from vehest.estimators.registry import estimator_class
 from vehest.evaluation.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
 from vehest.report.integrity_figures import stanford_figure
 from vehest.report.reliability import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.drive import how_it_was_made
+from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.studies.trust_faults import FaultTrials, elsewhere, health_of, trials_of
 from vehest.trust.bands import ELSEWHERE, LEVELS
@@ -50,10 +50,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     blocks += ["## Faults", *_faults(trials)]
     stanford = _stanford(parts)
     blocks += ["## Integrity", stanford] if stanford is not None else []
-    for name, part in parts.items():
-        made = how_it_was_made(part)
-        lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
-        blocks += [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
+    blocks += [block for name, part in parts.items() for block in appendix_of(name, part)]
     if (board["estimator"] == "ksnn").any():
         blocks.append(PATENT_NOTE)
     return {REPORT: Document(artefacts.title, blocks, {"faults": _cases(trials)})}
@@ -156,7 +153,7 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
 
 
 def _reliability(board: pd.DataFrame) -> Figure:
-    """Coverage over level, test sets of cars learnt on together, a line a data set and family."""
+    """Coverage over level, test sets of cars learnt on together, a line a family."""
     learnt = board[board["car"] == LEARNT]
     families = [name for name in SHOWN if name in set(learnt["estimator"])]
     lines, rows = lines_of([(name, "") for name in families]), []
@@ -164,7 +161,7 @@ def _reliability(board: pd.DataFrame) -> Figure:
         own = learnt[learnt["estimator"] == family]
         values = own[list(COVERAGES)].to_numpy(dtype=float)
         low, high = (np.quantile(values, share, axis=0) for share in (0.1, 0.9))
-        rows.append(Reliability(family, lines[family, ""], values.mean(axis=0), low, high))
+        rows.append(Reliability(estimator_class(family).title, lines[family, ""], values.mean(axis=0), low, high))
     caption = (
         "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a "
         "family, bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."

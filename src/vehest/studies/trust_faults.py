@@ -12,7 +12,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
@@ -147,4 +146,4 @@ def _ranges(part: PartArtefacts, spans: Sequence[Span]) -> list[Recording]:
 
 
 def _complete(recording: Recording, channel: str) -> bool:
-    return channel in recording and not CHANNELS[channel].is_reference and bool(np.isfinite(recording[channel]).all())
+    return channel in recording and bool(np.isfinite(recording[channel]).all())

@@ -33,7 +33,7 @@ from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
 from vehest.trust.monitor import Monitor
 from vehest.trust.record import Trust
-from vehest.trust.verdict import Verdict
+from vehest.trust.verdict import Verdict, starts_anew
 from vehest.trust.watch import Watch, Watched
 
 FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
@@ -57,11 +57,6 @@ class Guarded:
     estimate: Estimate
     cleaned: Cleaned
     marks: NDArray[np.int8]
-
-
-def starts_anew(estimator: Estimator) -> bool:
-    """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
-    return estimator.warm_up_steps == 0 and not getattr(estimator, "adapts", False)
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
@@ -274,8 +269,8 @@ class GuardedStepper(Stepper):
         self._stepper, self._fresh = estimator.online(), True
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
-        self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz else None
-        self._rate = bus_rate_hz or rate
+        self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz is not None else None
+        self._rate = rate if bus_rate_hz is None else bus_rate_hz
         self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
         self._monitor = Monitor(estimator, trust, elsewhere=elsewhere)

@@ -47,7 +47,7 @@ class FrontEnd:
             name: type(own)(own.low, own.high, max(usual.channels[name].jump, own.jump), own.run)
             for name, own in (limits.channels or usual.channels).items()
         }
-        self._guard = Guard(channels, skippable, GuardLimits(merged, limits.top_speed, limits.steepest), bus_rate_hz)
+        self._guard = Guard(channels, skippable, GuardLimits(merged, limits.top_speed, limits.largest_tan_sideslip), bus_rate_hz)
         self._ratio = rate_hz / bus_rate_hz
         self._phase = 1.0 - self._ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):

@@ -69,14 +69,12 @@ class GuardLimits:
     Args:
         channels: name -> limits.
         top_speed: that the car reaches [m/s].
-        steepest: largest |v| over max(u, 1 m/s) that is believed of an estimate; 1 is a sideslip of 45°.
-        learnt: whether training recordings set them, rather than what any car reaches.
+        largest_tan_sideslip: largest |v| over max(u, 1 m/s) that is believed of an estimate; 1 is a sideslip of 45°.
     """
 
     channels: Mapping[str, ChannelLimits] = field(default_factory=dict)
     top_speed: float = 140.0
-    steepest: float = 1.0
-    learnt: bool = False
+    largest_tan_sideslip: float = 1.0
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
@@ -110,8 +108,8 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
         )
     speeds = [np.abs(recording[name]) for recording in recordings for name in ("vx", "vx_ref") if name in recording]
     top = max((float(np.nanmax(part, initial=0.0)) for part in speeds), default=0.0)
-    steep = [_steepness(recording) for recording in recordings]
-    return GuardLimits(found, MARGIN * top if top > 0 else 140.0, max(1.0, 1.2 * max(steep, default=0.0)), learnt=True)
+    tangents = [_tan_sideslip(recording) for recording in recordings]
+    return GuardLimits(found, MARGIN * top if top > 0 else 140.0, max(1.0, 1.2 * max(tangents, default=0.0)))
 
 
 def _usual(name: str, rate_hz: float) -> ChannelLimits:
@@ -129,7 +127,7 @@ def _fastest(name: str, rate_hz: float) -> float:
     return span if name.startswith(FREE) else FASTEST.get(table.unit, span) / rate_hz
 
 
-def _steepness(recording: Recording) -> float:
+def _tan_sideslip(recording: Recording) -> float:
     if "vy_ref" not in recording:
         return 0.0
     name = "vx_ref" if "vx_ref" in recording else "vx"

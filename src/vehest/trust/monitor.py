@@ -10,7 +10,7 @@ from vehest.trust.bands import band_rows
 from vehest.trust.guard import Cleaned
 from vehest.trust.health import health_rows
 from vehest.trust.record import Trust
-from vehest.trust.verdict import ROLLED_BACK_SECONDS, Verdict, heed_rows, numbers_of, verdict_rows, widen_rows
+from vehest.trust.verdict import ROLLED_BACK_SECONDS, Verdict, adapts, isolate_rows, numbers_of, starts_anew, verdict_rows, widen_rows
 from vehest.trust.watch import Watched
 
 
@@ -32,9 +32,8 @@ class Monitor:
         self._numbers = numbers_of(estimator.channels)
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
-        self._remembers = estimator.warm_up_steps == 0
-        adapts = bool(getattr(estimator, "adapts", False))
-        self._often = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if adapts else 0
+        self._starts_anew = starts_anew(estimator)
+        self._rollback = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if adapts(estimator) else 0
         self._fault = np.zeros(2)
 
     @property
@@ -52,13 +51,13 @@ class Monitor:
         if self._health is None:
             return Verdict(np.zeros(len(received)), np.zeros(len(received)))
         found = health_rows(self._health, received, cleaned.measured, self._state)
-        heed_rows(
+        isolate_rows(
             found.status,
             found.reason,
             self._numbers,
             self._skippable,
-            self._remembers,
-            self._often,
+            self._starts_anew,
+            self._rollback,
             cleaned.rows,
             cleaned.measured,
             cleaned.flow,

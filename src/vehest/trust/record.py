@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_yaml
 from vehest.trust.bands import Bands
@@ -54,6 +55,11 @@ class Trust:
 @dataclass(frozen=True)
 class _File(Trust):
     format: int = 0
+
+
+def is_elsewhere(trust: Trust | None, recording: Recording) -> bool:
+    """Whether a recording is of another vehicle than those that bands were calibrated on."""
+    return trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
 
 
 def write_trust(trust: Trust, folder: Path) -> None:

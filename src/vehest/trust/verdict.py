@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE, WAIT
@@ -29,14 +30,13 @@ from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 NO_ESTIMATE, BEYOND_SPEED = 30, 31
 """Further kinds of reasons: there is no estimate; it was beyond what the speed allows."""
 
-WIDER = (1.0, 2.0, 4.0)
+BAND_FACTORS = (1.0, 2.0, 4.0)
 """Factor of the band of a valid, a degraded, an invalid estimate."""
 
 ROLLED_BACK_SECONDS = 1.0
 
 NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 """Kinds of reasons that accuse no sensor of anything that an estimator could do without."""
-
 
 OWN_WORDS = {NO_ESTIMATE: "there is no estimate", BEYOND_SPEED: "the estimate exceeds what the speed allows"}
 
@@ -59,21 +59,31 @@ class Verdict(NamedTuple):
     reason: FloatArray
 
 
+def adapts(estimator: Estimator) -> bool:
+    """Whether an estimator has states that adapt, such as tyres, friction or offsets: it then has a property ``adapts`` that says so."""
+    return bool(getattr(estimator, "adapts", False))
+
+
+def starts_anew(estimator: Estimator) -> bool:
+    """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
+    return estimator.warm_up_steps == 0 and not adapts(estimator)
+
+
 def numbers_of(channels: tuple[str, ...]) -> NDArray[np.int64]:
     """Numbers of channels in codes of reasons, (C,)."""
     return np.array([NUMBERS[name] for name in channels], np.int64)
 
 
 @entry(nogil=True)
-def heed_rows(status, reason, numbers, skippable, remembers, often, rows, measured, flow, state):  # type: ignore[no-untyped-def]
-    """Take accused channels out of the rows, and start estimators that remember anew once a fault is over; in place.
+def isolate_rows(status, reason, numbers, skippable, starts_anew, rollback, rows, measured, flow, state):  # type: ignore[no-untyped-def]
+    """Take accused channels out of the rows, and have estimators start anew after faults; in place (fault isolation).
 
     Args:
         status, reason: of each row, (T,).
         numbers: of the channels, (C,).
         skippable: which of them the estimator can do without, (C,).
-        remembers: whether the estimator has more memory than a window.
-        often: samples after which one with states that adapt goes back to what was fitted, while a channel that it needs is accused; 0
+        starts_anew: whether the estimator does once the fault is over.
+        rollback: samples after which one with states that adapt goes back to what was fitted, while a channel that it needs is accused; 0
             where nothing adapts.
         rows, measured, flow: as in `vehest.trust.guard.Cleaned`.
         state: whether there was a fault since health was last valid, and for how many samples one in a needed channel, (2,).
@@ -92,11 +102,11 @@ def heed_rows(status, reason, numbers, skippable, remembers, often, rows, measur
                 state[1] = 1.0
         elif status[k] == VALID and state[0] > 0.0:
             state[0], state[1] = 0.0, 0.0
-            if remembers and often == 0 and flow[k] == USE:
+            if starts_anew and flow[k] == USE:
                 flow[k] = RESTART
         if state[1] > 0.0:
             state[1] += 1.0
-            if often > 0 and flow[k] == USE and state[1] % often == 0.0:
+            if rollback > 0 and flow[k] == USE and state[1] % rollback == 0.0:
                 flow[k] = RESTART
 
 
@@ -139,7 +149,7 @@ def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyp
         bands: half widths of v [m/s] and β [rad], (T, 2).
     """
     for k in range(vy.shape[0]):
-        wider = WIDER[int(status[k])]
+        wider = BAND_FACTORS[int(status[k])]
         bands[k, 0] *= wider
         bands[k, 1] = min(bands[k, 1] * wider, math.pi)
         if marks[k] & EXTRAPOLATED and math.isfinite(vy[k]):

@@ -52,7 +52,7 @@ class Watch:
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
-        self._settings = np.array([limits.top_speed, limits.steepest, float(warm_up), 1.0 / rate_hz])
+        self._settings = np.array([limits.top_speed, limits.largest_tan_sideslip, float(warm_up), 1.0 / rate_hz])
         self.state = np.zeros(6)
         self.state[0] = math.nan  # no estimate yet
 
@@ -77,13 +77,13 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         vy, motion, flow: as in `Watch`.
         state: last value passed on, speed that is remembered, seconds of spinning, seconds beyond the bound, samples since the
             estimator's start, whether it was lost at the last row.
-        settings: top speed, steepest, warm-up in samples, sampling interval [s].
+        settings: top speed, largest tan β, warm-up in samples, sampling interval [s].
         out, marks: output, (T,).
 
     Returns:
         How many rows were done, and whether the estimator was lost at the last of them.
     """
-    top_speed, steepest, warm_up, step = settings
+    top_speed, largest_tan, warm_up, step = settings
     for k in range(vy.shape[0]):
         begins = flow[k] == RESTART or (state[5] > 0.0 and flow[k] != WAIT)
         state[4] = 0.0 if begins else state[4] + 1.0
@@ -97,7 +97,7 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         remembered = state[1] * math.exp(-step / REMEMBERED_SECONDS) if state[1] > 0.0 else top_speed * math.isnan(u)
         speed = remembered if math.isnan(u) else min(abs(u), top_speed)
         state[1] = max(speed, remembered)
-        bound = steepest * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)
+        bound = largest_tan * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)
         if state[2] > SPIN_SECONDS:
             marks[k] += SPINNING
         told, lost = math.nan, False
