@@ -89,6 +89,25 @@ def test_a_frozen_channel_counts_as_not_measured_after_its_longest_run(drive):
     assert np.flatnonzero(~measured).tolist() == list(range(first, 400))
 
 
+@pytest.mark.parametrize(("held", "believed"), [("at its lock", True), ("on the way there", False)])
+def test_a_steering_that_stands_still_is_believed_at_its_lock_alone(drive, held, believed):
+    steer = np.clip(0.4 * np.sin(0.5 * drive.time), -0.3, 0.35)
+    driven = Recording("driven", "car", RATE, 0.0, {"vx": drive["vx"], "steer": steer})
+    limits = learn_limits([driven], ("vx", "steer"), RATE)
+    assert limits.channels["steer"].stops == pytest.approx((-0.3, 0.35), rel=2e-3)
+    rows = np.stack([drive["vx"], steer], axis=1)
+    first = int(np.flatnonzero(steer[:-1] == 0.35)[0]) if believed else int(np.argmax(steer > 0.1))
+    rows[first : first + 60, 1] = rows[first, 1]
+    measured = Guard(("vx", "steer"), (), limits, RATE)(rows).measured[first : first + 60, 1]
+    assert measured.all() == believed
+
+
+def test_a_speed_has_no_lock(drive):
+    standing = np.minimum(drive["vx"], np.median(drive["vx"]))
+    limits = learn_limits([Recording("slow", "car", RATE, 0.0, {"vx": standing})], ("vx",), RATE)
+    assert limits.channels["vx"].stops == (-1e300, 1e300)
+
+
 def test_a_car_that_stands_has_no_frozen_channels():
     still = planar_drive(20.0)
     rows = rows_of(still)

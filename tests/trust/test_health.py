@@ -255,3 +255,17 @@ def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root: Path) -> No
         changed[first:] = change(changed[first:])
         found = judged(model, runs[3], **{channel: changed})
         assert (found.status[first : first + 300] > VALID).any(), channel
+
+
+def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
+    source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
+    runs = [source.read(f"iros_hoons_1_with_friction_run_{k}").without_references() for k in (1, 2, 3, 4, 0)]
+    model = learn_health(runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0)
+    assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=2e-3)
+    at_lock = source.read("hoons_all_test_run_21").without_references()  # stays at full lock for 5 s
+    found = judged(model, at_lock)
+    assert kernel.FROZEN not in {reason_kind(code) for code, status in zip(found.reason, found.status, strict=True) if status > VALID}
+    half = np.array(at_lock["steer"])
+    half[400:] = 0.2
+    frozen = judged(model, at_lock, steer=half)
+    assert any(reason_kind(code) == kernel.FROZEN and reason_channel(code) == "steer" for code in frozen.reason[400:])

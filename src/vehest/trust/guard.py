@@ -27,6 +27,7 @@ PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is believe
 MARGIN = 3.0  # beyond what was seen in training
 LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training says nothing by standing still
 LEAST_RUN = 0.3  # s
+STOP_TOLERANCE = 1e-3  # of the angle at which a steering is at its stop
 
 REACHED = {"m/s²": 25.0, "rad/s": 4.0, "rad": 1.0, "m/s": 100.0}
 """Unit -> size that some road car reaches; angular speeds of wheels and the angle of the steering wheel go by their own ranges."""
@@ -39,6 +40,11 @@ NOISE = {"m/s²": 6.0, "rad/s": 0.5, "rad": 0.1, "m/s": 2.0}
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
 """Starts of names whose ranges and changes differ too much between cars; what they may do has to be learnt."""
+
+STEERING = ("steer", "handwheel")
+"""Channels with stops: at its lock, a steering that stands still says nothing."""
+
+ENDLESS = 1e300  # stops of channels that have none
 
 STANDSTILL_SPEED, STANDSTILL_YAW_RATE = 0.5, 0.05  # m/s, rad/s: below both, nothing is expected to move
 
@@ -54,12 +60,14 @@ class ChannelLimits:
         low, high: smallest and largest value [unit of the channel].
         jump: largest change from one sample to the next [unit].
         run: longest time that it may stand still while the car moves [s]; 0 if any.
+        stops: between which alone it is expected to move [unit].
     """
 
     low: float
     high: float
     jump: Annotated[float, "a positive number"]
     run: float = 0.0
+    stops: tuple[float, float] = (-ENDLESS, ENDLESS)
 
 
 @dataclass(frozen=True)
@@ -104,7 +112,8 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
             jump=max(_fastest(name, rate_hz), MARGIN * jump),
-            run=_run_limit([recording for recording in recordings if name in recording], name),
+            run=_run_limit([recording for recording in recordings if name in recording], name, stops_of(own, name)),
+            stops=stops_of(own, name),
         )
     speeds = [np.abs(recording[name]) for recording in recordings for name in ("vx", "vx_ref") if name in recording]
     top = max((float(np.nanmax(part, initial=0.0)) for part in speeds), default=0.0)
@@ -136,18 +145,35 @@ def _tan_sideslip(recording: Recording) -> float:
     return float(np.nanmax(np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0), initial=0.0))
 
 
-def _run_limit(recordings: Sequence[Recording], name: str) -> float:
-    """Twice the longest time that a channel stood still while the car moved [s]; 0 if that says nothing."""
+def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
+    """Twice the longest time that a channel stood still between its stops while the car moved [s]; 0 if that says nothing."""
     if CHANNELS[name].rests or not recordings:
         return 0.0
     longest = 0.0
     for recording in recordings:
         samples = recording[name]
-        same = np.concatenate([[False], samples[1:] == samples[:-1]]) & _moves(recording)
+        same = np.concatenate([[False], samples[1:] == samples[:-1]]) & _moves(recording) & (samples > stops[0]) & (samples < stops[1])
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
         if len(edges):
             longest = max(longest, float((edges[1::2] - edges[::2]).max()) / recording.rate_hz)
     return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
+
+
+def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
+    """Where a steering is at its lock, (lower, upper): its extremes in training, if it stayed there for three samples or longer.
+
+    Args:
+        parts: samples of the channel, (T,) each.
+        name: of the channel; others than `STEERING` have no stops.
+    """
+    stops = [-ENDLESS, ENDLESS]
+    if name in STEERING and any(np.isfinite(part).any() for part in parts):
+        for side, sign in enumerate((-1.0, 1.0)):
+            farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
+            near = [sign * part >= farthest - STOP_TOLERANCE * abs(farthest) for part in parts]
+            if farthest > 0 and any((at[2:] & at[1:-1] & at[:-2]).any() for at in near):
+                stops[side] = sign * (farthest - STOP_TOLERANCE * abs(farthest))
+    return stops[0], stops[1]
 
 
 def _moves(recording: Recording) -> NDArray[np.bool_]:
@@ -193,7 +219,7 @@ class Guard:
         self.channels, self.rate_hz = tuple(channels), rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
-        self._limits = np.array([(row.low, row.high, row.jump, run) for row, run in zip(rows, runs, strict=True)])
+        self._limits = np.array([(row.low, row.high, row.jump, run, *row.stops) for row, run in zip(rows, runs, strict=True)])
         self._skippable = np.array([name in skippable for name in channels])
         places = [self.channels.index(name) if name in self.channels else -1 for name in ("vx", "yaw_rate")]
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
@@ -217,7 +243,7 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
         rows: (T, C), whatever was received.
         state: (C + 1, 6), of each channel: last believed value, samples since, length of the present run, last value, candidate after a
             jump, how often it was confirmed; last row: whether the estimator waits.
-        limits: (C, 4): low, high, jump, longest run in samples.
+        limits: (C, 6): low, high, jump, longest run in samples, lower and upper stop.
         skippable: (C,).
         settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand, whether a jump
             that is believed makes the estimator start anew.
@@ -235,7 +261,7 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
             if believed:
                 own[2] = own[2] + 1.0 if x == own[3] else 0.0
                 own[3] = x
-                if own[2] > limits[c, 3] and not still:
+                if own[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not still:
                     believed = False
                 elif own[1] <= bridged and abs(x - own[0]) > limits[c, 2]:  # a jump from what is not long gone
                     own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0

@@ -22,6 +22,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
+from vehest.trust.guard import ENDLESS, stops_of
 from vehest.trust.health_kernel import N_FEATURES, N_FORMS, N_LEVELS, Layout, health_kernel, memory_sizes
 from vehest.trust.relations import (
     FEATURES,
@@ -182,6 +183,7 @@ class HealthModel:
         healthy: offset, scale and delay that the likelihood ratios find in each channel while all is well.
         heaviest: weight that one sample may have in them.
         limits: of every statistic, in the order of `statistics`.
+        stops: of each channel, between which alone it is expected to move.
     """
 
     channels: tuple[str, ...]
@@ -201,6 +203,7 @@ class HealthModel:
     healthy: tuple[tuple[float, ...], ...] = ()
     heaviest: tuple[tuple[float, ...], ...] = ()
     limits: tuple[float, ...] = ()
+    stops: tuple[tuple[float, float], ...] = ()
 
     @property
     def layout(self) -> Layout:
@@ -290,6 +293,7 @@ class HealthModel:
             1.0 / limits,
             [PRIORITY[statistic.kind] for statistic in statistics],
             [*self.standstill, step, *self.spin, *forgetting([SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS])],
+            np.array(self.stops or ((-ENDLESS, ENDLESS),) * C).T,
         ]
         sizes = [
             *layout,
@@ -384,6 +388,7 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
         speeds=tuple(noise.speeds.tolist()),
         levels=_plain(levels),
+        stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
     found = _with_healthy(_with_healthy(found, train), train)
     return replace(found, limits=limits_from(block_maxima(found, [*train, *validation]), found.statistics, 1.0 / rate_hz))

@@ -101,16 +101,18 @@ PLACES = 15
     AT_INVERSE,
     AT_PRIORITY,
     AT_SETTINGS,
-) = range(PLACES + 0, PLACES + 23)
+    AT_STOPS,
+) = range(PLACES + 0, PLACES + 24)
 """Tables in ``numbers``, with C channels, p lags, R relations, F features, K statistics and L speeds: c (C), A of channel m on q (p, m, q),
 S⁻¹ (C, C), deviation (C), W (C, F), average relations (R, F), their gain of du/dt (R), usual and largest value (C), speeds (L), noise at
 them (L, C), 1 - Σ A_l of m on q (m, q), weight of an innovation some samples ago on a step in m (p, m, q) and their power (C, C), what the
 likelihood ratios find while all is well and what one sample may weigh in them (form, C), forgetting of energy, ratios and relations,
 limits, one over them, which of several says what is wrong (K), settings: speed, yaw rate and ay of standstill, step, yaw rate and u r of a
-spin, forgetting of the share of equal samples, of ax, and of the low-pass that stands for a delay."""
+spin, forgetting of the share of equal samples, of ax, and of the low-pass that stands for a delay; lower and upper stop, between which
+alone a channel is expected to move (2, C)."""
 
 (AT_MODELLED, AT_RESTS, AT_GAP_LIMIT, AT_WHEEL, AT_CODE, AT_TARGET, AT_KIND, AT_ACCUSED, AT_PARTNER, AT_INVOLVED, AT_VERSUS) = range(
-    PLACES + 23, PLACES + 34
+    PLACES + 24, PLACES + 35
 )
 """Tables in ``sizes`` itself: of channels whether they are modelled, may rest, longest gap, whether a wheel, number in a code; column of a
 relation's target; of statistics kind of reason, column that it accuses, column of the partner (-1: none); of relations whether they
@@ -147,7 +149,7 @@ involve a channel (R, C; 2: by a small term, which breaks them where it is wrong
     AT_SLOPE,
     AT_EFFECT,
     AT_STATISTICS,
-) = range(PLACES + 34, PLACES + 64)
+) = range(PLACES + 35, PLACES + 65)
 """Parts of ``state``. What lasts: flags (rows seen, rows until cleared, last reason, last status, rows of spin, rows since the yaw rate
 jumped, mean ax, unused), last value, rows without a sample (below zero while predictions settle again), run and share of equal samples,
 low-passed value (C each), x and its low-pass less x (2, p, C), y and innovations (p, C), energies (C, E), sums of the likelihood ratios
@@ -162,7 +164,7 @@ def table_sizes(layout: Layout) -> list[int]:
     C, p, R, K = layout.channels, layout.order, layout.relations, layout.n_statistics
     forms = [N_FORMS * C, N_FORMS * C, layout.energies, layout.ratios, layout.averages]
     described = [C, p * C * C, C * C, C, C * N_FEATURES, R * N_FEATURES, R, C, C, N_LEVELS, N_LEVELS * C, C * C, p * C * C, C * C]
-    return [*described, *forms, K, K, K, 9]
+    return [*described, *forms, K, K, K, 9, 2 * C]
 
 
 def index_sizes(layout: Layout) -> list[int]:
@@ -224,7 +226,7 @@ def _receive(k, rows, measured, sizes, numbers, state):  # type: ignore[no-untyp
     C, p = sizes[N_CHANNELS], sizes[N_LAGS]
     at_flags, at_last, at_usual, at_low_passed = sizes[AT_FLAGS], sizes[AT_LAST], sizes[AT_USUAL], sizes[AT_LOW_PASSED]
     at_run, at_share, at_settings, at_gap = sizes[AT_RUN], sizes[AT_SHARE], sizes[AT_SETTINGS], sizes[AT_GAP]
-    at_gap_limit, at_x, at_largest = sizes[AT_GAP_LIMIT], sizes[AT_X], sizes[AT_LARGEST]
+    at_gap_limit, at_x, at_largest, at_stops = sizes[AT_GAP_LIMIT], sizes[AT_X], sizes[AT_LARGEST], sizes[AT_STOPS]
     first, longest, absent = state[at_flags] == 0.0, 0.0, -1
     for i in range(C):
         value = rows[k, i]
@@ -233,7 +235,8 @@ def _receive(k, rows, measured, sizes, numbers, state):  # type: ignore[no-untyp
             state[at_last + i] = value if known else numbers[at_usual + i]
             state[at_low_passed + i] = state[at_last + i]
         if known:
-            same = value == state[at_last + i] and not first
+            free = numbers[at_stops + i] < value < numbers[at_stops + C + i]
+            same = free and value == state[at_last + i] and not first
             state[at_run + i] = state[at_run + i] + 1.0 if same else 0.0
             state[at_share + i] += numbers[at_settings + 6] * ((1.0 if same else 0.0) - state[at_share + i])
             state[at_last + i] = value
