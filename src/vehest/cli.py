@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
@@ -40,6 +41,7 @@ app = typer.Typer(
 data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
+STARTED = time.monotonic()
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
@@ -378,12 +380,20 @@ def run(
     as_json: AsJson = False,
     quiet: Quiet = False,
     jobs: Jobs = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Be done in this time, report included; what did not fit is named, and the same command goes on with it."),
+    ] = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
-    What is there is skipped. Overrides apply to every sweep that has their key.
+    What is there is skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    _run_pipeline(pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=jobs, only_report=False)
+    if minutes is not None and not minutes > 0:
+        raise ConfigurationError(f"--minutes must be positive, not {minutes:g}")
+    _run_pipeline(
+        pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=jobs, only_report=False, minutes=minutes
+    )
 
 
 @app.command()
@@ -844,7 +854,16 @@ def _echo(text: str, keep: str = "") -> None:
 
 
 def _run_pipeline(
-    name: str, overrides: list[str], *, dry_run: bool, force: bool, as_json: bool, quiet: bool, jobs: int | None, only_report: bool
+    name: str,
+    overrides: list[str],
+    *,
+    dry_run: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    jobs: int | None,
+    only_report: bool,
+    minutes: float | None = None,
 ) -> None:
     from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
 
@@ -870,12 +889,21 @@ def _run_pipeline(
 
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "calibrate", "evaluate", "report"}
     with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+        workshop.until = _until(minutes)
         outcome, made = whole_way(workshop)
         _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})
         if made.failed is not None:
             raise made.failed
-        if not dry_run:
+        if not dry_run and not made.unfinished:
             remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
+
+
+def _until(minutes: float | None) -> float | None:
+    """When trainings have to end, as ``time.monotonic`` reads, so that the report is drawn in time."""
+    if minutes is None:
+        return None
+    seconds = 60.0 * minutes
+    return STARTED + seconds - min(max(30.0, 0.06 * seconds), 0.5 * seconds)
 
 
 def _repeat(finished: Finished, *, dry_run: bool, quiet: bool) -> tuple[Path, Path | None]:

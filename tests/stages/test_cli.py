@@ -23,7 +23,9 @@ from conftest import planar_drive
 from place import DATASET, PIPELINE, Place, write_csv
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
+from vehest.stages import workshop
 from vehest.stages.artefacts import read_artefact
+from vehest.stages.signals import TimeLimit
 from vehest.trust.verdict import reason_in_words
 
 
@@ -344,6 +346,34 @@ def test_truncated_artefact_is_made_again(place):
     assert code == 0
     assert json.loads(out)["skipped"] is False
     assert weights.read_bytes() == whole
+
+
+def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(place, monkeypatch):
+    outputs = place.folder / "outputs"
+
+    class OneEvaluation(TimeLimit):
+        """A time that is up once one evaluation is there."""
+
+        def requested(self) -> bool:
+            return any((outputs / "evaluate").glob("*/manifest.json"))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(workshop, "TimeLimit", OneEvaluation)
+        code, out, err = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+    assert code == 0, err
+    assert "Luenberger" in out
+    assert "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on" in out
+    code, out, _ = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+    assert code == 0
+    assert "not done yet" not in out
+    assert "GRU" in out
+
+
+def test_a_time_in_which_nothing_can_be_done_is_said(place):
+    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none", "--minutes", "0.000001")
+    assert code == 3
+    assert "no estimator was done in this time; the same command goes on with: luenberger-luenberger-seed0" in line
+    assert place.refused("run", "small", "--minutes", "0")[1] == "error: --minutes must be positive, not 0"
 
 
 # --- what must not happen by accident -----------------------------------------------------------------------------

@@ -28,6 +28,7 @@ class Compared:
         facts: how recordings were prepared and what each training scheme was allowed, a line each.
         n_groups: groups of jobs there were.
         failures: name of a group that failed, and why; its members are missing.
+        unfinished: jobs for which no time was left, by name.
     """
 
     members: Sequence[Member]
@@ -36,6 +37,7 @@ class Compared:
     facts: Sequence[str]
     n_groups: int
     failures: Sequence[tuple[str, Failure]]
+    unfinished: Sequence[str] = ()
 
 
 def prepare(configs: Sequence[Config], workshop: Workshop) -> Fitted:
@@ -94,7 +96,8 @@ def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: 
 
     Raises:
         ConfigurationError: the jobs do not fit one comparison.
-        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator.
+        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator; or the time was up before anything
+            was done.
         MissingError: ``only_report`` and something is missing, or raw files are not here.
         NotThereYet: in a dry run.
         Stopped: a signal came.
@@ -112,14 +115,25 @@ def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: 
     if only_report:
         wanted, absent = _finished(groups, command)
         missing += absent
-    members, failures = workshop.run_groups(wanted)
+    found, failures = workshop.run_groups(wanted)
+    members = [member for member in found if member.evaluation is not None]
     order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
     members.sort(key=lambda member: order[member.job.plan.key])
     evaluation = groups[0].evaluation
     assert evaluation is not None
     titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
     facts = [*training_facts(configs), resampling_fact(configs), *prepared.facts]
-    return Compared(members, evaluation, titles, facts, n_groups, [*failures, *missing])
+    unfinished = _unfinished(wanted, members, failures)
+    if unfinished and not members:
+        raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}")
+    return Compared(members, evaluation, titles, facts, n_groups, [*failures, *missing], unfinished)
+
+
+def _unfinished(groups: Sequence[Group], members: Sequence[Member], failures: Sequence[tuple[str, Failure]]) -> list[str]:
+    """Jobs that were neither done nor failed, since the time was up, by name."""
+    done = {member.job.plan.key for member in members}
+    failed = {name for name, _ in failures}
+    return [job.plan.label for group in groups if group.name not in failed for job in group.jobs if job.plan.key not in done]
 
 
 def _finished(groups: Sequence[Group], command: str) -> tuple[list[Group], list[tuple[str, Failure]]]:

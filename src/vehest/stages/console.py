@@ -5,11 +5,13 @@ Names and other text come from files: their control characters are shown as esca
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
 from rich.text import Text
 
 from vehest.data.errors import printable
@@ -27,6 +29,7 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
+MOST_STANDING = 12
 LINE_BREAK = "\n"
 
 
@@ -99,16 +102,34 @@ class Messages:
             TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
         )
-        with Progress(*columns, console=self.console, transient=True, disable=self.quiet or not self.console.is_terminal) as progress:
-            yield Bars(progress)
+        drawn = not self.quiet and self.console.is_terminal
+        bars = Bars(Progress(*columns, console=self.console, disable=not drawn))
+        with Live(bars, console=self.console, transient=True) if drawn else nullcontext():
+            yield bars
 
 
 class Bars:
-    """Progress bars by name."""
+    """Progress bars by name, and above them how those that are done stand to each other."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._tasks: dict[str, TaskID] = {}
+        self._standing: dict[str, tuple[float, ...]] = {}
+        self._header: tuple[str, ...] = ()
+
+    def __rich__(self) -> RenderableType:
+        if not self._standing:
+            return self._progress
+        table = Table(*self._header, box=None, header_style="dim", padding=(0, 2))
+        for name, values in sorted(self._standing.items(), key=lambda row: row[1])[:MOST_STANDING]:
+            table.add_row(Text(printable(name)), *(f"{value:.3f}" for value in values))
+        return Group(table, self._progress)
+
+    def stands(self, name: str, figures: Mapping[str, float]) -> None:
+        """Add one that is done, by its figures; the first of them sorts the rows."""
+        if figures:
+            self._header = ("done so far", *figures)
+            self._standing[name] = tuple(figures.values())
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar; it appears when it is first moved."""

@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.stages.failures import Failure, failure_of
 from vehest.stages.locks import Waiting
-from vehest.stages.signals import StopSignals
+from vehest.stages.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
 
 Outcome = TypeVar("Outcome")
@@ -48,13 +48,13 @@ class Done(Generic[Outcome]):
 Reporter = Callable[[int, Progress | Waiting | None], None]
 
 
-def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[Outcome]]:
     """Run tasks, as many at a time as ``jobs`` says, and yield them as they end.
 
     Args:
         tasks: started in this order.
         jobs: processes; 1 runs everything in this one.
-        stop: when a signal came, running tasks are asked to end and no other is started.
+        stop: when a signal came or the time is up, running tasks are asked to end and no other is started.
         report: called with the task's position and its progress (None when it starts), or what it waits for.
     """
     if min(jobs, len(tasks)) <= 1:
@@ -68,7 +68,7 @@ def default_jobs() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[Outcome]]:
     for position, task in enumerate(tasks):
         if stop.requested():
             return
@@ -78,7 +78,9 @@ def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals, report: Repo
         yield Done(position, outcome)
 
 
-def _launch_in_processes(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals, report: Reporter) -> Iterator[Done[Outcome]]:
+def _launch_in_processes(
+    tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
+) -> Iterator[Done[Outcome]]:
     context = get_context("spawn")
     stopping, messages = context.Event(), context.SimpleQueue()
     pool = ProcessPoolExecutor(

@@ -29,13 +29,24 @@ from vehest.stages.fitting import Fitted
 from vehest.stages.ingest import STAGE as INGEST
 from vehest.stages.ingest import plan_ingest
 from vehest.stages.publishing import Publication, publish_study
-from vehest.stages.report import AbsentPart, PartJob, ReportJob, ShownDatasets, plan_report, prose_of, shown_in_terminal, write_report
+from vehest.stages.report import (
+    AbsentPart,
+    PartJob,
+    ReportJob,
+    ShownDatasets,
+    plan_report,
+    prose_of,
+    shown_in_terminal,
+    verdict_in_terminal,
+    write_report,
+)
 from vehest.stages.study_keys import Keys, keys_of_study
 from vehest.stages.tracking import Tracker
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.artefacts import AbsentDataset
 from vehest.studies.registry import study_module, study_names
 
+NO_TIME = "not done yet: no time was left, the same command goes on"
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
 
 Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
@@ -142,6 +153,8 @@ class PipelineOutcome:
         overview: table of a study in parts, or of recordings alone.
         publication: what is published of it where nothing stands against it.
         left_out: name of what failed, or is not there -> why.
+        unfinished: jobs for which no time was left, by name.
+        verdict: what the study says in words, a line each.
         failed: what the command ends with then.
     """
 
@@ -152,6 +165,8 @@ class PipelineOutcome:
     publication: Publication | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     failed: JobsFailedError | None = None
+    unfinished: tuple[str, ...] = ()
+    verdict: tuple[str, ...] = ()
 
 
 def read_pipeline(name: str) -> Pipeline:
@@ -484,7 +499,7 @@ def datasets_of(pipeline: Pipeline, configs: Configs, workshop: Workshop) -> dic
 
 
 def _part_job(part: Part, compared: Compared) -> PartJob:
-    failed = {name: failure.message for name, failure in compared.failures}
+    failed = {name: failure.message for name, failure in compared.failures} | dict.fromkeys(compared.unfinished, NO_TIME)
     return PartJob(part.title, compared.members, compared.evaluation, compared.data_titles, compared.facts, failed)
 
 
@@ -547,12 +562,23 @@ def _published(
     """
     table, overview = shown_in_terminal(job, report)
     publication = None
-    if pipeline.publish and not overrides and failed is None:
+    unfinished = tuple(name for part in job.parts.values() for name, reason in part.failed.items() if reason == NO_TIME)
+    if pipeline.publish and not overrides and failed is None and not unfinished:
         publication = Publication(pipeline.study, absent, _keys(pipeline, configs, absent, workshop))
     with workshop.messages.off_record():
         folder = None if workshop.dry_run else publish_study(publication, report, workshop.messages)
     left_out = {name: reason for part in job.parts.values() for name, reason in part.failed.items()}
-    return PipelineOutcome(report, pd.DataFrame() if table is None else table, folder, overview, publication, left_out, failed)
+    return PipelineOutcome(
+        report,
+        pd.DataFrame() if table is None else table,
+        folder,
+        overview,
+        publication,
+        left_out,
+        failed,
+        unfinished,
+        tuple(verdict_in_terminal(job)),
+    )
 
 
 def _keys(pipeline: Pipeline, configs: Configs, absent: Mapping[str, str], workshop: Workshop) -> Keys:

@@ -202,6 +202,13 @@ def shown_in_terminal(job: ReportJob, report: Artefact) -> tuple[pd.DataFrame | 
     return None, read_frame(report.folder / OVERVIEW)
 
 
+def verdict_in_terminal(job: ReportJob) -> list[str]:
+    """What a study says in words at its end, a line each; nothing where its module says none."""
+    module = study_module(job.module)
+    lines: list[str] = module.verdict(study_artefacts(job)) if hasattr(module, "verdict") else []
+    return lines
+
+
 def study_artefacts(job: ReportJob) -> StudyArtefacts:
     """What the study module sees."""
     datasets = [

@@ -81,8 +81,9 @@ def shown_of_pipeline(title: str, outcome: PipelineOutcome) -> Shown:
         for test_set, rows_of_set in outcome.leaderboard.groupby("test_set", sort=False)
         if rows_of_set["rmse_sideslip_low"].isna().all()
     ]
-    note = "\n".join([*short, *([note] if note else [])])
-    figures = {"leaderboard": _records(outcome.leaderboard)} | failed
+    note = "\n".join([*short, *([note] if note else []), *outcome.verdict])
+    said = {"verdict": list(outcome.verdict)} if outcome.verdict else {}
+    figures = {"leaderboard": _records(outcome.leaderboard)} | said | failed
     return Shown(tuple(boards), note, "report.html", json.dumps(figures))
 
 

@@ -1,10 +1,12 @@
-"""Ctrl-C and SIGTERM: a fit ends cleanly with the best so far, any other stage is dropped without a trace."""
+"""What ends work early: Ctrl-C and SIGTERM, after which a fit ends cleanly with the best so far and any other stage is dropped without a
+trace, and a time that was given."""
 
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 
 
@@ -64,3 +66,23 @@ class StopSignals:
         self.number = self.number or number
         if not (self._deferred and first):
             raise Stopped(number)
+
+
+class TimeLimit:
+    """Asks to stop as a signal does, or once a time is up; in the end only a signal counts.
+
+    Args:
+        stop: signals.
+        until: reading of ``time.monotonic`` from which on to stop [s]; none for never.
+    """
+
+    def __init__(self, stop: StopSignals, until: float | None) -> None:
+        self._stop, self._until = stop, until
+
+    def requested(self) -> bool:
+        """Whether a signal came, or the time is up."""
+        return self._stop.requested() or (self._until is not None and time.monotonic() >= self._until)
+
+    def deferred(self) -> AbstractContextManager[None]:
+        """As that of the signals."""
+        return self._stop.deferred()

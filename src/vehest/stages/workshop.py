@@ -34,7 +34,7 @@ from vehest.stages.locks import Waiting
 from vehest.stages.publishing import Publication
 from vehest.stages.rates import Note
 from vehest.stages.shown import Shown
-from vehest.stages.signals import StopSignals
+from vehest.stages.signals import StopSignals, TimeLimit
 from vehest.stages.tracking import Tracker
 from vehest.stages.train import HISTORY, learnt_spans, read_fit_metrics
 from vehest.studies.artefacts import read_frame
@@ -59,6 +59,7 @@ class Workshop:
         dry_run: say what would run, run nothing.
         tracker: where runs are logged; none for no tracking.
         tags: what runs are tagged with.
+        until: reading of ``time.monotonic`` from which on no training is begun, and those that run are stopped; none for no limit.
         artefacts: what was found or made so far, by folder.
     """
 
@@ -70,6 +71,7 @@ class Workshop:
     dry_run: bool = False
     tracker: Tracker | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+    until: float | None = None
     artefacts: dict[Path, Artefact] = field(default_factory=dict)
     _made: dict[str, Artefact] = field(default_factory=dict)
     _datasets: dict[str, Config] = field(default_factory=dict)
@@ -225,6 +227,8 @@ class Workshop:
     def run_groups(self, groups: Sequence[Group]) -> tuple[list[Member], list[tuple[str, Failure]]]:
         """Train and evaluate groups, side by side where there are cores; returns members and failures.
 
+        Where the time is up, members lack what was not made; those that were not begun are not among them.
+
         Raises:
             Stopped: a signal came; what was finished stays.
             NotThereYet: in a dry run, if anything would have to be made.
@@ -264,7 +268,7 @@ class Workshop:
                 else:
                     bars.fit(tasks[at].name, progress)
 
-            for done in launch(tasks, self.jobs, self.stop, report):
+            for done in launch(tasks, self.jobs, TimeLimit(self.stop, self.until), report):
                 name = tasks[done.position].name
                 bars.close(name)
                 if isinstance(done.outcome, Failure):
@@ -274,6 +278,8 @@ class Workshop:
                 for member in done.outcome:
                     members.append(member)
                     self._say_made(member)
+                    if member.evaluation is not None:
+                        bars.stands(member.job.plan.label, _shown_errors(member.evaluation))
                     self._track(member, waiting[done.position].evaluation)
         self.stop.raise_if_requested()
         for made in (artefact for member in members for artefact in (member.model, member.calibration, member.evaluation)):
@@ -338,8 +344,7 @@ class Workshop:
         if member.evaluation.skipped:
             self.messages.line("skip", "evaluate", member.evaluation.label, "up to date")
         else:
-            figures = test_figures(member.evaluation)
-            shown = ", ".join(f"{name} {value:.3f}°" for name, value in figures.items() if name.startswith("rmse_sideslip"))
+            shown = ", ".join(f"{name} {value:.3f}°" for name, value in _shown_errors(member.evaluation).items())
             self.messages.line("done", "evaluate", member.evaluation.label, shown)
 
     def say_calibrated(self, calibration: Artefact) -> None:
@@ -378,6 +383,10 @@ class Workshop:
         if self.tracker is not None and not self.tracker.is_tracked(evaluation):
             drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
             self.tracker.log(evaluation, self.tags, test_figures(evaluation), None, drawn)
+
+
+def _shown_errors(evaluation: Artefact) -> dict[str, float]:
+    return {name: value for name, value in test_figures(evaluation).items() if name.startswith("rmse_sideslip")}
 
 
 def test_figures(evaluation: Artefact) -> dict[str, float]:

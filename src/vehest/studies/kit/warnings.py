@@ -27,6 +27,30 @@ def warnings_of(artefacts: PartArtefacts) -> list[str]:
     return [*left_out, *_excitation(artefacts), *_floors(artefacts), *_kinds(artefacts), *_epoch_limits(artefacts)]
 
 
+def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
+    """Why a test set cannot rank estimators, in clauses: hardly any sideslip, or inputs that say little of it; none if it can."""
+    level, found = _level(artefacts, artefacts.split.tests[test_set]), []
+    if level < LITTLE_SIDESLIP:
+        found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
+    bound = min(
+        (
+            metrics["floor_cramer_rao"]
+            for (*_, name), metrics in runs_of(artefacts).items()
+            if name == test_set and "floor_cramer_rao" in metrics
+        ),
+        default=math.nan,
+    )
+    if bound > SILENT * level:
+        found.append(f"what was measured tells sideslip to no better than {bound:.2g}° (Cramér-Rao), where v = 0 errs by {level:.2g}°")
+    return found
+
+
+def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
+    """Root mean square of the reference sideslip, that of a car rolling backwards counted from its tail [deg]."""
+    size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
+    return float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))
+
+
 def _excitation(artefacts: PartArtefacts) -> list[str]:
     found = []
     for test_set, spans in artefacts.split.tests.items():
@@ -56,8 +80,7 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
             )
         if math.isnan(bound):
             continue
-        size = np.degrees(np.abs(_reference(artefacts, spans)["sideslip"]))
-        level = float(np.sqrt(np.mean(np.square(np.minimum(size, 180.0 - size)))))  # of a car that rolls backwards too
+        level = _level(artefacts, spans)
         if bound > SILENT * level:
             found.append(
                 f"Test set `{test_set}` is a silent drive: what the estimators read tells sideslip to no better than {bound:.2g}° "

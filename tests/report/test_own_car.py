@@ -1,0 +1,102 @@
+"""The verdict on a car of one's own: a winner only where there is one, and what more recordings would bring."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_report import drive, study
+
+from vehest.data.store import read_recording, write_recording
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.own_car import documents, not_compared, verdict, verdict_of
+
+
+@pytest.fixture(scope="module")
+def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+    return study(tmp_path_factory.mktemp("study"))
+
+
+def without(part: PartArtefacts, *names: str) -> PartArtefacts:
+    return replace(part, models=[model for model in part.models if model.estimator not in names])
+
+
+def said(part: PartArtefacts) -> str:
+    return " ".join(verdict_of(part, "test").sentences)
+
+
+def test_the_one_below_all_others_is_recommended_with_its_interval_and_what_it_beats(part):
+    words = said(without(part, "luenberger", "gru"))
+    assert "**Use KS-NN linear + bias, P = 2.** Expected RMSE(β) " in words
+    assert "It beats v = 0 and the static map." in words or "It beats the static map and v = 0." in words
+    low, high = (float(text) for text in words.split("(", 2)[2].split(")")[0].split(" to "))
+    assert 0.0 < low < high
+
+
+def test_the_model_of_the_next_commands_is_that_of_the_seed_chosen_on_validation(part):
+    model = verdict_of(without(part, "luenberger", "gru"), "test").model
+    assert model is not None
+    assert (model.estimator, model.seed) == ("ksnn", 1)
+
+
+def test_two_that_are_alike_are_not_told_apart(part):
+    twins = [replace(model, variant="twin", title="Its twin") for model in part.models if model.estimator == "gru"]
+    rows = part.metrics[part.metrics["estimator"] == "gru"].assign(variant="twin")
+    own = without(part, "ksnn", "luenberger")
+    words = said(replace(own, models=[*own.models, *twins], metrics=pd.concat([part.metrics, rows], ignore_index=True)))
+    assert "**No estimator can be called best.**" in words
+    assert "is not told apart from" in words
+    assert "**Use" not in words
+
+
+def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
+    words = said(without(part, "luenberger", "gru", "ksnn"))
+    assert words.startswith("**Nothing beats Static map here**")
+
+
+def test_without_the_baselines_there_is_no_winner(part):
+    assert "**Use" not in said(without(part, "zero", "static_map", "luenberger", "gru"))
+
+
+def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
+    still = drive()
+    file = tmp_path / "lap.parquet"
+    write_recording(replace(still, channels={**still.channels, "vy_ref": 0.01 * still["vy_ref"]}), file)
+    found = verdict_of(replace(part, references={("toy", "lap"): file}), "test")
+    assert found.sentences[0].startswith("**These recordings cannot rank estimators**, because they hardly excite sideslip (")
+    assert found.model is None
+
+
+def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
+    recording = read_recording(part.references["toy", "lap"])
+    minutes = 0.0
+    for start, stop in ((2.0, 40.0), (42.0, 58.0), (60.0, 85.0)):
+        minutes += float((np.abs(recording.cut(start, stop)["ay"]) > 4.0).sum()) / 20.0 / 60.0
+    assert f"Your recordings hold {minutes:.1f} min beyond 4 m/s²: {3 * minutes:.0f} more would halve the interval." in said(part)
+
+
+def test_families_that_lack_channels_are_named_with_them(part):
+    lines = not_compared(replace(part, failed={"lstm-states_5-seed0": "not done yet: no time was left, the same command goes on"}))
+    assert lines[0].startswith("lstm-states_5-seed0: not done yet")
+    assert any(line.startswith("learned_ukf: lacks ") and "motor_speed" in line for line in lines)
+    assert not any(line.startswith(("lstm:", "ksnn:", "zero:")) for line in lines)
+
+
+def test_the_terminal_says_what_the_report_says(part):
+    artefacts = StudyArtefacts(
+        study="toy",
+        title="A toy study",
+        about="",
+        command="vehest run toy",
+        titles={"": ""},
+        parts={"": part},
+        datasets=[],
+        absent=[],
+        absent_datasets=[],
+    )
+    lines = verdict(artefacts)
+    assert lines[0].replace("*", "") in str(documents(artefacts)["report"].blocks[0]).replace("*", "").replace("`", "")
+    model = lines[2].split()[2]
+    assert any(model == own.model_folder.name for own in part.models)
