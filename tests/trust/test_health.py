@@ -261,7 +261,7 @@ def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
     source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
     runs = [source.read(f"iros_hoons_1_with_friction_run_{k}").without_references() for k in (1, 2, 3, 4, 0)]
     model = learn_health(runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0)
-    assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=2e-3)
+    assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=3e-3)
     at_lock = source.read("hoons_all_test_run_21").without_references()  # stays at full lock for 5 s
     found = judged(model, at_lock)
     assert kernel.FROZEN not in {reason_kind(code) for code, status in zip(found.reason, found.status, strict=True) if status > VALID}

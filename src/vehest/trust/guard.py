@@ -27,7 +27,8 @@ PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is believe
 MARGIN = 3.0  # beyond what was seen in training
 LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training says nothing by standing still
 LEAST_RUN = 0.3  # s
-STOP_TOLERANCE = 1e-3  # of the angle at which a steering is at its stop
+STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
+NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
 
 REACHED = {"m/s²": 25.0, "rad/s": 4.0, "rad": 1.0, "m/s": 100.0}
 """Unit -> size that some road car reaches; angular speeds of wheels and the angle of the steering wheel go by their own ranges."""
@@ -160,7 +161,9 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
-    """Where a steering is at its lock, (lower, upper): its extremes in training, if it stayed there for three samples or longer.
+    """Where a steering is at its lock, (lower, upper): where it stayed for three samples in training, within a tenth of its extremes.
+
+    Resampling rings at a stop, so that the extreme itself may lie beyond it.
 
     Args:
         parts: samples of the channel, (T,) each.
@@ -170,10 +173,17 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
-            near = [sign * part >= farthest - STOP_TOLERANCE * abs(farthest) for part in parts]
-            if farthest > 0 and any((at[2:] & at[1:-1] & at[:-2]).any() for at in near):
-                stops[side] = sign * (farthest - STOP_TOLERANCE * abs(farthest))
+            stayed = [_stayed(sign * part, STOP_TOLERANCE * farthest) for part in parts]
+            reached = [value for values in stayed for value in values if value >= NEAR_STOP * farthest]
+            if farthest > 0 and reached:
+                stops[side] = sign * (float(np.median(reached)) - STOP_TOLERANCE * farthest)
     return stops[0], stops[1]
+
+
+def _stayed(values: FloatArray, tolerance: float) -> FloatArray:
+    """Those values that the two before them equal, within a tolerance."""
+    still = np.abs(np.diff(values)) <= tolerance
+    return values[2:][still[1:] & still[:-1]]
 
 
 def _moves(recording: Recording) -> NDArray[np.bool_]:
