@@ -10,7 +10,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -60,7 +62,7 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
         DataError: its files are damaged.
     """
     root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
-    folder = find_model(str(model), root)
+    folder = find_model(str(model), root, partial(warnings.warn, stacklevel=3))
     estimator = _load_model(folder)
     estimator.preparation = preparation_of(folder)
     trust = trust_of(folder, root)

@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -227,7 +227,7 @@ def evaluate(
         typer.Option(
             "--model",
             "-m",
-            help="A model's folder, or the start of its name; without it, the model that the overrides train.",
+            help="A model's folder, or the start of its name, or `pretrained`; without it, the model that the overrides train.",
             autocompletion=_complete_model,
         ),
     ] = None,
@@ -241,9 +241,9 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.stages.artefacts import find, read_artefact
+    from vehest.stages.artefacts import find
     from vehest.stages.comparison import plain_resampling
-    from vehest.stages.estimate import find_model, preparation_of
+    from vehest.stages.estimate import find_model, model_artefact, preparation_of
     from vehest.stages.evaluate import protocol_from_config
     from vehest.stages.evaluate_faults import fault_figures, write_faulted
     from vehest.stages.faults import check_channels, faults_of
@@ -258,9 +258,7 @@ def evaluate(
         split = workshop.split(config)
         if model is not None:
             config = fitted_evaluation(config, workshop)
-            trained = read_artefact(find_model(model, workshop.output))
-            if trained.stage != "train":
-                raise ConfigurationError(f"'{trained.folder}' holds no model but what the stage '{trained.stage}' made")
+            trained = model_artefact(find_model(model, workshop.output, _note))
             rate = trained_rate(trained)
             if not _names("downsample", overrides):
                 config["downsample"] = preparation_of(trained.folder)
@@ -344,7 +342,7 @@ def estimate(
     if out.suffix.lower() not in SUFFIXES:
         raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
     config = _compose("estimate", overrides)
-    folder = find_model(name, Path(config["output"]))
+    folder = find_model(name, Path(config["output"]), _note)
     fitted = load_model(folder)
     downsample = config["downsample"] if _names("downsample", overrides) else preparation_of(folder)
     if out.is_dir():
@@ -366,9 +364,84 @@ def estimate(
     _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
 
 
+def _note(text: str) -> None:
+    typer.echo(f"note: {text}", err=True)
+
+
 def _is_file_name(word: str) -> bool:
     """Whether a word is no override; a file that is there may have an ``=`` in its name."""
     return ("=" not in word and not word.startswith("~")) or Path(word).is_file()
+
+
+@app.command()
+def compare(
+    recording: Annotated[Path, typer.Argument(metavar="FILE", help="A recording with its reference: a table, or with dataset=NAME any.")],
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ESTIMATE]... [OVERRIDES]...",
+            help="Tables with time and v [m/s] or β [rad], made by any tool, or by `vehest estimate`; then key=value …",
+            show_default=False,
+        ),
+    ] = None,
+    models: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=_complete_model
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Score estimates made elsewhere on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
+
+    v = 0 and a static map, fitted on the other half of the drive, stand beside them. Where all estimates are there they are scored, with
+    95 % intervals over blocks of the drive; nothing is called best that is not below all others by more than chance.
+    """
+    from vehest.data.limits import limits_from_config, use_limits
+    from vehest.estimators.model_files import load_model, read_description
+    from vehest.stages.calibrate import trust_of
+    from vehest.stages.compare_files import compare_estimates, read_estimate_table
+    from vehest.stages.estimate import estimate_recording, find_model, preparation_of, read_table
+
+    files = [Path(word) for word in words or [] if _is_file_name(word)]
+    overrides = [word for word in words or [] if not _is_file_name(word)]
+    config = _compose("estimate", overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        drive = read_table(recording, overrides, references=True)
+        estimates = {file.stem: read_estimate_table(file, drive) for file in files}
+        if len(estimates) < len(files):
+            raise ConfigurationError("two estimates have the same file name; rename one, since it names the row")
+        for name in models or []:
+            folder = find_model(name, Path(config["output"]), _note)
+            fitted, trust = load_model(folder), trust_of(folder, Path(config["output"]))
+            about = read_description(folder).about
+            if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
+                typer.echo(f"warning: '{name}' learnt on this recording: its row is no test", err=True)
+            estimates[name] = estimate_recording(fitted, drive.without_references(), preparation_of(folder), trust)
+        found = compare_estimates(drive, estimates)
+    if as_json:
+        _echo(
+            _json({"start": found.start, "stop": found.stop, "rate_hz": found.rate_hz, "rows": found.rows, "verdict": found.verdict}),
+            keep="\n",
+        )
+        return
+    header = ("estimate", "RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0, static map", "RMSE(v) [m/s]", "FVU")
+    _table([*header], [_compared_row(row) for row in found.rows])
+    _echo(f"scored from {found.start:.6g} to {found.stop:.6g} s at {found.rate_hz:g} Hz")
+    _echo(found.verdict)
+
+
+def _compared_row(row: Mapping[str, Any]) -> list[str]:
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    return [
+        str(row["estimate"]),
+        f"{row['rmse_sideslip']:.3f}",
+        f"{low:.3f} … {high:.3f}" if math.isfinite(low) else "–",
+        str(row["against_best"]),
+        f"{row['beats_zero']}, {row['beats_static_map']}",
+        f"{row['rmse_vy']:.3f}",
+        f"{row['fvu']:.3f}",
+    ]
 
 
 @app.command()

@@ -138,7 +138,7 @@ class TabularSource(Source):
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)
-        names = _column_names(file, self.dataset)
+        names = column_names(file, self.dataset)
         columns = identity_columns(names) if self.columns is None else self.columns
         if not columns:
             raise DataError(
@@ -304,7 +304,7 @@ class TabularSource(Source):
 
     def _read_runs(self, file: Path) -> dict[int, slice]:
         column = self.runs if self.runs is not None or self.time is None else self.time.column
-        names = _column_names(file, self.dataset)
+        names = column_names(file, self.dataset)
         if names.count(str(column)) != 1:
             what = "counts" if self.runs is not None else "begins"
             raise DataError(
@@ -342,7 +342,17 @@ def _is_parquet(file: Path) -> bool:
     return file.suffix.lower() in {".parquet", ".pq"}
 
 
-def _column_names(file: Path, dataset: Mapping[str, Any]) -> list[str]:
+def column_names(file: Path, dataset: Mapping[str, Any]) -> list[str]:
+    """Names of a table's columns, in order.
+
+    Args:
+        file: the table.
+        dataset: with ``delimiter``, ``encoding`` and ``skip_rows`` where they are others than a plain CSV's.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, or has too many columns.
+    """
     if _is_parquet(file):
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +16,18 @@ from vehest.alignment.checks import Finding, checks_of_recording
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
-from vehest.data.files import written_aside
+from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import read_description
+from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, read_description
 from vehest.sources.base import read_single
+from vehest.stages.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
+from vehest.stages.train import STAGE as TRAIN
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict
 from vehest.trust.record import Trust, is_elsewhere
@@ -51,12 +55,18 @@ def pretrained_note() -> str:
     return " ".join(read_description(pretrained_folder()).about.note.split())
 
 
-def find_model(name: str, output: Path) -> Path:
+def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
+
+    Of several that fit the newest is taken.
+
+    Args:
+        name: path or start of the name.
+        output: the output root.
+        say: told which one was taken and which others fit.
 
     Raises:
         MissingError: there is none.
-        ConfigurationError: several have that name.
     """
     given = Path(name)
     if given.is_dir():
@@ -69,8 +79,31 @@ def find_model(name: str, output: Path) -> Path:
         listed = f" (there are: {', '.join(known[:8])}{', …' if len(known) > 8 else ''})" if known else "; train one first"
         raise MissingError(f"there is no model '{name}', neither a folder nor in '{output / 'train'}'{listed}")
     if len(found) > 1:
-        raise ConfigurationError(f"'{name}' could be any of: {', '.join(folder.name for folder in found[:8])}; say more of the name")
+        found.sort(key=lambda folder: folder.stat().st_mtime_ns, reverse=True)
+        others = f"{', '.join(folder.name for folder in found[1:4])}{f' and {len(found) - 4} more' if len(found) > 4 else ''}"
+        say(f"'{name}' is taken for {found[0].name}, the newest; it could also be {others}")
     return found[0]
+
+
+def model_artefact(folder: Path) -> Artefact:
+    """A model as an artefact: that of the stage ``train``, or one that came without, such as `pretrained_folder` or what `save` wrote.
+
+    Raises:
+        MissingError: there is no model.
+        DataError: its files are damaged.
+        ConfigurationError: it is what another stage made.
+    """
+    if (folder / MANIFEST).is_file():
+        artefact = read_artefact(folder)
+        if artefact.stage != TRAIN:
+            raise ConfigurationError(f"'{folder}' holds no model but what the stage '{artefact.stage}' made")
+        return artefact
+    about = read_description(folder)
+    outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
+    label = PRETRAINED if folder == pretrained_folder() else folder.resolve().name
+    key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
+    config = {"estimator": dict(about.settings), "train": [], "validation": []}
+    return Artefact(folder, TRAIN, label, key, "complete", outputs, config, {}, skipped=True)
 
 
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:

@@ -40,7 +40,7 @@ from vehest.evaluation.metrics import (
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.stages.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.stages.code_version import code_version
-from vehest.stages.train import file_digest, learnt_spans, read_fit_metrics, recording_file
+from vehest.stages.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
 from vehest.studies.artefacts import read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.record import read_trust
@@ -185,7 +185,7 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     """Estimate and score every range; write estimates, metrics and, in a file of their own, times into ``folder``."""
     estimator = load_model(job.model.folder)
     about = read_description(job.model.folder).about
-    fit = read_fit_metrics(job.model.folder)
+    fit = _fit_of(job.model, estimator)
     if not set(FIT_FIGURES) <= set(fit):
         raise DataError(f"'{job.model.folder}' does not say {', '.join(sorted(set(FIT_FIGURES) - set(fit)))} of its fit; train it again")
     bands = _bands_of(job)
@@ -245,6 +245,13 @@ def _rows(
         ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]
         rows.append((*head, about.seed, metric, repr(float(value)), UNITS[metric], *ends))
     return rows
+
+
+def _fit_of(model: Artefact, estimator: Estimator) -> dict[str, float]:
+    """Figures of a fit; of a model that came without those its number of parameters, and no epochs."""
+    if model.outputs and FIT_METRICS not in model.outputs:
+        return dict.fromkeys(FIT_FIGURES, 0.0) | {"n_parameters": float(estimator.n_parameters)}
+    return read_fit_metrics(model.folder)
 
 
 def _bands_of(job: EvaluateJob) -> Bands | None:

@@ -316,8 +316,8 @@ def _bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[Fau
     if len(unseen):
         held = int((unseen["median"] >= 90.0).sum())
         words = (
-            f"Of the {len(unseen)} faults of this table that the likelihood-ratio test does not see, bands of the median estimator hold 90 % "
-            f"or more under {held}; the lowest such share is {unseen['median'].min():.0f} %, that of the worst estimator "
+            f"Of the {len(unseen)} faults of this table that the likelihood-ratio test does not see, bands of the median estimator hold "
+            f"90 % or more under {held}; the lowest such share is {unseen['median'].min():.0f} %, that of the worst estimator "
             f"{unseen['lowest'].min():.0f} %."
         )
     columns = {
