@@ -1030,11 +1030,11 @@ def _names(group: str, overrides: list[str] | None) -> bool:
 def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
     """The configuration at a rate that the recordings have, and what it trains."""
     from vehest.stages.fitting import fitted_job
-    from vehest.stages.train import plan_train
+    from vehest.stages.starting import plan_training
 
     _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz")
     split, config = workshop.split(config), fitted_job(config, workshop)
-    return config, plan_train(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
+    return config, plan_training(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
 
 
 @contextmanager

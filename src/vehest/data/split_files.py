@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
@@ -15,6 +15,7 @@ from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
+from vehest.data.shortened import shortened
 from vehest.data.splits import VALIDATION, Kept, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
@@ -59,7 +60,8 @@ class RangeFile:
 
 @dataclass(frozen=True)
 class SplitFile:
-    """What conf/split/*.yaml says."""
+    """What conf/split/*.yaml says. ``minutes`` cuts training and validation down to so many in all, as if no more had been recorded with
+    a reference; ``minutes_at`` is the share of them after which these begin."""
 
     name: str = "unnamed"
     title: str | None = None
@@ -69,6 +71,8 @@ class SplitFile:
     tests: dict[str, tuple[RangeFile, ...]] | None = None
     folds: FoldsFile | None = None
     fold: int = 0
+    minutes: float | None = None
+    minutes_at: float = 0.0
 
 
 def _read(config: Any) -> SplitFile:
@@ -119,8 +123,32 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
     """
     told = _read(config)
     ranges = _Ranges(told.name, told.dataset, catalogue)
-    if told.folds is not None:
-        return _folded(told, told.folds, ranges)
+    made = _split_of(told, ranges) if told.folds is None else _folded(told, told.folds, ranges)
+    return made if told.minutes is None else _cut_down(made, told.minutes, told.minutes_at, ranges)
+
+
+def _cut_down(split: Split, minutes: float, at: float, ranges: _Ranges) -> Split:
+    """A split with less to learn from: validation keeps its share of what is left."""
+
+    def bounds_of(span: Span) -> tuple[float, float]:
+        recording = ranges.recording(span.dataset, span.recording)(None)
+        return recording.start_time, recording.end_time
+
+    def length(spans: Sequence[Span]) -> float:
+        return sum(min(span.stop, bounds_of(span)[1]) - max(span.start, bounds_of(span)[0]) for span in spans)
+
+    learnt, stopped = length(split.train), length(split.validation)
+    share = 60.0 * minutes / (learnt + stopped)
+    return replace(
+        split,
+        name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""),
+        train=shortened(split.train, share * learnt, at, bounds_of),
+        validation=shortened(split.validation, share * stopped, at, bounds_of),
+    )
+
+
+def _split_of(told: SplitFile, ranges: _Ranges) -> Split:
+    """Ranges as they are written."""
     return Split(
         name=told.name,
         train=ranges.spans("train", told.train or ()),

@@ -13,7 +13,8 @@ from vehest.stages.failures import Failure, failure_of
 from vehest.stages.faults import all_of, check_channels, faults_of
 from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member, existing, is_finished
-from vehest.stages.train import TrainJob, new_estimator, plan_train
+from vehest.stages.starting import plan_training
+from vehest.stages.train import TrainJob, new_estimator
 from vehest.stages.workshop import NotThereYet, Workshop
 
 
@@ -96,8 +97,7 @@ def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: 
 
     Raises:
         ConfigurationError: the jobs do not fit one comparison.
-        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator; or the time was up before anything
-            was done.
+        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator.
         MissingError: ``only_report`` and something is missing, or raw files are not here.
         NotThereYet: in a dry run.
         Stopped: a signal came.
@@ -124,8 +124,6 @@ def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: 
     titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
     facts = [*training_facts(configs), resampling_fact(configs), *prepared.facts]
     unfinished = _unfinished(wanted, members, failures)
-    if unfinished and not members:
-        raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(unfinished)}")
     return Compared(members, evaluation, titles, facts, n_groups, [*failures, *missing], unfinished)
 
 
@@ -192,7 +190,7 @@ def _groups(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group],
         except DataError as error:
             unplanned[position] = failure_of(error)
             continue
-        job = plan_train(config, split, data)
+        job = plan_training(config, split, data)
         if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
             raise ConfigurationError(
                 f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError
@@ -14,7 +16,7 @@ from vehest.evaluation.metrics import accuracy, score
 from vehest.stages.calibrate import Stretch, learn_trust
 from vehest.stages.config import compose_config
 from vehest.stages.downsample import transforms_of
-from vehest.stages.estimate import prepared_recording, require_estimate
+from vehest.stages.estimate import find_model, prepared_recording, require_estimate
 from vehest.stages.evaluate import protocol_from_config
 from vehest.stages.train import new_estimator
 from vehest.trust.record import Trust
@@ -26,6 +28,8 @@ def train_on(
     """Fit an estimator as conf/train.yaml and overrides describe it, and calibrate it; see `vehest.api.train`."""
     config = compose_config("train", [f"estimator={name}", *overrides])
     model = new_estimator(config["estimator"])
+    if config["training"].get("start_from") is not None:
+        config["training"]["start_from"] = str(find_model(str(config["training"]["start_from"]), Path(config["output"]), warnings.warn))
     training: Any = settings_from_config(model.training_type, config["training"], "training")
     model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
     model.seed(seed)

@@ -57,6 +57,8 @@ def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLi
         stop: when a signal came or the time is up, running tasks are asked to end and no other is started.
         report: called with the task's position and its progress (None when it starts), or what it waits for.
     """
+    if stop.requested():
+        return
     if min(jobs, len(tasks)) <= 1:
         yield from _launch_here(tasks, stop, report)
     else:

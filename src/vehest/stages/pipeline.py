@@ -423,6 +423,9 @@ def run_pipeline(
         failed = failed_in(compared.values(), workshop)
         if failed is not None and not (_shows_failed(pipeline) and any(own.members for own in compared.values())):
             raise failed
+        if not any(own.members for own in compared.values()):
+            left = [name for own in compared.values() for name in own.unfinished]
+            raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(left)}")
         parts = {part.name: _part_job(part, compared[part.name]) for part in pipeline.parts if _has_members(compared, part)}
     job = ReportJob(
         study=pipeline.study,

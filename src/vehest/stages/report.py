@@ -197,7 +197,7 @@ def shown_in_terminal(job: ReportJob, report: Artefact) -> tuple[pd.DataFrame | 
     """The study's leaderboard, one row an estimator and test set, or, where its module gives none, its overview as the report shows it."""
     module = study_module(job.module)
     if hasattr(module, "leaderboard"):
-        table: pd.DataFrame = module.leaderboard(study_artefacts(job).only)
+        table: pd.DataFrame = module.leaderboard(study_artefacts(job).first)
         return table, None
     return None, read_frame(report.folder / OVERVIEW)
 

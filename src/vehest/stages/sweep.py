@@ -24,7 +24,8 @@ from vehest.stages.faults import FaultSettings, all_of, check_channels, chosen_f
 from vehest.stages.fitting import Fitted, fitted
 from vehest.stages.group import Evaluation, Group, Member
 from vehest.stages.pipeline import content_overrides
-from vehest.stages.train import new_estimator, plan_train
+from vehest.stages.starting import plan_training
+from vehest.stages.train import new_estimator
 from vehest.stages.workshop import NotThereYet, Workshop
 from vehest.studies.artefacts import read_frame
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, Value, build, is_of_fault, short_names, shown_value, summary
@@ -251,7 +252,7 @@ def _groups(sweep: Sweep, evaluation: Evaluation, workshop: Workshop) -> tuple[d
             continue
         try:
             data = workshop.data_for(evaluation.split, new_estimator(combination.config["estimator"]).settings.rate_hz, combination.config)
-            jobs = [plan_train({**combination.config, "seed": seed}, evaluation.split, data) for seed in sweep.seeds]
+            jobs = [plan_training({**combination.config, "seed": seed}, evaluation.split, data) for seed in sweep.seeds]
             faults = faults_of(combination.config)
             check_channels(faults, evaluation.split, data)
             together = owners.setdefault(tuple(job.plan.key for job in jobs), [])

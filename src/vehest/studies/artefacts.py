@@ -252,6 +252,11 @@ class StudyArtefacts:
         return part
 
     @property
+    def first(self) -> PartArtefacts:
+        """The first part, or the only one."""
+        return next(iter(self.parts.values()))
+
+    @property
     def metrics(self) -> pd.DataFrame:
         """Metrics of all parts, `METRIC_COLUMNS`; after ``trained_on`` the part, if it has a name: ``sim_two_cars/scheme_1``."""
         return of_parts({name: part.metrics for name, part in self.parts.items()})

@@ -1,7 +1,8 @@
 """The study of a car of one's own: which estimator to trust on it and how far, in words; then the comparison as of any drive.
 
-Used by the pipelines that ``vehest new`` writes. `documents` makes the report, `leaderboard` the table in it, `verdict` what the terminal
-says at the end.
+Used by the pipelines that ``vehest new`` writes. The first part is the comparison on all that was recorded; further ones, with
+``split.minutes``, make the curve of how much reference is needed. `documents` makes the report, `leaderboard` the table in it, `verdict`
+what the terminal says at the end.
 """
 
 from __future__ import annotations
@@ -13,20 +14,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.files import file_name
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Ranking
-from vehest.report.document import REPORT, Document, as_code, as_text
+from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.kit.reference_minutes import blocks_of_curve, curves_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, runs_of, values_of
 from vehest.studies.kit.standing import BASELINE_TITLES, ranking_of
 from vehest.studies.kit.warnings import cannot_rank
 
-TAKES = "split"
+TAKES = "parts"
+SHOWS_FAILED = True
 HARD = 4.0  # m/s², from which on driving says something of the tyres
 PLAIN = (*BASELINES, "kinematic", "data_sheet")
 """Estimators that others have to beat."""
@@ -49,7 +53,7 @@ class Verdict:
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The verdict, then the report of the comparison."""
-    part = artefacts.only
+    part = artefacts.first
     compared = drive.comparison(part)
     told = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _told(part)]
     commands = "\n".join(_commands(part, artefacts.study))
@@ -59,12 +63,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     if absent:
         blocks.append("Not compared:\n\n" + "\n".join(f"- {as_text(line)}" for line in absent))
-    return {REPORT: replace(compared, blocks=[*blocks, *compared.blocks])}
+    curves = curves_of(list(artefacts.parts.values()))
+    learnt = [block for curve in curves for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))]
+    needed: list[Block] = ["## How much reference is needed", *learnt] if learnt else []
+    further = [block for name, other in list(artefacts.parts.items())[1:] for block in drive.appendix_of(name, other)]
+    return {REPORT: replace(compared, title=artefacts.title, blocks=[*blocks, *needed, *compared.blocks, *further])}
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
-    part = artefacts.only
+    part = artefacts.first
     lines = [text.replace("**", "").replace("`", "") for _, text in _told(part)]
     commands = _commands(part, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]

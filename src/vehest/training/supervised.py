@@ -30,6 +30,7 @@ class SupervisedSettings:
         patience: epochs without a better validation loss after which a member stops.
         dtype: ``float32`` or ``float64``.
         compiled: use the compiled recursion where the network has one; plain PyTorch otherwise.
+        start_from: a model, by its folder or the start of its name, or ``pretrained``: its weights are where training starts.
         checkpoint_seconds: time between two checkpoints [s].
     """
 
@@ -39,6 +40,7 @@ class SupervisedSettings:
     patience: int = 25
     dtype: Literal["float32", "float64"] = "float32"
     compiled: bool = True
+    start_from: str | None = None
     checkpoint_seconds: float = 15.0
 
     def __post_init__(self) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +18,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
+from vehest.estimators.model_files import load_model
 from vehest.training.context import FitContext
 from vehest.training.members import predict_members, prepare, random_numbers
 from vehest.training.supervised import SupervisedSettings, train_members
@@ -101,8 +103,11 @@ class WindowedEstimator(Estimator):
         windowed = [member for member in members if isinstance(member, WindowedEstimator)]
         first = windowed[0]
         sets = [windows_of(part, first.channels, TARGET, first.settings.window) for part in (data.train, data.validation)]
+        started = start_weights(first, Path(training.start_from)) if training.start_from is not None else None
         for member in windowed:
             member.network = member._seeded_network(list(data.train), getattr(torch, training.dtype))
+            if started is not None:
+                member.network.load_state_dict({name: tensor.to(getattr(torch, training.dtype)) for name, tensor in started.items()})
         networks = [member.network for member in windowed]
         records = train_members(networks, [member._seed for member in windowed], sets[0], sets[1], training, context)
         return [
@@ -191,6 +196,27 @@ class WindowStepper(Stepper):
         if len(self._window) < self._estimator.settings.window:
             return {"vy": float("nan")}
         return {"vy": float(self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0])}
+
+
+def start_weights(estimator: WindowedEstimator, folder: Path) -> dict[str, Tensor]:
+    """Weights and ranges of another model, to start a training from (fine-tuning).
+
+    Args:
+        estimator: that is to be trained.
+        folder: of a model of the same family and settings.
+
+    Raises:
+        ConfigurationError: it is of another family, or has other settings.
+        MissingError: there is no model.
+        DataError: its files are damaged.
+    """
+    other = load_model(folder)
+    if (other.name, other.settings) != (estimator.name, estimator.settings) or not isinstance(other, WindowedEstimator):
+        raise ConfigurationError(
+            f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
+            f"training starts from a model of the same family and settings, here {estimator.full_title} with {asdict(estimator.settings)}"
+        )
+    return {name: torch.from_numpy(values) for name, values in other.weights().items()}
 
 
 def _check_state(network: nn.Module) -> None:

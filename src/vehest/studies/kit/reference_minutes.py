@@ -1,0 +1,253 @@
+"""How much recording with a reference an estimator needs: its error over the minutes that it learnt on, a learning curve.
+
+Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and ``split.minutes_at``, and in whether trainings
+start from another model (``training.start_from``). Minutes count training and validation together, since both need the sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from vehest.data.splits import Span
+from vehest.data.store import read_recording
+from vehest.evaluation.blocks import Segments
+from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
+from vehest.report.document import Block, Column, Figure, Table, as_text
+from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure, paper_style
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as MatplotlibFigure
+
+SCRATCH = "from scratch"
+
+
+@dataclass(frozen=True)
+class Point:
+    """An estimator after so much reference.
+
+    Args:
+        estimator: its name.
+        variant: its variant.
+        title: for people.
+        start: what its training starts from; `SCRATCH` for nothing.
+        minutes: with reference that it learnt and stopped on, rounded to hundredths.
+        n_trainings: stretches of the drive times seeds.
+    """
+
+    estimator: str
+    variant: str
+    title: str
+    start: str
+    minutes: float
+    n_trainings: int
+
+    @property
+    def name(self) -> Name:
+        """Under which it is ranked."""
+        return (self.estimator, "" if self.estimator in BASELINES[:1] else f"{self.variant}|{self.start}|{self.minutes:g}")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Learning curves on one test set.
+
+    Args:
+        title: of the first of its parts.
+        test_set: that was tested on.
+        points: by estimator, start and minutes.
+        ranking: of all of them.
+    """
+
+    title: str
+    test_set: str
+    points: Sequence[Point]
+    ranking: Ranking
+
+    def interval(self, point: Point) -> tuple[float, float]:
+        """95 % interval of its RMSE(β) [deg]; NaN where the test is too short for one."""
+        return self.ranking.intervals.get(point.name, (math.nan, math.nan))
+
+
+def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
+    """A curve for every test set of parts that share it; test sets with a single amount of reference make none."""
+    groups: dict[tuple[str, tuple[Span, ...]], list[PartArtefacts]] = {}
+    for part in parts:
+        for test_set, spans in part.split.tests.items():
+            groups.setdefault((test_set, tuple(spans)), []).append(part)
+    found = [_curve(test_set, own) for (test_set, _), own in groups.items()]
+    return [curve for curve in found if len({point.minutes for point in curve.points}) > 1]
+
+
+def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
+    models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
+    for part in parts:
+        minutes = round(minutes_of(part), 2)
+        for model in part.models:
+            models.setdefault((model.estimator, model.variant, start_of(model), minutes), []).append(model)
+    counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
+    points = {
+        Point(estimator, variant, as_text(own[0].title), start, minutes, len(own)): own
+        for (estimator, variant, start, minutes), own in models.items()
+        if counts[estimator, variant] > 1 or estimator in BASELINES
+    }
+    segments: dict[Name, list[Segments]] = {}
+    for point, own in points.items():
+        segments.setdefault(point.name, []).extend(model.segments(test_set) for model in own)
+    finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
+    ordered = sorted((point for point in points if point.name in finite), key=lambda p: (p.estimator, p.variant, p.start, p.minutes))
+    asked = [(tuned.name, plain.name) for plain in ordered for tuned in ordered if _same(plain, tuned)]
+    return Curve(as_text(parts[0].title), test_set, ordered, rank(finite, parts[0].protocol.rate_hz, asked=asked))
+
+
+def _same(plain: Point, tuned: Point) -> bool:
+    """Whether two points differ in what their trainings start from alone."""
+    same = (plain.estimator, plain.variant, plain.minutes) == (tuned.estimator, tuned.variant, tuned.minutes)
+    return same and plain.start == SCRATCH != tuned.start
+
+
+def start_of(model: EvaluatedModel) -> str:
+    """What a training started from, for people."""
+    start = model.training.get("start_from")
+    return SCRATCH if start is None else f"from {Path(str(start)).name}"
+
+
+def minutes_of(part: PartArtefacts) -> float:
+    """Minutes of training and validation ranges together."""
+    seconds = 0.0
+    for span in (*part.split.train, *part.split.validation):
+        start, stop = span.start, span.stop
+        if not (math.isfinite(start) and math.isfinite(stop)):
+            recording = read_recording(part.references[span.dataset, span.recording], ["vx"])
+            start, stop = max(start, recording.start_time), min(stop, recording.end_time)
+        seconds += stop - start
+    return seconds / 60.0
+
+
+def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
+    """Sentences, figure and table of a curve; ``name`` ends the files' names."""
+    caption = (
+        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference that were learnt and stopped "
+        f"on; bars are 95 % intervals over blocks of the test and trainings. Dashed: v = 0."
+    )
+    return [
+        _in_words(curve),
+        Figure(f"reference_minutes_{name}", caption, _figure(curve)),
+        Table(
+            f"reference_minutes_{name}",
+            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: stretches of the drive times seeds. The last column: against the "
+            f"same estimator from scratch on as much, corrected by Holm.",
+            pd.DataFrame(rows_of_curve(curve)),
+            {
+                "title": Column("estimator"),
+                "start": Column("training"),
+                "minutes": Column("reference [min]", decimals=2),
+                "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
+                "interval": Column("95 % interval [deg]"),
+                "n_trainings": Column("trainings", decimals=0),
+                "against_scratch": Column("than from scratch"),
+            },
+        ),
+    ]
+
+
+def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
+    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and how it stands to one from scratch."""
+    return [_row(curve, point) for point in curve.points if point.estimator != BASELINES[0]]
+
+
+def _row(curve: Curve, point: Point) -> dict[str, object]:
+    low, high = curve.interval(point)
+    return {
+        "title": point.title,
+        "start": point.start,
+        "minutes": point.minutes,
+        "rmse_sideslip": curve.ranking.rmse[point.name],
+        "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
+        "n_trainings": point.n_trainings,
+        "against_scratch": _against_scratch(curve, point) or "–",
+    }
+
+
+def _against_scratch(curve: Curve, point: Point) -> str:
+    plain = next((other for other in curve.points if _same(other, point)), None)
+    own = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
+    return own.verdict if own is not None else ""
+
+
+def _in_words(curve: Curve) -> str:
+    """What more reference brings to each estimator, and what starting from another model does; only what is more than chance."""
+    sentences = []
+    for key in dict.fromkeys(
+        (point.estimator, point.variant, point.start) for point in curve.points if point.estimator not in BASELINES[:1]
+    ):
+        own = [point for point in curve.points if (point.estimator, point.variant, point.start) == key]
+        if len(own) < 2:
+            continue
+        first, last = own[0], own[-1]
+        how = "" if first.start == SCRATCH else f" ({first.start})"
+        sentences.append(
+            f"{first.title}{how}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
+            f"{fixed(curve.ranking.rmse[last.name], 2)}° after {last.minutes:g} min."
+        )
+    better = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"]
+    worse = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"]
+    if any(_against_scratch(curve, point) for point in curve.points):
+        told = [f"lower by more than chance with {listed(better)} min"] if better else []
+        told += [f"higher with {listed(worse)} min"] if worse else []
+        sentences.append(
+            f"Starting from another model, the error is {' and '.join(told)}."
+            if told
+            else "Starting from another model is not told apart from starting from scratch with any amount."
+        )
+    return f"**{curve.title}.** " + " ".join(sentences)
+
+
+def _figure(curve: Curve) -> MatplotlibFigure:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    ranking = curve.ranking
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.2)
+        axes = figure.subplots()
+        keys = list(
+            dict.fromkeys((point.estimator, point.variant, point.start) for point in curve.points if point.estimator != BASELINES[0])
+        )
+        for shift, key in enumerate(keys):
+            own = [point for point in curve.points if (point.estimator, point.variant, point.start) == key]
+            line = line_of(key[0], key[1])
+            apart = 1.03 ** (shift - len(keys) / 2)
+            minutes, errors = [point.minutes * apart for point in own], [ranking.rmse[point.name] for point in own]
+            dash = "solid" if key[2] == SCRATCH else "dashed"
+            label = own[0].title + ("" if key[2] == SCRATCH else f", {key[2]}")
+            axes.plot(minutes, errors, color=line.colour, linestyle=dash, marker=line.marker, markersize=3.5, linewidth=1.1, label=label)
+            for at, point in zip(minutes, own, strict=True):
+                low, high = curve.interval(point)
+                if math.isfinite(low):
+                    axes.plot([at, at], [low, high], color=line.colour, linewidth=0.8)
+        nothing = next((ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan)
+        if math.isfinite(nothing):
+            axes.axhline(nothing, color="black", linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
+        axes.set_xticks(sorted({round(point.minutes, 1) for point in curve.points}))
+        axes.set_yticks([tick for tick in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0) if _within(tick, axes)])
+        axes.set_xlabel("recording with a reference [min]")
+        axes.set_ylabel("RMSE(β) [deg]")
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=6.5, frameon=False)
+    return figure
+
+
+def _within(tick: float, axes: object) -> bool:
+    low, high = axes.get_ylim()  # type: ignore[attr-defined]
+    return bool(low <= tick <= high)
