@@ -36,14 +36,24 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("vehest")
     runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
-    assert len(runs) == 12
+    assert len(runs) == 13, "12 of stages, and one above them"
+    parent = runs.pop("small")
+    assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
     trained = runs["ksnn-linear_no_bias_p2-seed0"]
+    (learnt,) = trained.inputs.dataset_inputs
+    assert (learnt.dataset.name, learnt.tags[0].value) == ("mine", "training")
+    assert trained.data.tags["mlflow.source.name"].startswith("vehest run small")
     assert trained.data.params["estimator.n_local"] == "2"
     assert trained.data.params["training.learning_rate"] == "0.001"
     assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
     kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
     assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
+    (output,) = client.get_run(trained.info.run_id).outputs.model_outputs
+    (used,) = client.get_run(evaluated.info.run_id).inputs.model_inputs
+    assert output.model_id == used.model_id
+    model = client.get_logged_model(output.model_id)
+    assert (model.model_type, str(model.status)) == ("ksnn", "READY")
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
 
@@ -65,7 +75,7 @@ def _local(place: Place, stage: str = "") -> list:
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
     experiment = client.get_experiment_by_name("vehest")
     runs = client.search_runs([experiment.experiment_id]) if experiment else []
-    return [run for run in runs if not stage or run.data.tags["vehest.stage"] == stage]
+    return [run for run in runs if run.data.tags["vehest.stage"] == stage or (not stage and run.data.tags["vehest.stage"] != "study")]
 
 
 def _markers(place: Place) -> list[str]:
@@ -249,7 +259,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
         assert code == 0, err
         assert "does not answer" not in err
         runs = _runs(client)
-        assert len(runs) == 12
+        assert len(runs) == 13
         trained = runs["ksnn-linear_no_bias_p2-seed1"]
         assert trained.info.status == "FINISHED"
         assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2

@@ -6,7 +6,9 @@ import hashlib
 import json
 import logging
 import os
+import re
 import sqlite3
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -24,6 +26,8 @@ SQLITE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 TRACKED = "tracked"  # folder of the markers
 KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output"
+STUDY_TAG, PARENT_TAG, PARENT = "vehest.study", "mlflow.parentRunId", "study"
+SOURCE_LENGTH = 5000
 UNFINISHED, KILLED = "RUNNING", "KILLED"  # what MLflow calls a run's status
 
 
@@ -127,8 +131,11 @@ class Tracker:
         client = self._connected()
         from mlflow.entities import Metric, Param, RunTag
 
-        run = self._begun(artefact) or client.create_run(self._experiment_id, tags={**self._identity(artefact), **tags})
+        run = self._begun(artefact) or client.create_run(
+            self._experiment_id, tags={**self._identity(artefact), **tags, **self._parent(tags)}
+        )
         run_id, stamp = str(run.info.run_id), run.info.start_time
+        client.log_inputs(run_id, datasets=_datasets(artefact))
         points = [Metric(key, value, stamp, 0) for key, value in metrics.items()]
         points += [Metric(key, value, stamp, step) for key, value, step in _over_epochs(history)]
         parameters = [Param(key, str(value)[:500]) for key, value in _flattened(artefact.config).items()]
@@ -145,8 +152,56 @@ class Tracker:
         for name, drawing in drawings.items():
             if drawing is not None:
                 client.log_figure(run_id, drawing, f"figures/{name}")
+        if artefact.stage == "train" and artefact.status == "complete" and artefact.outputs:
+            self._log_model(artefact, run_id)
+        elif artefact.inputs.get("model"):
+            self._link_model(artefact, run_id)
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else KILLED)
         return run_id
+
+    def _parent(self, tags: Mapping[str, str]) -> dict[str, str]:
+        """The tag that puts a run below that of its study or sweep, which is made with the first of them."""
+        study = tags.get(STUDY_TAG)
+        if study is None:
+            return {}
+        client, root = self._connected(), str(self._output.resolve())
+        quoted = study.replace("'", "''")
+        wanted = f"tags.`{STUDY_TAG}` = '{quoted}' and tags.`{STAGE_TAG}` = '{PARENT}'"
+        found = [run for run in client.search_runs([self._experiment_id], wanted) if run.data.tags.get(OUTPUT_TAG) == root]
+        if found:
+            return {PARENT_TAG: found[0].info.run_id}
+        own = {"mlflow.runName": study, STUDY_TAG: study, STAGE_TAG: PARENT, OUTPUT_TAG: root}
+        made = client.create_run(self._experiment_id, tags=own)
+        client.set_terminated(made.info.run_id, "FINISHED")
+        return {PARENT_TAG: made.info.run_id}
+
+    def _log_model(self, artefact: Artefact, run_id: str) -> None:
+        """The model as an entity of its own, once, that evaluations are linked to."""
+        from mlflow.entities import LoggedModelOutput
+
+        client = self._connected()
+        made = self._models_of(artefact.digest)
+        if not made:
+            name = re.sub(r"[/:.%'\"]", "_", artefact.label)
+            kind = str(_flattened(artefact.config).get("estimator.name", ""))
+            parameters = {key: str(value)[:500] for key, value in list(_flattened(artefact.config).items())[:PARAMETERS]}
+            made = [client.create_logged_model(self._experiment_id, name, run_id, {DIGEST_TAG: artefact.digest}, parameters, kind)]
+            client.log_model_artifacts(made[0].model_id, str(artefact.folder))
+            client.finalize_logged_model(made[0].model_id, "READY")
+        outputs = client.get_run(run_id).outputs
+        if outputs is None or not outputs.model_outputs:
+            client.log_outputs(run_id, [LoggedModelOutput(made[0].model_id, 0)])
+
+    def _link_model(self, artefact: Artefact, run_id: str) -> None:
+        from mlflow.entities import LoggedModelInput
+
+        made = self._models_of(str(artefact.inputs["model"]))
+        inputs = self._connected().get_run(run_id).inputs
+        if made and (inputs is None or not inputs.model_inputs):
+            self._connected().log_inputs(run_id, models=[LoggedModelInput(made[0].model_id)])
+
+    def _models_of(self, digest: str) -> list[Any]:
+        return list(self._connected().search_logged_models([self._experiment_id], filter_string=f"tags.`{DIGEST_TAG}` = '{digest}'"))
 
     def _identity(self, artefact: Artefact) -> dict[str, str]:
         """Tags that say whose run it is, and by them is found again."""
@@ -156,6 +211,9 @@ class Tracker:
             KEY_TAG: artefact.key,
             DIGEST_TAG: artefact.digest,
             "vehest.status": artefact.status,
+            "mlflow.source.name": " ".join(["vehest", *sys.argv[1:]])[:500],
+            "mlflow.source.type": "LOCAL",
+            **({"mlflow.source.git.commit": str(artefact.provenance["commit"])} if artefact.provenance.get("commit") else {}),
             OUTPUT_TAG: str(self._output.resolve()),
         }
 
@@ -211,6 +269,24 @@ def _look_into(store: Path) -> None:
     """
     with closing(sqlite3.connect(f"{regular_file(store).resolve().as_uri()}?mode=rw", uri=True)) as connection:
         connection.execute("select name from sqlite_master").fetchall()
+
+
+def _datasets(artefact: Artefact) -> list[Any]:
+    """Data sets behind an artefact, as MLflow shows them: recordings that it was made from, together one a data set."""
+    from mlflow.entities import Dataset, DatasetInput, InputTag
+
+    digests: dict[str, dict[str, str]] = {}
+    for name, digest in artefact.inputs.items():
+        dataset, slash, recording = name.rpartition("/")
+        if slash and not name.startswith("reference of "):
+            digests.setdefault(dataset, {})[recording] = digest
+    context = InputTag("mlflow.data.context", "training" if artefact.stage == "train" else artefact.stage)
+    found = []
+    for dataset, recordings in digests.items():
+        digest = hashlib.sha256(json.dumps(recordings, sort_keys=True).encode()).hexdigest()[:16]
+        source = json.dumps({"dataset": dataset, "recordings": sorted(recordings)})[:SOURCE_LENGTH]
+        found.append(DatasetInput(Dataset(dataset[:255], digest, "vehest", source), [context]))
+    return found
 
 
 def _sqlite(file: Path) -> str:
