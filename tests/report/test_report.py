@@ -516,7 +516,10 @@ def test_page_loads_nothing_from_anywhere(written: Path) -> None:
     text = (written / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert page.loads, "figures are embedded"
-    assert all(target.startswith("data:") for _, target in page.loads)
+    models = {target for tag, target in page.loads if tag == "a" and not target.startswith("data:")}
+    assert len(models) == len(FAMILIES)
+    assert all(target.startswith("../../") and target.endswith("/model/") for target in models)  # as the folders of this test are called
+    assert all(target.startswith("data:") for _, target in page.loads if target not in models)
     assert not {"link", "iframe", "object", "embed", "base"} & set(page.tags)
     assert page.policy.startswith("default-src 'none'")
     assert "http" not in page.policy
@@ -530,10 +533,10 @@ def test_page_loads_nothing_from_anywhere(written: Path) -> None:
 def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefacts: PartArtefacts, written: Path) -> None:
     page = Page((written / "report.html").read_text(encoding="utf-8"))
     best = leaderboard(artefacts).iloc[0]
-    rows = [row for row in page.rows if row[0] == best["title"]]
-    assert len(rows) == 2  # standing, and seeds
+    rows = [row for row in page.rows if row[0].splitlines()[0] == best["title"]]
+    assert len(rows) == 2  # standing, with links to the model, and seeds
     assert fixed(best["rmse_sideslip"], 3) in rows[0]
-    assert any(row[0] == "GRU | 5 <states>" for row in page.rows)
+    assert any(row[0].splitlines()[0] == "GRU | 5 <states>" for row in page.rows)
     images = [base64.b64decode(target.split(",", 1)[1]) for tag, target in page.loads if tag == "img"]
     assert len(images) == 6
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
@@ -624,8 +627,6 @@ def test_decimation_keeps_peaks_ends_and_gaps() -> None:
 
 
 def test_importing_the_report_package_loads_no_drawing_library() -> None:
-    code = (
-        "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'plotly', 'pandas', 'jinja2'} & set(sys.modules))"
-    )
+    code = "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', 'jinja2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.data.errors import printable
+from vehest.report.explorer import Explorer
 from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
 
 if TYPE_CHECKING:
     import pandas as pd
     from markdown_it import MarkdownIt
     from matplotlib.figure import Figure as MatplotlibFigure
-    from plotly.graph_objects import Figure as PlotlyFigure
 
 PATENT_NOTE = (
     "## Note\n\nThe KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence; "
@@ -29,6 +29,7 @@ PATENT_NOTE = (
 REPORT = "report"
 """Document of a study that one starts with."""
 
+LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
 PNG_COLOURS = 256
 _PATH = re.compile(r'\bd="[^"]*"')
@@ -48,12 +49,27 @@ class Column:
         digits: significant digits of its typical value, from which the decimals of all follow.
         decimals: decimals of every value, instead of ``digits``.
         each: every value has its own decimals, as in a column of different units.
+        bar: columns of the frame with a value and the ends of its interval; the page draws them into the cells, and sorts by the value.
     """
 
     header: str
     digits: int = 3
     decimals: int | None = None
     each: bool = False
+    bar: tuple[str, str, str] | None = None
+
+
+@dataclass(frozen=True)
+class ModelLink:
+    """Where the model behind a row of a table is.
+
+    Args:
+        folder: relative to the page.
+        command: that runs it.
+    """
+
+    folder: str
+    command: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,12 +81,14 @@ class Table:
         caption: Markdown.
         frame: the values, with short names as columns.
         columns: column of the frame -> how it is shown, in this order; all of them, by their own names, if empty.
+        links: a model a row, for the page alone; none if empty.
     """
 
     name: str
     caption: str
     frame: pd.DataFrame
     columns: Mapping[str, Column] = field(default_factory=dict)
+    links: Sequence[ModelLink] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +99,13 @@ class Figure:
         name: file name without ending, as in `Table`.
         caption: Markdown; its first sentence is what those are told who cannot see the figure.
         static: matplotlib figure, for PNG, SVG and print.
-        interactive: plotly figure for the page, where one helps.
+        interactive: what the page draws in its place, to zoom and filter, where that helps.
     """
 
     name: str
     caption: str
     static: MatplotlibFigure
-    interactive: PlotlyFigure | None = None
+    interactive: Explorer | None = None
 
 
 Block: TypeAlias = "str | Table | Figure"
@@ -339,14 +357,10 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             continue
         shared = {"name": block.name, "number": numbers[position], "caption": Markup(markdown.renderInline(_harmless(block.caption)))}
         if isinstance(block, Table):
-            headers, rows, numeric = formatted(block)
-            csv = block.frame.to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
-            blocks.append(
-                {"kind": "table", **shared, "headers": headers, "rows": rows, "numeric": numeric, "csv": _data_uri(csv, "text/csv")}
-            )
+            blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
             alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
-            blocks.append({"kind": "figure", **shared, **alternative, "json": _plotly_json(block.interactive)})
+            blocks.append({"kind": "figure", **shared, **alternative, "json": _json_of(block.interactive)})
     interactive = any(block.get("json") for block in blocks)
     environment = Environment(
         loader=PackageLoader("vehest.report", "templates"),
@@ -361,7 +375,8 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         blocks=blocks,
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),
-        plotly=Markup(_plotly_library()) if interactive else "",
+        plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if interactive else "",
+        plots_style=Markup(_packaged("uplot.css")) if interactive else "",
         missing=MISSING,
     )
 
@@ -372,18 +387,48 @@ def _markdown_parser() -> MarkdownIt:
     return MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
 
 
-def _plotly_json(figure: PlotlyFigure | None) -> Any:
-    """A plotly figure as JSON that can stand inside a script element."""
+def _page_table(table: Table) -> dict[str, Any]:
+    headers, rows, numeric = formatted(table)
+    csv = table.frame.to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
+    barred = {i: column.bar for i, column in enumerate(table.columns.values()) if column.bar}
+    bars = {i: bars_of(*(table.frame[name].tolist() for name in names)) for i, names in barred.items()}
+    cells = [[{"text": text, "bar": bars[i][k] if i in bars else None} for i, text in enumerate(row)] for k, row in enumerate(rows)]
+    return {"headers": headers, "rows": cells, "numeric": numeric, "links": list(table.links), "csv": _data_uri(csv, "text/csv")}
+
+
+def bars_of(values: Sequence[float], lows: Sequence[float], highs: Sequence[float]) -> list[dict[str, Any] | None]:
+    """Where values and the ends of their intervals lie on one axis from zero, in per cent of its length; none where a value is missing.
+
+    The axis ends at the highest, but at `LONGEST_AXIS` times the median value where one lies far beyond; what is longer is ``cut``.
+    """
+    known = [value for value in values if math.isfinite(value)]
+    ends = [high if math.isfinite(high) else value for value, high in zip(values, highs, strict=True) if math.isfinite(value)]
+    if not known or max(ends) <= 0:
+        return [None] * len(values)
+    axis = min(max(ends), LONGEST_AXIS * sorted(known)[len(known) // 2] or max(ends))
+
+    def place(value: float) -> float:
+        return round(100 * min(max(value / axis, 0.0), 1.0), 1)
+
+    return [
+        {
+            "value": value,
+            "at": place(value),
+            "low": place(low if math.isfinite(low) else value),
+            "high": place(high if math.isfinite(high) else value),
+            "cut": max(value, high if math.isfinite(high) else value) > axis * (1 + 1e-9),
+        }
+        if math.isfinite(value)
+        else None
+        for value, low, high in zip(values, lows, highs, strict=True)
+    ]
+
+
+def _json_of(explorer: Explorer | None) -> Any:
+    """An explorer as JSON that can stand inside a script element."""
     from markupsafe import Markup
 
-    return None if figure is None else Markup(figure.to_json().replace("<", "\\u003c"))
-
-
-def _plotly_library() -> str:
-    from plotly.offline import get_plotlyjs
-
-    library: str = get_plotlyjs()
-    return library
+    return None if explorer is None else Markup(explorer.to_json())
 
 
 def _packaged(name: str) -> str:

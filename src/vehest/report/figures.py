@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, on_dark, paper_style, significant
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, paper_style, significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
-    from plotly.graph_objects import Figure as PlotlyFigure
 
 STATIC_POINTS = 500
-INTERACTIVE_POINTS = 6000
 LEAST_SAMPLES = 20
 LOGARITHMIC_FROM = 20.0
 
@@ -197,57 +195,6 @@ def zoom_figure(
     return figure
 
 
-def interactive_traces(
-    time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str, zoom: tuple[float, float]
-) -> PlotlyFigure:
-    """Reference and all estimates, to zoom, scroll and switch on and off; the range slider lies below the sideslip.
-
-    ``layout.meta["views"]`` holds ranges for which the page draws buttons, ``meta["dark"]`` of a trace its colour on a dark page.
-
-    Args:
-        time: [s], shape (K,).
-        reference: measured.
-        estimates: in the order of the legend.
-        time_label: label of the time axis.
-        zoom: a range that deserves a button [s].
-    """
-    import plotly.graph_objects as go
-    from plotly.subplots import make_subplots
-
-    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
-    for rank, source in [*reversed(list(enumerate(estimates, start=2))), (1, reference)]:
-        for row, values in enumerate((source.vy, source.sideslip), start=1):
-            at, shown = decimated(time, values, INTERACTIVE_POINTS)
-            trace = go.Scatter(
-                x=at.astype(np.float32),
-                y=shown.astype(np.float32),
-                mode="lines",
-                name=source.label,
-                legendgroup=source.label,
-                showlegend=row == 1,
-                legendrank=rank,
-                meta={"dark": on_dark(source.line.colour)},
-                line={"color": source.line.colour, "width": 1.8 if source is reference else 1.3, "dash": _plotly_dash(source.line)},
-                hovertemplate="%{y:.2f}",
-            )
-            figure.add_trace(trace, row=row, col=1)
-    figure.update_yaxes(title_text="v [m/s]", row=1, col=1)
-    figure.update_yaxes(title_text="β [deg]", row=2, col=1)
-    figure.update_xaxes(title_text=time_label, rangeslider={"visible": True, "thickness": 0.08}, row=2, col=1)
-    whole = [float(time[0]), float(time[-1])]
-    figure.update_xaxes(range=whole)
-    figure.update_layout(
-        template="none",
-        margin={"l": 50, "r": 34, "t": 12, "b": 40},
-        hovermode="x unified",
-        font={"size": 12},
-        legend={"orientation": "h", "yanchor": "bottom", "y": 1.03, "x": 0, "xanchor": "left"},
-        modebar={"orientation": "v", "bgcolor": "rgba(0,0,0,0)"},
-        meta={"views": {"whole range": whole, f"busiest {zoom[1] - zoom[0]:.0f} s": list(zoom)}},
-    )
-    return figure
-
-
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
     with paper_style():
@@ -392,10 +339,6 @@ def _legend_width(labels: Sequence[str], columns: int) -> float:
     """About how wide a legend of 7 pt gets [in]; its entries fill one column after another."""
     widths = [max(len(label) for label in column) for column in np.array_split(np.array(labels, dtype=object), columns)]
     return sum(0.54 + 0.052 * width for width in widths)
-
-
-def _plotly_dash(line: Line) -> str:
-    return {"solid": "solid", "dashed": "dash", "dotted": "dot", "dashdot": "dashdot"}[line.dash]
 
 
 def _rms(values: FloatArray) -> float:

@@ -143,7 +143,8 @@ def plan_report(job: ReportJob, output: Path) -> StagePlan:
         for member in part.members:
             assert member.model is not None
             assert member.evaluation is not None
-            inputs |= {f"{prefix}{artefact.label}": artefact.digest for artefact in (member.model, member.evaluation)}
+            made = (member.model, member.evaluation, *([member.calibration] if member.calibration is not None else []))
+            inputs |= {f"{prefix}{artefact.label}": artefact.digest for artefact in made}
     return StagePlan(stage=STAGE, label=job.study, config=config, inputs=inputs, code=code_of_report(job.module), output=output)
 
 
@@ -252,6 +253,7 @@ def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
                 model_folder=member.model.folder,
                 evaluation_folder=member.evaluation.folder,
                 training=dict(member.job.training),
+                calibration_folder=member.calibration.folder if member.calibration is not None else None,
             )
         )
     e = part.evaluation

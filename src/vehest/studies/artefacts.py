@@ -79,6 +79,7 @@ class EvaluatedModel:
         model_folder: what the train stage wrote (``history.csv`` in it, where there is one).
         evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence.
         training: how it was trained, as configured.
+        calibration_folder: where trust.yaml lies, if it was calibrated.
     """
 
     estimator: str
@@ -88,6 +89,7 @@ class EvaluatedModel:
     model_folder: Path
     evaluation_folder: Path
     training: Mapping[str, Any] = field(default_factory=dict)
+    calibration_folder: Path | None = None
 
     def history(self) -> pd.DataFrame | None:
         """Training history, one row an epoch (or a search); none if the method has none."""

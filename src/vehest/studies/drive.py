@@ -19,11 +19,13 @@ from vehest.data.splits import TRAINING, VALIDATION, Span
 from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, ModelLink, Table, as_code, as_text
+from vehest.report.explorer import Explorer
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.bands import band_blocks
 from vehest.studies.kit.drives import floors_table, regime_table
+from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
@@ -277,7 +279,7 @@ def _plural(word: str, count: int) -> str:
 
 def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> list[Block]:
     file = re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
-    blocks: list[Block] = [f"## Test set `{test_set}`", *_leaderboard_table(board, f"leaderboard_{file}", test_set)]
+    blocks: list[Block] = [f"## Test set `{test_set}`", *_leaderboard_table(artefacts, board, f"leaderboard_{file}", test_set)]
     lost = board[~np.isfinite(board["rmse_sideslip"])]
     if len(lost):
         blocks.append(f"No finite error, and so not in the figures: {', '.join(lost['title'])}.")
@@ -291,7 +293,7 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
         blocks.append(by_regime)
     blocks.append(_spread(artefacts, finite, test_set, f"spread_{file}", lines))
     shown = _shown(finite)
-    drive = _Drive.of(artefacts, shown, test_set)
+    drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
         blocks.append(
             f"The following figures show {len(shown)} of {len(finite)} estimators: those with the lowest RMSE(v) on the validation range."
@@ -300,7 +302,7 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(drive, shown, file, lines)]
 
 
-def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Block]:
+def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str) -> list[Block]:
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
     decimals = decimals_for(frame["rmse_sideslip"].tolist())
@@ -316,7 +318,7 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
             "title": Column("estimator"),
             "n_parameters": Column("params", decimals=0),
             "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
-            "interval": Column("95 % interval [deg]"),
+            "interval": Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")),
             "against_best": Column("to the lowest [deg]"),
             "beats_zero": Column("beats v = 0"),
             "beats_static_map": Column("beats static map"),
@@ -326,6 +328,7 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
             "fvu": Column("FVU"),
             **({_BOUND: Column("bound [deg]", decimals=decimals)} if frame[_BOUND].notna().any() else {}),
         },
+        _links(artefacts, board),
     )
     seeds = Table(
         f"{name}_seeds",
@@ -346,6 +349,13 @@ def _leaderboard_table(board: pd.DataFrame, name: str, test_set: str) -> list[Bl
         },
     )
     return [standing, seeds]
+
+
+def _links(artefacts: PartArtefacts, board: pd.DataFrame) -> list[ModelLink]:
+    """The chosen seed's model of each row; a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY."""
+    folders = {(model.estimator, model.variant, model.seed): model.model_folder for model in artefacts.models}
+    rows = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
+    return [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in rows]
 
 
 def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: str, lines: dict[Name, Line]) -> Figure:
@@ -378,6 +388,7 @@ class _Drive:
         reference: measured; every array of shape (K,).
         estimates: (estimator, variant) -> estimated.
         zoom: `ZOOM_SECONDS` with the largest mean square of the reference sideslip [s].
+        explorer: all of it and what was measured, for the page.
     """
 
     time: FloatArray
@@ -385,19 +396,25 @@ class _Drive:
     reference: Scored
     estimates: dict[Name, Scored]
     zoom: tuple[float, float]
+    explorer: Explorer
 
     @classmethod
-    def of(cls, artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> _Drive:
+    def of(cls, artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> _Drive:
         """Read the chosen seeds' estimates."""
         models = {(model.estimator, model.variant, model.seed): model for model in artefacts.models}
-        chosen = {(row["estimator"], row["variant"]): row["seed"] for row in board.to_dict("records")}
-        parts = {name: artefacts.scored(models[*name, seed], test_set) for name, seed in chosen.items()}
+        rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
+        shown = {name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()}
+        parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
         step = 1.0 / artefacts.protocol.rate_hz
         joined = {name: _joined(own, step) for name, own in parts.items()}
         first = next(iter(parts.values()))
         reference = next(iter(joined.values()))
         label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
-        return cls(reference.time, label, reference, joined, _busiest(first, reference.time, step))
+        zoom = _busiest(first, reference.time, step)
+        start = float(reference.time[0])
+        begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
+        axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
+        return cls(reference.time, label, reference, joined, zoom, explorer_of(artefacts, test_set, shown, parts, axis))
 
     @property
     def scored(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -414,15 +431,14 @@ def _joined(parts: Sequence[Scored], step: float) -> Scored:
     """Ranges one after another; a single one keeps its times."""
     if len(parts) == 1:
         return parts[0]
-    gap = np.full(_gap_of(parts), np.nan)
+    gap = _gap_of(parts)
 
-    def chained(name: str) -> FloatArray:
-        pieces: list[FloatArray] = [piece for part in parts for piece in (getattr(part, name), gap)]
-        return np.concatenate(pieces[:-1])
+    def over(name: str) -> FloatArray:
+        return chained([getattr(part, name) for part in parts], gap)
 
-    vy = chained("vy")
+    vy = over("vy")
     time: FloatArray = np.arange(len(vy), dtype=np.float64) * step
-    return Scored(time, vy, chained("vy_ref"), chained("sideslip"), chained("sideslip_ref"), chained("ay"))
+    return Scored(time, vy, over("vy_ref"), over("sideslip"), over("sideslip_ref"), over("ay"))
 
 
 def _gap_of(parts: Sequence[Scored]) -> int:
@@ -458,7 +474,7 @@ def _figures_of(drive: _Drive, board: pd.DataFrame, file: str, lines: dict[Name,
             f"traces_{file}",
             "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated (coloured).",
             figures.traces_figure(drive.time, reference, traces, drive.time_label),
-            figures.interactive_traces(drive.time, reference, traces, drive.time_label, drive.zoom),
+            drive.explorer,
         ),
         Figure(
             f"zoom_{file}",

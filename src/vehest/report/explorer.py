@@ -1,0 +1,180 @@
+"""All signals of a test set as data for the page: traces to zoom, the course, and errors over the rows that pass a filter.
+
+Values are kept in 16 bits over their range, as differences between neighbours, compressed: an hour at 20 Hz of eight estimates with their
+bands and ten channels takes some 4 MB of the page. The page unpacks them by itself; sideslip is computed there as everywhere,
+atan2(v, u) with the measured u.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.report.style import Line, on_dark
+
+LEVELS = 65_534
+GAP = 65_535
+"""Code of a value that is not there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """A channel that was measured.
+
+    Args:
+        label: for people.
+        unit: that it is drawn in.
+        values: shape (K,); NaN where there is none.
+        drawn: whether it is drawn before anybody asks.
+    """
+
+    label: str
+    unit: str
+    values: FloatArray
+    drawn: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An estimator in the traces.
+
+    Args:
+        label: its title.
+        line: its looks.
+        vy: estimated lateral velocity [m/s], shape (K,).
+        band_vy: half width of its calibrated 90 % band of v [m/s], (K,), where it has one.
+        band_sideslip: the same of β [deg].
+        health: 0 valid, 1 degraded, 2 invalid, (K,), where it is known.
+    """
+
+    label: str
+    line: Line
+    vy: FloatArray
+    band_vy: FloatArray | None = None
+    band_sideslip: FloatArray | None = None
+    health: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Explorer:
+    """Everything over one uniform time axis; NaN breaks all lines between two ranges.
+
+    Args:
+        start: first time [s].
+        step: between two samples [s].
+        time_label: label of the time axis.
+        zoom: a range that deserves a button [s].
+        vx: measured forward velocity [m/s], shape (K,).
+        vy: reference lateral velocity [m/s], (K,).
+        ay: measured lateral acceleration [m/s²], (K,); None where there is none.
+        inputs: further channels as measured.
+        candidates: in the order of the table.
+        course: x and y of the car [m], (K,) each, where they are known.
+        course_note: how they are known.
+    """
+
+    start: float
+    step: float
+    time_label: str
+    zoom: tuple[float, float]
+    vx: FloatArray
+    vy: FloatArray
+    ay: FloatArray | None
+    inputs: Sequence[Signal]
+    candidates: Sequence[Candidate]
+    course: tuple[FloatArray, FloatArray] | None = None
+    course_note: str = ""
+
+    def to_json(self) -> str:
+        """What the page reads; nothing in it can end a script element."""
+        columns: dict[str, FloatArray | None] = {"vx": self.vx, "vy": self.vy, "ay": self.ay}
+        columns |= {f"input{i}": signal.values for i, signal in enumerate(self.inputs)}
+        for i, own in enumerate(self.candidates):
+            columns |= {f"vy{i}": own.vy, f"bandv{i}": own.band_vy, f"bandb{i}": own.band_sideslip, f"health{i}": own.health}
+        if self.course is not None:
+            columns |= dict(zip(("x", "y"), self.course, strict=True))
+        described, data = packed({name: values for name, values in columns.items() if values is not None})
+        content = {
+            "start": self.start,
+            "step": self.step,
+            "length": len(self.vx),
+            "timeLabel": self.time_label,
+            "zoom": list(self.zoom),
+            "inputs": [{"label": signal.label, "unit": signal.unit, "drawn": signal.drawn} for signal in self.inputs],
+            "candidates": [
+                {"label": own.label, "colour": own.line.colour, "dark": on_dark(own.line.colour), "dash": own.line.dash}
+                for own in self.candidates
+            ],
+            "courseNote": self.course_note,
+            "columns": described,
+            "data": data,
+        }
+        return json.dumps(content, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+
+
+def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:
+    """Columns in 16 bits.
+
+    Returns:
+        Name -> lowest value and the step between two codes, in the order of the data; and the data, base64 of zlib: of each column the low
+        bytes, then the high bytes, of differences between neighbouring codes.
+    """
+    described, parts = {}, []
+    for name, values in columns.items():
+        known = np.isfinite(values)
+        low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
+        scale = (high - low) / LEVELS or 1.0
+        codes = np.full(len(values), GAP, np.uint16)
+        codes[known] = np.round((values[known] - low) / scale).astype(np.uint16)
+        differences = np.diff(codes, prepend=np.uint16(0))  # modulo 2¹⁶
+        parts += [(differences & 0xFF).astype(np.uint8), (differences >> 8).astype(np.uint8)]
+        described[name] = [low, scale]
+    return described, base64.b64encode(zlib.compress(b"".join(part.tobytes() for part in parts), 9)).decode()
+
+
+def unpacked(content: dict[str, Any]) -> dict[str, FloatArray]:
+    """Columns of what `Explorer.to_json` says, as the page reads them."""
+    n = content["length"]
+    raw = np.frombuffer(zlib.decompress(base64.b64decode(content["data"])), np.uint8).reshape(-1, 2, n).astype(np.uint16)
+    codes = np.cumsum(raw[:, 0] + (raw[:, 1] << 8), axis=1, dtype=np.uint16)
+    return {
+        name: np.where(own == GAP, np.nan, low + scale * own.astype(np.float64))
+        for own, (name, (low, scale)) in zip(codes, content["columns"].items(), strict=True)
+    }
+
+
+def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Where the car went, by integrating its velocities from the origin, heading along x; NaN stays a gap, after which it starts anew.
+
+    Args:
+        vx: forward velocity [m/s], shape (K,).
+        vy: lateral velocity [m/s], (K,).
+        yaw_rate: [rad/s], (K,).
+        step: between two samples [s].
+
+    Returns:
+        x and y [m], (K,) each.
+    """
+    x, y = np.full(len(vx), np.nan), np.full(len(vx), np.nan)
+    known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
+    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
+    for first, end in zip(edges[::2], edges[1::2], strict=True):
+        own = slice(first, end)
+        heading = _integral(yaw_rate[own], step)
+        x[own] = _integral(vx[own] * np.cos(heading) - vy[own] * np.sin(heading), step)
+        y[own] = _integral(vx[own] * np.sin(heading) + vy[own] * np.cos(heading), step)
+    return x, y
+
+
+def _integral(values: FloatArray, step: float) -> FloatArray:
+    """By the trapezoidal rule, from zero."""
+    steps = 0.5 * step * (values[1:] + values[:-1])
+    whole: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
+    return whole

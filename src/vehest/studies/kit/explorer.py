@@ -1,0 +1,115 @@
+"""All signals of a test set for the page of a report: what was measured, the reference, estimates with bands and health, the course."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.data.store import read_recording
+from vehest.evaluation.metrics import Scored, pieces_of, scored_range
+from vehest.report.explorer import Candidate, Explorer, Signal, reckoned_course
+from vehest.report.style import Line
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.kit.runs import Name
+from vehest.trust.health import HealthModel, health_rows
+from vehest.trust.record import TRUST, read_trust
+
+MOST_INPUTS = 16
+DRAWN_INPUTS = ("vx", "yaw_rate", "ay", "steer", "handwheel")
+RECKONED = "No positions were recorded: the course is reckoned from speed, reference and yaw rate, and drifts the longer it gets."
+
+
+def explorer_of(
+    artefacts: PartArtefacts,
+    test_set: str,
+    shown: Mapping[Name, tuple[EvaluatedModel, str, Line]],
+    scored: Mapping[Name, Sequence[Scored]],
+    axis: tuple[float, str, int, tuple[float, float]],
+) -> Explorer:
+    """What the page draws of a test set.
+
+    Args:
+        artefacts: of the comparison.
+        test_set: the test set.
+        shown: (estimator, variant) -> model, title and looks, in the order of the board.
+        scored: (estimator, variant) -> estimate and reference of each range, or sequence.
+        axis: first time [s], label of the time axis, samples between two ranges, and a range that deserves a button [s].
+    """
+    start, label, gap, zoom = axis
+    spans = artefacts.split.tests[test_set]
+    pieces = list(pieces_of(spans, lambda span: read_recording(artefacts.references[span.dataset, span.recording]), artefacts.protocol))
+    parts = [_scored_part(recording, piece, artefacts) for recording, piece in pieces]
+
+    def measured(name: str) -> FloatArray:
+        return chained([part[name] if name in part else np.full(len(part), np.nan) for part in parts], gap)
+
+    names = [name for name in CHANNELS if all(name in part for part in parts) and not CHANNELS[name].is_reference]
+    candidates = []
+    for name, (model, title, line) in shown.items():
+        bands = [part.bands for part in scored[name]]
+        band_vy, band_sideslip = (chained([own[q] for own in bands], gap) if all(q in own for own in bands) else None for q in _BANDS)
+        degrees = None if band_sideslip is None else np.degrees(band_sideslip)
+        vy = chained([part.vy for part in scored[name]], gap)
+        candidates.append(Candidate(title, line, vy, band_vy, degrees, health_over(model, pieces, artefacts, gap)))
+    vx, vy_ref, step = measured("vx"), measured("vy_ref"), 1.0 / artefacts.protocol.rate_hz
+    turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if all(name in part for part in parts)), None)
+    return Explorer(
+        start=start,
+        step=step,
+        time_label=label,
+        zoom=zoom,
+        vx=vx,
+        vy=vy_ref,
+        ay=measured("ay") if "ay" in names else None,
+        inputs=[_signal(name, measured(name)) for name in names[:MOST_INPUTS]],
+        candidates=candidates,
+        course=None if turning is None else reckoned_course(vx, vy_ref, measured(turning), step),
+        course_note=RECKONED,
+    )
+
+
+_BANDS = ("vy", "sideslip")
+
+
+def chained(pieces: Sequence[FloatArray], gap: int) -> FloatArray:
+    """Pieces one after another with a gap of NaN between two."""
+    between = np.full(gap, np.nan)
+    parts: list[FloatArray] = [part for piece in pieces for part in (piece, between)]
+    return np.concatenate(parts[:-1])
+
+
+def health_over(model: EvaluatedModel, pieces: Sequence[tuple[Recording, Span]], artefacts: PartArtefacts, gap: int) -> FloatArray | None:
+    """What the health of a model says of the channels that it reads: 0 valid, 1 degraded, 2 invalid, over all ranges.
+
+    None where the model has no health, or reads another rate than that of the evaluation.
+    """
+    if model.calibration_folder is None or not (model.calibration_folder / TRUST).is_file():
+        return None
+    health = read_trust(model.calibration_folder).health
+    if health is None or health.rate_hz != artefacts.protocol.rate_hz:
+        return None
+    if not all(name in recording for recording, _ in pieces for name in health.channels):
+        return None
+    return chained([_health_of(health, recording, piece, artefacts) for recording, piece in pieces], gap)
+
+
+def _health_of(health: HealthModel, recording: Recording, piece: Span, artefacts: PartArtefacts) -> FloatArray:
+    first, end = scored_range(recording, piece, artefacts.protocol)
+    begin = recording.index_range(max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop)[0]
+    rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
+    return health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :]
+
+
+def _scored_part(recording: Recording, piece: Span, artefacts: PartArtefacts) -> Recording:
+    return recording.cut(max(piece.start, recording.start_time) + artefacts.protocol.skip_seconds, piece.stop)
+
+
+def _signal(name: str, values: FloatArray) -> Signal:
+    channel = CHANNELS[name]
+    unit = {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
+    return Signal(name, unit, np.degrees(values) if channel.is_angular else values, name in DRAWN_INPUTS)
