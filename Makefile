@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -41,13 +41,16 @@ run: $(INSTALLED) ## train and compare four families on simulated drives (a few 
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
 test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page"
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
 
 test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow" $(TESTS_$(@:test-%=%))
+
+test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
+	$(BIN)/python -m pytest -m "page and not slow" -rs
 
 TESTS_docs := tests/test_docs.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz

@@ -242,7 +242,7 @@ class Explorer {
     this.panels.replaceChildren();
     const dark = isDark();
     this.rows.forEach((row) => (row.swatch.style.borderTopColor = dark ? row.own.dark : row.own.colour));
-    const drawn = this.candidates.filter((own) => own.drawn);
+    const drawn = this.candidates.filter((own) => own.drawn).reverse(); // the first lies on top
     const measured = { label: "reference", colour: colourOf("ink"), width: 1.8 };
     const lines = (quantity) => drawn.map((own) => ({ label: own.label, colour: dark ? own.dark : own.colour, dash: DASHES[own.dash], values: own[quantity], width: 1.2 }));
     const panels = [
@@ -292,7 +292,7 @@ class Explorer {
       height: last ? height + 48 : height,
       series,
       bands,
-      padding: [6, 8, 0, 0],
+      padding: [6, 18, 0, 0],
       legend: { show: false },
       cursor: { sync: { key: this.sync.key, scales: ["x", null] }, drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false, bind: { dblclick: () => () => this.look(this.whole) } },
       scales: { x: { time: false, min: this.view[0], max: this.view[1] }, y: { range: (_, low, high) => spread(low, high) }, ...options.scales },
@@ -530,7 +530,7 @@ for (const figure of document.querySelectorAll("figure.live")) {
   unpack(content).then((columns) => {
     figure.classList.add("drawn");
     delete content.data;
-    new Explorer(figure.querySelector(".explorer"), content, columns);
+    figure.explorer = new Explorer(figure.querySelector(".explorer"), content, columns);
     figure.dataset.ready = "yes";
   });
 }

@@ -1,0 +1,83 @@
+"""Headless Chromium for tests of pages: starting it, opening a page at a width and in a scheme, what it and axe complain of."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+WIDTHS = (1280, 390)
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+READY_SECONDS = 60.0
+
+
+@contextmanager
+def browser(profile: Path) -> Iterator[Any]:
+    """A browser with a profile of its own; the test is skipped where there is none.
+
+    Args:
+        profile: an empty folder.
+    """
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install 'vehest[dev]'")
+    from selenium.webdriver.chrome.service import Service
+
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium with its chromedriver here: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    started = webdriver.Chrome(options=options, service=Service(driver))
+    try:
+        yield started
+    finally:
+        started.quit()
+
+
+def opened(driver: Any, path: Path, *, width: int = 1280, scheme: str = "light") -> None:
+    """Open a page and wait until all that it draws by itself is drawn.
+
+    Args:
+        driver: of `browser`.
+        path: of the page.
+        width: of the window [px]; a narrow one counts as a phone's.
+        scheme: ``light`` or ``dark``, as the system says.
+    """
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]})
+    driver.get_log("browser")
+    driver.get(path.as_uri())
+    drawn = "return [...document.querySelectorAll('figure.live')].every(figure => figure.dataset.ready)"
+    WebDriverWait(driver, READY_SECONDS, 0.1).until(lambda own: own.execute_script(drawn))
+
+
+def complaints(driver: Any) -> list[str]:
+    """What the browser has written to its console since the page was opened."""
+    return [f"{entry['level']}: {entry['message']}" for entry in driver.get_log("browser")]
+
+
+def axe_violations(driver: Any) -> list[str]:
+    """What axe finds on the page that is open, a line each: rule, and the first element."""
+    pytest.importorskip("axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'")
+    driver.execute_script((files("axe_core_python") / "axe.min.js").read_text(encoding="utf-8"))
+    found = driver.execute_async_script("const done = arguments[arguments.length - 1]; axe.run().then(done)")
+    return [f"{own['id']}: {own['help']}, {own['nodes'][0]['html'][:200]}" for own in found["violations"]]

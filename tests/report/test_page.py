@@ -1,0 +1,199 @@
+"""The page of a report in headless Chromium: what it draws, what its filter says, how it reads with dark and light, wide and narrow."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hour import hour_of_driving
+from test_report import FAMILIES, drive, study
+
+from chromium import WIDTHS, axe_violations, browser, complaints, opened
+from vehest.report.document import Document, write_document
+from vehest.report.explorer import unpacked
+from vehest.studies.drive import comparison, leaderboard
+
+pytestmark = pytest.mark.page
+
+SCHEMES = ("light", "dark")
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with browser(tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Document]:
+    """A comparison whose numbers are known, as a page."""
+    folder = tmp_path_factory.mktemp("toy")
+    artefacts = study(tmp_path_factory.mktemp("study"))
+    document = comparison(artefacts)
+    write_document(document, folder)
+    return folder / "report.html", leaderboard(artefacts), document
+
+
+@pytest.fixture(scope="module")
+def hour(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hour")
+    write_document(hour_of_driving(), folder)
+    return folder / "report.html"
+
+
+def board(driver: Any) -> dict[str, tuple[float, float]]:
+    """What the filter's table says: estimator -> RMSE(β) [deg], RMSE(v) [m/s]."""
+    script = "return [...document.querySelectorAll('.explorer tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
+    return {cells[1]: (float(cells[2]), float(cells[4])) for cells in driver.execute_script(script)}
+
+
+def fill(driver: Any, label: str, value: str) -> None:
+    field = driver.find_element("css selector", f'.explorer input[aria-label="{label}"]')
+    field.clear()
+    field.send_keys(value)
+
+
+def views(driver: Any) -> list[list[float]]:
+    """First and last time that each trace shows [s]."""
+    return driver.execute_script(
+        "return document.querySelector('figure.live').explorer.plots.map(plot => [plot.scales.x.min, plot.scales.x.max])"
+    )
+
+
+def press(driver: Any, text: str) -> None:
+    (button,) = [own for own in driver.find_elements("css selector", ".views button, .filters button") if own.text == text]
+    button.click()
+
+
+def test_errors_over_all_rows_are_those_of_the_leaderboard(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+    path, ranked, _ = toy
+    opened(chromium, path)
+    shown = board(chromium)
+    assert len(shown) == len(FAMILIES)
+    for row in ranked.to_dict("records"):
+        assert shown[row["title"]] == pytest.approx((row["rmse_sideslip"], row["rmse_vy"]), abs=1e-3)
+
+
+def test_errors_over_filtered_rows_are_those_computed_from_the_signals(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+    path, ranked, _ = toy
+    opened(chromium, path)
+    fill(chromium, "speed from [m/s]", "30")
+    fill(chromium, "|ay| from [m/s²]", "4")
+    fill(chromium, "|ay| to [m/s²]", "10")
+    recording = drive()
+    time, vx, vy_ref, ay = recording.time, recording["vx"], recording["vy_ref"], np.abs(recording["ay"])
+    rows = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9) & (vx >= 30) & (ay >= 4) & (ay <= 10)
+    assert 20 < rows.sum() < 400
+    vy = vy_ref + 0.15 * np.sin(3.0 * time + 1 + 0.1)  # the KS-NN of the seed that validation chooses
+    error = np.degrees(np.arctan2(vy, vx) - np.arctan2(vy_ref, vx))[rows]
+    assert board(chromium)["KS-NN linear + bias, P = 2"][0] == pytest.approx(math.sqrt(np.mean(error**2)), abs=1e-3)
+    assert f"{rows.sum()} of" in chromium.find_element("css selector", ".said").text
+    press(chromium, "all rows")
+    assert board(chromium)["KS-NN linear + bias, P = 2"][0] == pytest.approx(ranked.iloc[0]["rmse_sideslip"], abs=1e-3)
+
+
+def test_browser_unpacks_what_was_packed(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+    path, _, document = toy
+    opened(chromium, path)
+    (explorer,) = [block.interactive for block in document.blocks if getattr(block, "interactive", None) is not None]
+    known = unpacked(json.loads(explorer.to_json()))
+    for name in ("vx", "vy", "vy2", "x"):
+        read = chromium.execute_script(f"return [...document.querySelector('figure.live').explorer.columns['{name}']]")
+        assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)
+
+
+def test_all_traces_zoom_together_and_back(chromium: Any, hour: Path) -> None:
+    opened(chromium, hour)
+    assert len(views(chromium)) == 3 + 1 + 3  # v, β and its error; health; three channels
+    for text, view in {"": (0.0, 3599.95), "busiest 20 s": (100.0, 120.0), "whole range": (0.0, 3599.95)}.items():
+        if text:
+            press(chromium, text)
+        assert all(shown == pytest.approx(view) for shown in views(chromium))
+
+
+def test_dragging_over_one_trace_zooms_all(chromium: Any, hour: Path) -> None:
+    from selenium.webdriver import ActionChains
+
+    opened(chromium, hour)
+    over = chromium.find_elements("css selector", ".u-over")[1]
+    wide = over.size["width"]
+    ActionChains(chromium).move_to_element_with_offset(over, -wide // 4, 0).click_and_hold().move_by_offset(
+        wide // 4, 0
+    ).release().perform()
+    for start, stop in views(chromium):
+        assert start == pytest.approx(900.0, abs=30.0)
+        assert stop == pytest.approx(1800.0, abs=30.0)
+
+
+def test_errors_can_be_taken_over_the_stretch_in_view(chromium: Any, hour: Path) -> None:
+    opened(chromium, hour)
+    press(chromium, "busiest 20 s")
+    chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
+    assert chromium.find_element("css selector", ".said").text.startswith("401 of 72000 samples, 20.1 s")
+
+
+def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+    path, ranked, _ = toy
+    opened(chromium, path)
+    header = chromium.find_element("xpath", "//figure[@id='table-leaderboard_test']//th/button[contains(., 'interval')]")
+    header.click()
+    header.click()
+    rows = chromium.find_elements("css selector", "#table-leaderboard_test tbody tr")
+    assert rows[0].text.startswith(ranked.iloc[-1]["title"])
+    button = rows[0].find_element("css selector", "button.command")
+    button.click()
+    assert chromium.find_element("css selector", "#table-leaderboard_test p.command code").text == button.get_attribute("data-command")
+    assert button.get_attribute("data-command").startswith("vehest estimate ")
+    assert rows[0].find_element("css selector", "a").get_dom_attribute("href").startswith("../../")
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium: Any, toy: tuple[Path, Any, Document], scheme: str) -> None:
+    opened(chromium, toy[0], scheme=scheme)
+
+    def paper() -> str:
+        return chromium.execute_script("return getComputedStyle(document.body).backgroundColor")
+
+    grounds = {"light": "rgb(255, 255, 255)", "dark": "rgb(26, 26, 26)"}
+    other = SCHEMES[scheme == "light"]
+    assert paper() == grounds[scheme]
+    chromium.find_element("id", "theme").click()
+    assert paper() == grounds[other]
+    image = chromium.find_element("css selector", "#figure-errors_test img")
+    assert image.value_of_css_property("color-scheme") == other  # by which an SVG image picks its colours
+    chromium.execute_script("localStorage.clear()")
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_page_is_accessible_fits_its_width_and_complains_of_nothing(chromium: Any, hour: Path, toy: Any, width: int, scheme: str) -> None:
+    for path in (hour, toy[0]):
+        opened(chromium, path, width=width, scheme=scheme)
+        assert axe_violations(chromium) == []
+        assert chromium.execute_script("return document.documentElement.scrollWidth") <= width
+        assert complaints(chromium) == []
+
+
+def test_page_shows_the_figure_where_scripts_may_not_run(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+    chromium.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
+    try:
+        chromium.get(toy[0].as_uri())
+        assert chromium.find_element("css selector", "figure.live img.static").is_displayed()
+    finally:
+        chromium.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+
+
+def test_every_script_is_read_by_node_without_complaint(tmp_path: Path) -> None:
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node to check the scripts with")
+    templates = Path(__file__).parents[2] / "src" / "vehest" / "report" / "templates"
+    for script in templates.glob("*.js"):
+        subprocess.run([node, "--check", str(script)], check=True)
