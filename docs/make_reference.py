@@ -1,4 +1,5 @@
-"""Write the pages that are made from the code: docs/reference.md, docs/channels.md, docs/manoeuvres.md, and two tables in README.md.
+"""Write what is made from the code, docs/reference.md, docs/channels.md and docs/manoeuvres.md, and from published results: two tables in
+docs/results.md and what they say of each family in docs/estimators/.
 
 Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
 """
@@ -25,6 +26,21 @@ ACROSS_START = "<!-- across vehicles: made by docs/make_reference.py from result
 ACROSS_END = "<!-- end of across vehicles -->"
 ACROSS_SOURCE = "results/ksnn/tables/overview.csv"
 
+FIGURES_START = "<!-- figures: made by docs/make_reference.py from results -->"
+FIGURES_END = "<!-- end of figures -->"
+BASELINES = ("zero", "static_map")
+FAMILIES = {  # page -> estimators in it, study and figure that show them
+    "baselines": (("zero", "static_map", "kinematic", "data_sheet"), "ferrari_drive", "spread_test"),
+    "luenberger": (("luenberger",), "ferrari_drive", "errors_over_ay_test"),
+    "rational_ekf": ((), "heavy_ekf", "sideslip_ferrari"),
+    "ksnn": (("ksnn",), "ksnn", "figure_6"),
+    "recurrent": (("gru", "lstm"), "ferrari_drive", "zoom_test"),
+    "velocity_networks": (("velocity_gru", "velocity_lstm"), "leave_one_out", "transfer"),
+    "learned_ukf": ((), "learned_ukf", "figure_4_real"),
+    "dugoff_ukf": ((), "cnn_ukf", "figure_6"),
+    "networks_and_ukf": (("sideslip_ffnn",), "cnn_ukf", "figure_7"),
+}
+
 ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
 TABLED = ("estimator", "training", "tracking")
 VERBATIM = ("dataset", "split", "vehicle")
@@ -33,12 +49,13 @@ TYPER_OWN = {"install_completion", "show_completion", "help"}
 
 def pages(root: Path = ROOT) -> dict[Path, str]:
     """Every page that is made here, by its path: what it should hold."""
-    readme = root / "README.md"
+    results = root / "docs" / "results.md"
     return {
         root / "docs" / "reference.md": reference_page(root),
         root / "docs" / "channels.md": channels_page(),
         root / "docs" / "manoeuvres.md": manoeuvres_page(root),
-        readme: with_overview(with_leaderboard(readme.read_text(encoding="utf-8"), root / BOARD_SOURCE), root / ACROSS_SOURCE),
+        results: with_overview(with_leaderboard(results.read_text(encoding="utf-8"), root / BOARD_SOURCE), root / ACROSS_SOURCE),
+        **{root / "docs" / "estimators" / f"{name}.md": family_page(name, root) for name in FAMILIES},
     }
 
 
@@ -86,7 +103,7 @@ def channels_page() -> str:
         _table(("unit", "becomes", "factor"), conversions),
         *_simulated_sensors(),
         "## Metrics",
-        "Names and units in `metrics.csv`; definitions: [estimators.md](estimators.md#metrics).",
+        "Names and units in `metrics.csv`; definitions: [estimators.md](evaluation.md#metrics).",
         _table(("metric", "unit"), [(f"`{name}`", unit) for name, unit in UNITS.items()]),
     ]
     return "\n\n".join(parts) + "\n"
@@ -251,10 +268,96 @@ def _arguments(described: type) -> Iterable[str]:
             yield f"{', '.join(f'`{name}`' for name in names.split(', '))}: {meaning}"
 
 
-def with_leaderboard(readme: str, source: Path) -> str:
-    """The README with the leaderboard that is in results/; as it is where there are no results."""
+def family_page(name: str, root: Path) -> str:
+    """The page of a family with what published studies say of it."""
+    text = (root / "docs" / "estimators" / f"{name}.md").read_text(encoding="utf-8")
+    estimators, study, figure = FAMILIES[name]
+    parts = [*_on_test_sets(estimators, root), *_in_study(study, root), *_shown(study, figure, root)]
+    return _between(text, FIGURES_START, FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _on_test_sets(estimators: Sequence[str], root: Path) -> list[str]:
+    """RMSE(β) with its interval on every test set of `ferrari_drive` and `leave_one_out`, a column a variant, baselines last."""
+    parts = []
+    for study, said in {"ferrari_drive": "learnt on the same drive", "leave_one_out": "learnt on other vehicles only"}.items():
+        files = sorted((root / "results" / study / "tables").glob("leaderboard_*.csv"))
+        own = [row for file in files if not file.stem.endswith("_seeds") for row in _rows(file) if row["rmse_sideslip"]]
+        titles: dict[str, str] = {}
+        for wanted in (*estimators, *(name for name in BASELINES if name not in estimators)):
+            titles |= {_title(row): wanted for row in own if row["estimator"] == wanted}
+        if not any(wanted in estimators for wanted in titles.values()):
+            continue
+        tests: dict[str, dict[str, str]] = {}
+        for row in own:
+            where = f"{row['title']}, {row['test_set']}" if "estimator_title" in row else "Ferrari 250 LM (real), 550 to 700 s"
+            tests.setdefault(where, {})[_title(row)] = f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
+        shown = {where: cells for where, cells in tests.items() if any(titles.get(title) in estimators for title in cells)}
+        parts.append(f"RMSE(β) [deg] with its 95 % interval, {said} ([{study}](../../results/{study}/report.md)):")
+        parts.append(
+            _table(
+                ("test", *titles),
+                [(where, *(cells.get(title, "–") for title in titles)) for where, cells in shown.items()],
+                right=len(titles),
+            )
+        )
+    return parts
+
+
+def _title(row: dict[str, str]) -> str:
+    return row.get("estimator_title") or row["title"]
+
+
+def _in_study(study: str, root: Path) -> list[str]:
+    """The overview of the study that re-creates a family's paper, as far as it has one of its own."""
+    headers = {
+        "heavy_ekf": (
+            "RMSE(β) [deg], the truck **simulated**",
+            {"test": "test", **{key: key for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")}},
+        ),
+        "cnn_ukf": (
+            "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
+            {"part": "learnt on", "candidate": "method", "ours_mse": "MSE", "ours_mse_nonlinear": "MSE_nl", "n_seeds": "seeds"},
+        ),
+        "learned_ukf": (
+            "Weighted squared error of the states, **real** recordings, medians of seeds; D is a tyre that none has seen",
+            {"candidate": "method", "ours_tyre_a": "tyre A", "ours_tyre_d": "tyre D", "n_seeds": "seeds"},
+        ),
+    }
+    rows = _rows(root / "results" / study / "tables" / "overview.csv")
+    if study not in headers or not rows:
+        return []
+    said, columns = headers[study]
+    text = [tuple(_rounded(row[key]) for key in columns) for row in rows]
+    return [f"{said} ([{study}](../../results/{study}/report.md)):", _table(tuple(columns.values()), text)]
+
+
+def _rounded(cell: str) -> str:
+    return f"{float(cell):.3f}" if re.fullmatch(r"-?\d+\.\d+", cell) else cell
+
+
+def _shown(study: str, figure: str, root: Path) -> list[str]:
+    """A published figure with what its report says of it."""
+    report = root / "results" / study / "report.md"
+    found = re.search(rf"!\[([^\]]*)\]\(figures/{figure}\.png\)", report.read_text(encoding="utf-8")) if report.is_file() else None
+    if not found:
+        return []
+    return [
+        f"![{found[1]}](../../results/{study}/figures/{figure}.png)",
+        f"{found[1]} From [results/{study}](../../results/{study}/report.md).",
+    ]
+
+
+def with_leaderboard(page: str, source: Path) -> str:
+    """A page with the leaderboard that is in results/; as it is where there are no results."""
     if not source.is_file():
-        return readme
+        return page
     with open(source, newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     lines = [
@@ -281,13 +384,13 @@ def with_leaderboard(readme: str, source: Path) -> str:
         "FVU",
     )
     table = _table(header, lines, right=7)
-    return _between(readme, BOARD_START, BOARD_END, table)
+    return _between(page, BOARD_START, BOARD_END, table)
 
 
-def with_overview(readme: str, source: Path) -> str:
-    """The README with what the study across vehicles came to; as it is where there are no results."""
+def with_overview(page: str, source: Path) -> str:
+    """A page with what the study across vehicles came to; as it is where there are no results."""
     if not source.is_file():
-        return readme
+        return page
     with open(source, newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     lines = []
@@ -298,7 +401,7 @@ def with_overview(readme: str, source: Path) -> str:
         "estimator",
         *(f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")),
     )
-    return _between(readme, ACROSS_START, ACROSS_END, _table(header, lines, right=len(header) - 1))
+    return _between(page, ACROSS_START, ACROSS_END, _table(header, lines, right=len(header) - 1))
 
 
 def _between(text: str, start: str, end: str, content: str) -> str:

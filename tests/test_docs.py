@@ -37,7 +37,12 @@ from vehest.studies.artefacts import METRIC_COLUMNS
 pytestmark = pytest.mark.apart
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "estimators").glob("*.md")),
+]
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…")
 STUDY = ROOT / "results" / "ferrari_drive"
 
@@ -76,12 +81,12 @@ def test_generated_pages_are_up_to_date():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is not what the code says; run 'make docs'"
 
 
-def test_leaderboard_in_readme_follows_the_results(tmp_path):
+def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     source = tmp_path / "leaderboard.csv"
     columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
-    made = generator().with_leaderboard(page("README.md"), source)
+    made = generator().with_leaderboard(page("docs/results.md"), source)
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
     assert f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |" in made
     assert made.count("<!-- end of leaderboard -->") == 1
@@ -283,7 +288,7 @@ def test_wrong_command_lines_would_be_noticed(line):
 
 def test_readme_names_the_patent_and_the_licence():
     assert "PCT/IT2023/050058" in page("README.md")
-    assert "PCT/IT2023/050058" in page("docs/estimators.md")
+    assert "PCT/IT2023/050058" in page("docs/estimators/ksnn.md")
     assert "(LICENSE)" in page("README.md")
 
 
@@ -303,7 +308,9 @@ def test_citation_names_seven_papers():
 
 
 def test_pages_know_every_name():
-    data, estimators, cli = page("docs/data.md"), page("docs/estimators.md"), page("docs/cli.md")
+    data, evaluation, cli = page("docs/data.md"), page("docs/evaluation.md"), page("docs/cli.md")
+    overview = page("docs/estimators.md")
+    families = "".join(page(f"docs/estimators/{name}.md") for name in re.findall(r"\(estimators/(\w+)\.md\)", overview))
     for source in source_names():
         own = page(f"docs/sources/{source}.md")
         assert f"(sources/{source}.md)" in data
@@ -312,9 +319,12 @@ def test_pages_know_every_name():
     named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated", "offset", "dropout", "reverse"}
     for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
         assert f"`{name}`" in data, f"docs/data.md does not explain {name}"
-    for name in {*estimator_names(), *UNITS}:
-        assert f"`{name}`" in estimators, f"docs/estimators.md does not explain {name}"
-    assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(estimators.split())
+    for name in estimator_names():
+        assert f"`{name}`" in overview, f"docs/estimators.md does not name {name}"
+        assert f"`{name}`" in families, f"no page of docs/estimators explains {name}"
+    for name in UNITS:
+        assert f"`{name}`" in evaluation, f"docs/evaluation.md does not explain {name}"
+    assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(evaluation.split())
     for name in {*(field.name for kind in (PipelineFile, PartFile) for field in fields(kind)), *GROUPS}:
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
@@ -354,13 +364,13 @@ def test_stated_limits_of_checks_are_those_of_the_code():
 @pytest.mark.parametrize("name", ["gru", "lstm"])
 def test_stated_parameter_counts_of_recurrent_networks(name):
     counts = [estimator_class(name).from_config({"n_states": states}).n_parameters for states in range(2, 7)]
-    row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators.md"), re.MULTILINE)
+    row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators/recurrent.md"), re.MULTILINE)
     assert row is not None
     assert [int(cell) for cell in row[1].split("|")] == counts
 
 
 def test_stated_parameter_counts_of_the_ksnn():
-    rows = re.findall(r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)", page("docs/estimators.md"), re.MULTILINE)
+    rows = re.findall(r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)", page("docs/estimators/ksnn.md"), re.MULTILINE)
     assert len(rows) == 4
     for overrides, count in rows:
         (job,) = expand(["estimator=ksnn", *overrides.split()])

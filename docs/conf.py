@@ -1,0 +1,42 @@
+"""The documentation site: Sphinx with MyST over docs/, the reports in results/ and the changelog (`make docs-site`).
+
+The root of the repository is the source folder, so that links between docs/ and results/ are the same on the site and in a checkout.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+project = "vehest"
+author = "the authors of vehest"
+copyright = "the authors of vehest, MIT licence"
+release = re.findall(r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "version.py").read_text(encoding="utf-8"))[0]
+
+extensions = ["myst_parser", "sphinx_copybutton"]
+root_doc = "docs/index"
+include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md"]
+exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines", "benchmarks", "docs/examples"]
+
+myst_heading_anchors = 5
+myst_enable_extensions = ["colon_fence"]
+nitpicky = True
+suppress_warnings: list[str] = []
+highlight_language = "text"
+copybutton_prompt_text = r"\$ "
+copybutton_prompt_is_regexp = True
+
+html_theme = "furo"
+html_title = f"vehest {release}"
+html_copy_source = False
+html_show_sourcelink = False
+html_extra_path = ["site"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_theme_options = {
+    "light_css_variables": {"color-brand-primary": "#0b4f9c", "color-brand-content": "#0b4f9c", "color-brand-visited": "#0b4f9c"},
+    "dark_css_variables": {"color-brand-primary": "#8cc4f5", "color-brand-content": "#8cc4f5", "color-brand-visited": "#8cc4f5"},
+    "navigation_with_keys": True,
+}
