@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -83,6 +83,10 @@ reference: $(INSTALLED)
 docs-site: $(INSTALLED) ## a site of all pages in build/site, every warning an error, every local link tried
 	$(BIN)/sphinx-build -q -W --keep-going -b html -c docs . build/site
 	$(BIN)/python docs/check_site.py build/site
+
+screenshots: $(INSTALLED) docs-site ## pictures of the quickstart's page and of the site, in docs/images; needs Chromium
+	$(BIN)/vehest run quickstart tracking=none
+	PYTHONPATH=tests $(BIN)/python tests/screenshots.py "$$(ls -td "$${VEHEST_OUTPUT:-outputs}"/report/quickstart-*/ | head -1)report.html" build/site docs/images
 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml

@@ -35,6 +35,7 @@ html_show_sourcelink = False
 html_extra_path = ["site"]
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_theme_options = {
     "light_css_variables": {"color-brand-primary": "#0b4f9c", "color-brand-content": "#0b4f9c", "color-brand-visited": "#0b4f9c"},
     "dark_css_variables": {"color-brand-primary": "#8cc4f5", "color-brand-content": "#8cc4f5", "color-brand-visited": "#8cc4f5"},

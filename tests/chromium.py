@@ -75,9 +75,9 @@ def complaints(driver: Any) -> list[str]:
     return [f"{entry['level']}: {entry['message']}" for entry in driver.get_log("browser")]
 
 
-def axe_violations(driver: Any) -> list[str]:
-    """What axe finds on the page that is open, a line each: rule, and the first element."""
+def axe_violations(driver: Any, within: str = "html") -> list[str]:
+    """What axe finds on the page that is open, or in a part of it, a line each: rule, and the first element."""
     pytest.importorskip("axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'")
     driver.execute_script((files("axe_core_python") / "axe.min.js").read_text(encoding="utf-8"))
-    found = driver.execute_async_script("const done = arguments[arguments.length - 1]; axe.run().then(done)")
+    found = driver.execute_async_script("const done = arguments[arguments.length - 1]; axe.run(arguments[0]).then(done)", within)
     return [f"{own['id']}: {own['help']}, {own['nodes'][0]['html'][:200]}" for own in found["violations"]]

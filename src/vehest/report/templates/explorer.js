@@ -292,7 +292,7 @@ class Explorer {
       height: last ? height + 48 : height,
       series,
       bands,
-      padding: [6, 18, 0, 0],
+      padding: [6, 18, last ? 0 : 6, 0],
       legend: { show: false },
       cursor: { sync: { key: this.sync.key, scales: ["x", null] }, drag: { x: true, y: false, setScale: false }, points: { show: false }, y: false, bind: { dblclick: () => () => this.look(this.whole) } },
       scales: { x: { time: false, min: this.view[0], max: this.view[1] }, y: { range: (_, low, high) => spread(low, high) }, ...options.scales },

@@ -1,0 +1,46 @@
+"""Pictures of a report's page and of the site as they look in Chromium: `make screenshots`."""
+
+from __future__ import annotations
+
+import base64
+import io
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from chromium import browser, opened
+
+LOOKS = {1280: 1.0, 390: 2.0}  # width [px] -> pixels of the picture for one of the page
+HEIGHTS = {1280: 1150, 390: 1500}
+SCHEMES = ("light", "dark")
+SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"}
+
+
+def picture(driver: Any, top: float, width: int, path: Path) -> None:
+    """A part of the page that is open, from ``top`` down, in few colours."""
+    clip = {"x": 0, "y": top, "width": width, "height": HEIGHTS[width], "scale": LOOKS[width]}
+    shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})["data"]
+    with Image.open(io.BytesIO(base64.b64decode(shot))) as image:
+        image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def main(report: Path, site: Path, out: Path) -> None:
+    """Write ``report_*`` (leaderboard), ``traces_*`` (traces, course, filter) and ``site_*`` at both widths, light and dark."""
+    out.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as driver:
+        for width in LOOKS:
+            for scheme in SCHEMES:
+                opened(driver, report.resolve(), width=width, scheme=scheme)
+                for name, selector in {"report": "h2", "traces": "figure.live"}.items():
+                    script = f"return document.querySelector('{selector}').getBoundingClientRect().top + scrollY"
+                    picture(driver, driver.execute_script(script), width, out / f"{name}_{width}_{scheme}.png")
+                for name, page in SITE.items():
+                    opened(driver, (site / page).resolve(), width=width, scheme=scheme)
+                    picture(driver, 0, width, out / f"{name}_{width}_{scheme}.png")
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))

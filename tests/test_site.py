@@ -1,0 +1,69 @@
+"""The documentation site: it builds without a warning, its links lead somewhere, and it reads well in a browser."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from chromium import WIDTHS, axe_violations, browser, complaints, opened
+
+ROOT = Path(__file__).resolve().parents[1]
+SHOWN = ("docs/index.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
+
+
+def broken_links(site: Path) -> list[str]:
+    spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "check_site.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.broken_links(site)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("furo", reason="the site's tools are not installed: pip install 'vehest[docs]'")
+    folder = tmp_path_factory.mktemp("site")
+    strict = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-c", str(ROOT / "docs")]
+    done = subprocess.run([*strict, str(ROOT), str(folder)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with browser(tmp_path_factory.mktemp("profile")) as driver:
+        yield driver
+
+
+def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path: Path) -> None:
+    folder = tmp_path / "site"
+    folder.mkdir()
+    (tmp_path / "outside.html").write_text("", encoding="utf-8")
+    (folder / "other.html").write_text('<h1 id="there">x</h1>', encoding="utf-8")
+    links = ("other.html", "other.html#there", "#here", "https://example.org/x", "gone.html", "other.html#gone", "../outside.html", "#gone")
+    text = "".join(f'<a href="{link}">x</a>' for link in links)
+    (folder / "index.html").write_text(f'<p id="here">{text}</p><img src="gone.png">', encoding="utf-8")
+    assert [line.split(": ")[1] for line in broken_links(folder)] == [*links[4:], "gone.png"]
+
+
+@pytest.mark.page
+def test_every_local_link_of_the_site_leads_somewhere(site: Path) -> None:
+    assert len(list(site.rglob("*.html"))) > 40
+    assert broken_links(site) == []
+
+
+@pytest.mark.page
+@pytest.mark.parametrize(("width", "scheme"), zip(WIDTHS, ("light", "dark"), strict=True))
+@pytest.mark.parametrize("name", SHOWN)
+def test_pages_are_accessible_and_fit_their_width(chromium: Any, site: Path, name: str, scheme: str, width: int) -> None:
+    opened(chromium, site / name, width=width, scheme=scheme)
+    assert axe_violations(chromium, "article") == []  # what stands around it is the theme's
+    assert chromium.execute_script("return document.documentElement.scrollWidth") <= width
+    assert complaints(chromium) == []
