@@ -15,7 +15,7 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -117,6 +117,9 @@ leave_one_out: $(INSTALLED) ## each vehicle tested by estimators that learnt on 
 
 sim_to_real: $(INSTALLED) ## from simulated cars to the real Ferrari; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/sim_to_real.yaml
+
+reference_minutes: $(INSTALLED) ## how many minutes of reference an estimator needs; needs VEHEST_DATA (half an hour on two cores)
+	$(BIN)/vehest run pipelines/reference_minutes.yaml
 
 trust: $(INSTALLED) ## how far estimates can be trusted: bands, faults; needs VEHEST_DATA, and an hour
 	$(BIN)/vehest run pipelines/trust.yaml
