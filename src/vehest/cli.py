@@ -390,8 +390,8 @@ def replay(
         str,
         typer.Option(
             "--signals",
-            help="CHANNEL=MESSAGE.SIGNAL, separated by commas, for signals that are not called like channels; a minus before the signal where "
-            "it counts the other way than ISO 8855, :UNIT behind it where the DBC says none.",
+            help="CHANNEL=MESSAGE.SIGNAL, separated by commas, for signals that are not called like channels; a minus before the signal "
+            "where it counts the other way than ISO 8855, :UNIT behind it where the DBC says none.",
         ),
     ] = "",
     speed: Annotated[str, typer.Option("--speed", help="Times real time, or max: as fast as it goes.")] = "1",
