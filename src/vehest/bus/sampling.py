@@ -23,7 +23,7 @@ GAIN = 0.02
 WHOLE = 0.05
 """Share of a cycle by which a message's period may differ from whole cycles, for its phase to count."""
 
-PLAIN = 0.02
+PLAIN = 5e-3
 SLACK = 1e-9
 
 
@@ -33,7 +33,7 @@ class Timing:
 
     Args:
         rate_hz: of the samples.
-        periods: channel -> median interval between its values [s].
+        periods: channel -> interval between its values [s].
         clock: channel whose frames tell the sender's clock.
         offset: from the arrival of those to the instant of the sample [s].
         start: instant of the first sample [s].
@@ -56,7 +56,7 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     Raises:
         ConfigurationError: a rate that is no rate.
     """
-    periods = {name: float(np.median(np.diff(times))) for name, times in stamps.items()}
+    periods = {name: _period(np.diff(times)) for name, times in stamps.items()}
     clock = min(periods, key=lambda name: periods[name])
     if not all(period > 0 for period in periods.values()):
         raise ConfigurationError("frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which")
@@ -71,6 +71,14 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     first = max(times[0] for times in stamps.values() if len(times))
     start = first + (middle - first) % cycle
     return Timing(rate_hz, periods, clock, offset, start)
+
+
+def _period(steps: FloatArray) -> float:
+    """The interval behind stamps that jitter [s]: the mean, a gap counting as the frames that it lacks."""
+    period = float(np.median(steps))
+    for _ in range(3 if period > 0 else 0):
+        period = float(steps.sum() / np.maximum(np.rint(steps / period), 1.0).sum())
+    return period
 
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
