@@ -6,10 +6,12 @@ lines of text, and of a BLF file every object, container and what that unpacks t
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -42,7 +44,7 @@ def frames_of(file: Path) -> Iterator[Any]:
     check_log(file)
     count = 0
     try:
-        with _opened(file, suffix) as reader:
+        with _speechless(), _opened(file, suffix) as reader:
             for frame in reader:
                 count += 1
                 check_limit("samples", count, f"'{file}' holds {count} frames or more")
@@ -73,6 +75,18 @@ def check_log(file: Path) -> None:
         _check_blf(file)
     else:
         check_size(file, 1, LONGEST_LINE)
+
+
+@contextmanager
+def _speechless() -> Iterator[None]:
+    """Keep python-can from printing a line for every object that it does not know."""
+    logger = logging.getLogger("can.io")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _opened(file: Path, suffix: str) -> Any:
