@@ -8,9 +8,10 @@ import sys
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -202,8 +203,10 @@ class _Run:
         self.receiver.advance(last + self.receiver.sampler.cycle)
 
     def _in_real_time(self) -> None:
+        frames = self._frames()
+        head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
-        thread = threading.Thread(target=self._send_in_time, name="sender", daemon=True)
+        thread = threading.Thread(target=self._send_in_time, args=(chain([head] if head else [], frames),), name="sender", daemon=True)
         thread.start()
         receiver, sampler = self.receiver, self.receiver.sampler
         try:
@@ -221,11 +224,11 @@ class _Run:
         if self.failure is not None:
             raise self.failure
 
-    def _send_in_time(self) -> None:
+    def _send_in_time(self, frames: Iterable[Any]) -> None:
         """The sender's thread: each frame at its time; between them what others sent is taken off the bus."""
         last = self.first
         try:
-            for frame in self._frames():
+            for frame in frames:
                 due = self.begin + (frame.timestamp - self.first) / self.speed
                 while (left := due - time.time()) > 0:
                     if self.over.is_set():
@@ -274,7 +277,7 @@ def _two_buses(bus: Bus, signals: BusSignals) -> Iterator[tuple[Any, Any]]:
         raise MissingError("CAN needs the packages python-can and cantools; pip install 'vehest[bus]'") from None
     options: dict[str, Any] = {"interface": bus.interface, "channel": bus.channel}
     if bus.interface == "virtual":
-        options["preserve_timestamps"] = bus.speed is None
+        options |= {"preserve_timestamps": bus.speed is None, "ignore_config": True}
     mask = {False: 0x7FF, True: 0x1FFFFFFF}
     filters: Any = [
         {"can_id": identifier, "can_mask": mask[extended], "extended": extended} for identifier, extended in signals.database.messages
