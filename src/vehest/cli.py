@@ -424,7 +424,8 @@ def replay(
     with stop.installed(), stop.deferred():
         outcome = replay_log(words, overrides or [], stop.requested)
     _say(as_json, outcome)
-    stop.raise_if_requested()
+    if stop.number is not None:
+        raise typer.Exit(128 + stop.number)
 
 
 def _is_file_name(word: str) -> bool:
