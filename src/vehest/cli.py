@@ -422,7 +422,7 @@ def replay(
     words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
     stop = StopSignals()
     with stop.installed(), stop.deferred():
-        outcome = replay_log(words, overrides or [], stop.requested)
+        outcome = replay_log(words, overrides or [], stop.requested, _note)
     _say(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)

@@ -42,13 +42,19 @@ class ReplayWords:
     quiet: bool = True
 
 
-def replay_log(words: ReplayWords, overrides: Sequence[str] = (), stopped: Callable[[], bool] = lambda: False) -> dict[str, Any]:
+def replay_log(
+    words: ReplayWords,
+    overrides: Sequence[str] = (),
+    stopped: Callable[[], bool] = lambda: False,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
     """Replay a log and let a model estimate; returns its figures.
 
     Args:
         words: what was asked for.
         overrides: of conf/estimate.yaml.
         stopped: whether to end early.
+        say: which of several models of a name was taken.
 
     Raises:
         ConfigurationError: words that make no sense together.
@@ -62,7 +68,7 @@ def replay_log(words: ReplayWords, overrides: Sequence[str] = (), stopped: Calla
     if words.out is not None:
         check_output(words.out)
     config = compose_config("estimate", [*([f"dataset={words.dataset}"] if words.dataset else []), *overrides])
-    folder = find_model(words.model, Path(config["output"]))
+    folder = find_model(words.model, Path(config["output"]), say)
     model, trust = load_model(folder), trust_of(folder, Path(config["output"]))
     with use_limits(limits_from_config(config["limits"])):
         signals = _signals(words, config["dataset"], model)
