@@ -14,11 +14,12 @@ SEEDS ?= range(3)
 FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
+MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
 
 help: ## list the targets
-	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
 
 install: $(INSTALLED) ## set up .venv (GPU=1 for a CUDA build of torch)
 
@@ -154,6 +155,12 @@ bench-trust: $(INSTALLED) ## what contract, band and health cost a step online a
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
+
+replay_check: $(INSTALLED) ## models on the frames of a bus against themselves offline, on the real Ferrari's test range; needs VEHEST_DATA
+	$(BIN)/python benchmarks/replay.py check
+
+replay_30min: $(INSTALLED) ## 30 minutes of a bus at 100 Hz in real time: deadlines and memory; on an idle machine (MINUTES=30)
+	$(BIN)/python benchmarks/replay.py soak --minutes $(MINUTES)
 
 examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
 	$(BIN)/python docs/compare_examples.py

@@ -368,6 +368,66 @@ def _note(text: str) -> None:
     typer.echo(f"note: {text}", err=True)
 
 
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames of a bus: .asc, .blf, or .log of candump.")],
+    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            "--model",
+            "-m",
+            help="A model's folder, or the start of its name; by default the pre-trained one.",
+            autocompletion=_complete_model,
+        ),
+    ] = "pretrained",
+    dbc: Annotated[Path | None, typer.Option("--dbc", help="What describes the bus; by default the data set's.")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option("--dataset", help="A data set of the source can, which says what is which channel.", autocompletion=_complete_dataset),
+    ] = None,
+    signals: Annotated[
+        str,
+        typer.Option(
+            "--signals",
+            help="CHANNEL=MESSAGE.SIGNAL, separated by commas, for signals that are not called like channels; a minus before the signal "
+            "where it counts the other way than ISO 8855, :UNIT behind it where the DBC says none.",
+        ),
+    ] = "",
+    speed: Annotated[str, typer.Option("--speed", help="Times real time, or max: as fast as it goes.")] = "1",
+    bus_rate: Annotated[
+        float | None, typer.Option("--bus-rate", help="Samples a second [Hz]; by default as many as the fastest message has frames.")
+    ] = None,
+    interface: Annotated[str, typer.Option("--interface", help="Of python-can: virtual, socketcan, …")] = "virtual",
+    channel: Annotated[str, typer.Option("--channel", help="Of the interface, for example vcan0.")] = "vehest",
+    identifier: Annotated[
+        str, typer.Option("--id", help="Identifier of the estimates' frames; that of their bands is the next one.")
+    ] = "0x6F0",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Where estimates go: .csv, or .asc for their frames, with the DBC that describes them beside it."),
+    ] = None,
+    write_dbc: Annotated[Path | None, typer.Option("--write-dbc", help="Write the DBC of the estimates' frames here.")] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Put a log's frames on a bus and let a model estimate online from what it takes off: `vehest replay drive.asc --dbc car.dbc -m MODEL`.
+
+    Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
+    Ctrl-C ends it; what was written is kept.
+    """
+    from vehest.stages.replay import ReplayWords, replay_log
+    from vehest.stages.signals import StopSignals
+
+    words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
+    stop = StopSignals()
+    with stop.installed(), stop.deferred():
+        outcome = replay_log(words, overrides or [], stop.requested, _note)
+    _say(as_json, outcome)
+    if stop.number is not None:
+        raise typer.Exit(128 + stop.number)
+
+
 def _is_file_name(word: str) -> bool:
     """Whether a word is no override; a file that is there may have an ``=`` in its name."""
     return ("=" not in word and not word.startswith("~")) or Path(word).is_file()

@@ -16,6 +16,11 @@ PIECES = (
     "mlflow",
     "optuna",
     "gtsam",
+    "can.interfaces.virtual",
+    "can.io.asc",
+    "can.io.blf",
+    "can.io.canutils",
+    "cantools.database",
     "torch",
     "pooch",
     "requests",
@@ -61,3 +66,6 @@ def load_kernels() -> None:
     drive = vehest.Recording("drive", "car", 20.0, 0.0, channels, "simulated")
     for drives in ([drive], []):
         vehest.estimate(vehest.train("zero", drives, drives), drive.without_references())
+    stepper = vehest.online(vehest.load_model(), 100.0)
+    for _ in range(400):
+        stepper.step({"vx": 20.0, "yaw_rate": 0.0, "ay": 0.0, "ax": 0.0})

@@ -50,7 +50,7 @@ def test_every_source_has_a_module_that_opens() -> None:
 
 @pytest.mark.parametrize("name", ["revz", None, ""])
 def test_an_unknown_source_is_refused_with_those_there_are(name: str | None) -> None:
-    with pytest.raises(ConfigurationError, match="is not one of: mdf, revs, rosbag, simulated, tabular"):
+    with pytest.raises(ConfigurationError, match="is not one of: can, mdf, revs, rosbag, simulated, tabular"):
         source_module({"name": "x", "source": name})
 
 

@@ -18,6 +18,7 @@ from vehest.stages.config_files import packaged_conf, packaged_pipelines
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),
     "factor-graph": ("gtsam", "factor graphs"),
+    "bus": ("cantools", "CAN logs and replays"),
     "tuning": ("optuna", "noise levels tuned by Optuna"),
 }
 """Extra -> the package it brings, and what needs it."""

@@ -25,6 +25,7 @@ from vehest.sources.mdf.layout import ChannelPlace, Contents, Field, Group
 from vehest.sources.mdf.values import invalid_samples, is_number, raw_values
 from vehest.sources.mdf.version3 import read_version3
 from vehest.sources.mdf.version4 import read_version4
+from vehest.sources.signals import Signal
 
 FINISHED, UNFINISHED = b"MDF     ", b"UnFinMF "
 COMPARED = 10_000  # names that a misspelt one is compared with
@@ -42,28 +43,6 @@ class Wanted:
 
     name: str
     group: int | str | None = None
-
-
-@dataclass(frozen=True)
-class Signal:
-    """One signal.
-
-    Args:
-        group: its channel group, for messages.
-        stamps: seconds since the start of the measurement, strictly increasing, shape (T,).
-        values: physical values in the file's unit, NaN where the file marks them as invalid, shape (T,).
-        unit: as the file writes it.
-    """
-
-    group: str
-    stamps: FloatArray
-    values: FloatArray
-    unit: str
-
-    @property
-    def rate_hz(self) -> float:
-        """Rate behind the median interval [Hz]."""
-        return float(1.0 / np.median(np.diff(self.stamps)))
 
 
 @dataclass(frozen=True)
@@ -147,7 +126,7 @@ def _signals(file: BlockFile, contents: Contents, group: Group, places: Mapping[
     signals = {}
     for number, (name, field) in enumerate(fields.items(), start=1):
         values = _physical(field, columns[number], _where(file, places[name], group))
-        signals[name] = Signal(shown(group.title), stamps, values, field.unit)
+        signals[name] = Signal(f"group {shown(group.title)}", stamps, values, field.unit)
         columns[number] = np.empty(0)
     return signals
 

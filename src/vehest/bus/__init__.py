@@ -1,0 +1,1 @@
+"""A model on a vehicle's bus: signals of a DBC become samples, samples estimates, estimates frames."""

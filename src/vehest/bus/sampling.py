@@ -1,0 +1,150 @@
+"""Samples at even instants from frames that jitter, are lost or come late.
+
+A sample holds, of each channel, what arrived last before its instant, if that is no older than the channel's own period. Instants lie in
+the middle of the longest pause between the messages of a cycle, so that frames may jitter by half of that before they count as late, and
+follow the sender's clock, which is not the receiver's, by a phase-locked loop of first order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
+from vehest.sources.columns import plain_rate
+
+GAIN = 0.02
+"""Share of the deviation of an arrival by which the next instant is moved: a time constant of 50 samples."""
+
+WHOLE = 0.05
+"""Share of a cycle by which a message's period may differ from whole cycles, for its phase to count."""
+
+PLAIN = 5e-3
+SLACK = 1e-9
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the messages of a bus come.
+
+    Args:
+        rate_hz: of the samples.
+        periods: channel -> interval between its values [s].
+        clock: channel whose frames tell the sender's clock.
+        offset: from the arrival of those to the instant of the sample [s].
+        start: instant of the first sample [s].
+    """
+
+    rate_hz: float
+    periods: Mapping[str, float]
+    clock: str
+    offset: float
+    start: float
+
+
+def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) -> Timing:
+    """When messages come, from a while of a bus.
+
+    Args:
+        stamps: channel -> times of its frames [s], each at least two.
+        rate_hz: of the samples; without it that of the fastest channel.
+
+    Raises:
+        ConfigurationError: a rate that is no rate.
+    """
+    periods = {name: _period(np.diff(times)) for name, times in stamps.items()}
+    clock = min(periods, key=lambda name: periods[name])
+    if not all(period > 0 for period in periods.values()):
+        raise ConfigurationError("frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which")
+    if rate_hz is None:
+        rate_hz = plain_rate(1.0 / periods[clock], PLAIN)
+    if not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise ConfigurationError(f"the rate of a bus must be a positive number [Hz], not {rate_hz}")
+    cycle = 1.0 / rate_hz
+    phases = {name: found for name, times in stamps.items() if (found := _phase(times, periods[name], cycle)) is not None}
+    middle = _middle_of_longest_gap(phases.values(), cycle)
+    offset = (middle - phases[clock]) % cycle if clock in phases else 0.5 * cycle
+    first = max(times[0] for times in stamps.values() if len(times))
+    start = first + (middle - first) % cycle
+    return Timing(rate_hz, periods, clock, offset, start)
+
+
+def _period(steps: FloatArray) -> float:
+    """The interval behind stamps that jitter [s]: the mean, a gap counting as the frames that it lacks."""
+    period = float(np.median(steps))
+    for _ in range(3 if period > 0 else 0):
+        period = float(steps.sum() / np.maximum(np.rint(steps / period), 1.0).sum())
+    return period
+
+
+def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
+    """Where in a cycle frames arrive [s], by their circular mean; None if anywhere."""
+    if abs(period / cycle - max(round(period / cycle), 1)) > WHOLE * max(period / cycle, 1.0):
+        return None
+    mean = complex(np.exp(2j * np.pi * (times / cycle)).mean())
+    return float(np.angle(mean) / (2 * np.pi) * cycle % cycle) if abs(mean) > 0.5 else None
+
+
+def _middle_of_longest_gap(phases: Iterable[float], cycle: float) -> float:
+    found = sorted(phases)
+    if not found:
+        return 0.0
+    gaps = [(after - before, before) for before, after in zip(found, [*found[1:], found[0] + cycle], strict=True)]
+    longest, begin = max(gaps)
+    return (begin + 0.5 * longest) % cycle
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What was known of a bus at one instant.
+
+    Args:
+        time: on the bus's clock [s].
+        values: channel -> value [SI] of what is fresh.
+        missing: channels of which nothing is.
+    """
+
+    time: float
+    values: Mapping[str, float]
+    missing: tuple[str, ...]
+
+
+class Sampler:
+    """Forms samples; frames are to come in the order of their stamps.
+
+    Args:
+        timing: of the bus.
+
+    Attributes:
+        next_time: instant of the next sample [s]; it holds what arrives up to then.
+    """
+
+    def __init__(self, timing: Timing) -> None:
+        self.timing, self.cycle = timing, 1.0 / timing.rate_hz
+        self.next_time = timing.start
+        self._limits = {name: max(period, self.cycle) + SLACK for name, period in timing.periods.items()}
+        self._values = dict.fromkeys(timing.periods, math.nan)
+        self._stamps = dict.fromkeys(timing.periods, -math.inf)
+        self._deviation = 0.0
+
+    def take(self, values: Mapping[str, float], stamp: float) -> None:
+        """Take what a frame carries, channel -> value [SI]; one that was stamped before the last sample counts for the next."""
+        for name, value in values.items():
+            self._values[name], self._stamps[name] = value, stamp
+        if self.timing.clock in values:
+            early = (stamp - self.next_time + self.timing.offset + 0.5 * self.cycle) % self.cycle - 0.5 * self.cycle
+            self._deviation = min(max(early, -0.25 * self.cycle), 0.25 * self.cycle)
+
+    def sample(self) -> Sample:
+        """The sample at ``next_time``, which moves on by a cycle."""
+        time = self.next_time
+        fresh = {
+            name: value for name, value in self._values.items() if time - self._stamps[name] <= self._limits[name] and not math.isnan(value)
+        }
+        self.next_time = time + self.cycle + GAIN * self._deviation
+        self._deviation = 0.0
+        return Sample(time, fresh, tuple(name for name in self._values if name not in fresh))

@@ -1,0 +1,89 @@
+"""A drive as the frames of a bus, estimated online from them, against the same model offline on the drive itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from can_drive import SIGNALS, write_log
+
+from vehest.api import estimate, load_model
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.stages.replay import ReplayWords, replay_log
+
+JITTER, LOST = 0.001, 0.01
+SETTLED = 2.0  # s after the first estimate of both
+FERRARI = (550.0, 700.0)  # s, the test range of its drive
+MINUS = {1: "", -1: "-"}
+TOLD = ",".join(f"{name}={MINUS[entry.get('sign', 1)]}{entry['column']}:{entry['unit']}" for name, entry in SIGNALS.items())
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Errors of one model on one drive, after both have settled.
+
+    Args:
+        online, offline: root mean square errors of v [m/s] and β [deg] against the reference.
+        at_sample: those online if estimates counted for the instant of their sample, as if filters took no time.
+        samples, lost: of the bus, and those at which a channel was missing.
+        latest_ms, missed: as fast as it goes, the longest step and how many took longer than a cycle.
+    """
+
+    online: tuple[float, float]
+    offline: tuple[float, float]
+    at_sample: tuple[float, float]
+    samples: int
+    lost: int
+    latest_ms: float
+    missed: int
+
+    @property
+    def ratios(self) -> tuple[float, float]:
+        """Online over offline, of v and β."""
+        return self.online[0] / self.offline[0], self.online[1] / self.offline[1]
+
+
+def told_for(channels: tuple[str, ...]) -> str:
+    """--signals for a model's channels."""
+    return ",".join(word for word in TOLD.split(",") if word.partition("=")[0] in channels)
+
+
+def compare(model: str, drive: Recording, folder: Path, output: Path | None = None) -> Compared:
+    """Estimate a drive offline, and online from the frames of a bus with jitter and lost frames.
+
+    Args:
+        model: as ``vehest replay`` takes it.
+        drive: with references.
+        folder: for log and estimates.
+        output: root in which models are.
+    """
+    written = write_log(drive, folder, jitter=JITTER, lost=LOST, seed=1)
+    fitted = load_model(model, output)
+    offline = estimate(fitted, drive.without_references())
+    table = folder / "estimates.csv"
+    words = ReplayWords(written.log, model, written.dbc, signals=told_for(fitted.channels), speed="max", out=table)
+    figures = replay_log(words, [f"output={output}"] if output else [])
+    online = pd.read_csv(table).dropna(subset=["vy", "sideslip"])
+    known = ~np.isnan(offline["vy"])
+    begin = SETTLED + max(online["time"].iloc[0] + written.origin, offline.time[known][0])
+    end = min(online["time"].iloc[-1] + written.origin, offline.time[known][-1])
+
+    def errors(times: FloatArray, vy: FloatArray, sideslip: FloatArray) -> tuple[float, float]:
+        inside = (times >= begin) & (times <= end)
+        v = vy[inside] - np.interp(times[inside], drive.time, drive["vy_ref"])
+        beta = np.degrees(sideslip[inside] - np.interp(times[inside], drive.time, drive["sideslip_ref"]))
+        return float(np.sqrt(np.mean(v**2))), float(np.sqrt(np.mean(beta**2)))
+
+    estimates = (online["vy"].to_numpy(), online["sideslip"].to_numpy())
+    return Compared(
+        online=errors(online["time"].to_numpy() + written.origin, *estimates),
+        offline=errors(offline.time[known], offline["vy"][known], offline["sideslip"][known]),
+        at_sample=errors(online["sampled"].to_numpy() + written.origin, *estimates),
+        samples=figures["samples"],
+        lost=figures["samples_lost"],
+        latest_ms=figures["latest_ms"],
+        missed=figures["deadlines_missed"],
+    )

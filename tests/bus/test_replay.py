@@ -1,0 +1,258 @@
+"""A log on a virtual bus with a model behind it: estimates as without a bus, what is lost is missing, what was written stays."""
+
+from __future__ import annotations
+
+import io
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import vehest
+from conftest import planar_drive
+from vehest.bus.mapping import from_dataset, from_names
+from vehest.bus.receiver import Figures, Said
+from vehest.bus.sampling import Sample
+from vehest.bus.view import LiveView, PlainView, Shown, rows_of, view_on
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.recording import Recording
+from vehest.stages.replay import ReplayWords, replay_log
+from vehest.trust.contract import GuardedStepper
+
+can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
+cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+
+from can_drive import DBC, SIGNALS, Written, ferrari, write_log  # noqa: E402
+from replayed_drive import FERRARI, compare, told_for  # noqa: E402
+
+CHANNELS = ("yaw_rate", "vx", "ay", "ax")  # of the pre-trained model
+RATE = 100.0
+
+
+def drive(seconds: float = 20.0) -> Recording:
+    return planar_drive(seconds, RATE, seed=3)
+
+
+def replayed(written: Written, **more: Any) -> dict[str, Any]:
+    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max", **more}
+    return replay_log(ReplayWords(written.log, **words), more.pop("overrides", ()))
+
+
+def by_cantools(written: Written) -> dict[str, list[float]]:
+    """Values of the frames in SI units and ISO 8855 signs, without vehest."""
+    database = cantools.database.load_string(DBC, "dbc")
+    found: dict[str, list[float]] = {name: [] for name in CHANNELS}
+    for frame in can.LogReader(written.log):
+        values = database.decode_message(frame.arbitration_id, frame.data)
+        if "VehSpd" in values:
+            found["vx"].append(values["VehSpd"] / 3.6)
+        if "AccLat" in values:
+            found["ay"].append(-values["AccLat"])
+            found["ax"].append(values["AccLong"])
+            found["yaw_rate"].append(math.radians(values["YawRate"]))
+    return found
+
+
+def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path: Path) -> None:
+    written = write_log(drive(), tmp_path, jitter=0.001)
+    figures = replayed(written, out=tmp_path / "out.csv")
+    table = pd.read_csv(tmp_path / "out.csv")
+    values = by_cantools(written)
+    stepper = vehest.online(vehest.load_model(), RATE)
+    expected, last = [], stepper.last
+    for k in range(len(values["vx"])):
+        said = stepper.step({name: values[name][k] for name in CHANNELS})
+        if said is not last:
+            expected.append((said["vy"], said["sideslip"], said["health"]))
+            last = said
+    assert figures["samples_lost"] == 0
+    assert figures["estimates"] == len(table) == len(expected)
+    np.testing.assert_allclose(table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9)
+
+
+def test_estimates_hold_for_their_sample_less_the_delay_of_the_filter_and_plus_the_horizon(tmp_path: Path) -> None:
+    written = write_log(drive(), tmp_path)
+    replayed(written, out=tmp_path / "out.csv")
+    table = pd.read_csv(tmp_path / "out.csv")
+    stepper = vehest.online(vehest.load_model(), RATE)
+    ahead = stepper.horizon_steps / 20.0 - stepper.delay
+    # frames come at whole cycles, 0 and 0.4 ms behind them; samples in the middle of the rest
+    np.testing.assert_allclose(table["sampled"] % 0.01, 0.0052, atol=2e-5)
+    held = table["sampled"] + ahead - 0.0050
+    assert np.abs(table["time"] - held).max() < 3e-4
+
+
+def test_lost_frames_are_missing_samples(tmp_path: Path) -> None:
+    written = write_log(drive(30.0), tmp_path, jitter=0.001, lost=0.02)
+    figures = replayed(written)
+    assert figures["missing"] == {
+        "vx": len(written.lost["Speed"]),
+        **dict.fromkeys(("yaw_rate", "ay", "ax"), len(written.lost["IMU"])),
+    }
+    assert figures["samples_lost"] == len(set(written.lost["IMU"]) | set(written.lost["Speed"]))
+
+
+def test_frames_of_estimates_say_what_the_table_says(tmp_path: Path) -> None:
+    written = write_log(drive(), tmp_path, ".blf")
+    replayed(written, out=tmp_path / "out.csv")
+    figures = replayed(written, out=tmp_path / "sent.asc", identifier="0x321")
+    assert figures["written"] == [str(tmp_path / "sent.asc"), str(tmp_path / "sent.dbc")]
+    table = pd.read_csv(tmp_path / "out.csv")
+    database = cantools.database.load_file(tmp_path / "sent.dbc")
+    frames = [(frame, database.decode_message(frame.arbitration_id, frame.data)) for frame in can.LogReader(tmp_path / "sent.asc")]
+    said = [values for frame, values in frames if frame.arbitration_id == 0x321]
+    assert len(said) == len(table) == len(frames) / 2
+    assert [values["AliveCounter"] for values in said] == [k % 16 for k in range(len(said))]
+    known = [k for k, values in enumerate(said) if str(values["LateralVelocity"]) != "not available"]
+    assert known == np.flatnonzero(table["vy"].notna()).tolist()
+    np.testing.assert_allclose([said[k]["LateralVelocity"] for k in known], table["vy"].iloc[known], atol=0.0003)
+    np.testing.assert_allclose([said[k]["SideslipAngle"] for k in known], np.degrees(table["sideslip"].iloc[known]), atol=0.0003)
+
+
+def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path: Path) -> None:
+    written = write_log(drive(3.0), tmp_path)
+    figures = replayed(written, speed="4", out=tmp_path / "out.csv")
+    assert figures["frames_sent"] == figures["frames_received"] == 600
+    assert figures["samples"] == pytest.approx(300, abs=3)
+    assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"] == pytest.approx(60, abs=1)
+
+
+@pytest.mark.parametrize("speed", ["max", "1"])
+def test_what_was_written_before_a_stop_is_kept(tmp_path: Path, speed: str) -> None:
+    written = write_log(drive(), tmp_path)
+    calls = iter(range(10_000))
+    words = ReplayWords(written.log, dbc=written.dbc, signals=told_for(CHANNELS), speed=speed, out=tmp_path / "out.csv")
+    figures = replay_log(words, stopped=lambda: next(calls) > 300)
+    assert figures["stopped"]
+    assert 0 < figures["samples"] < 2000
+    assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]
+
+
+def test_signals_called_like_channels_need_no_map(tmp_path: Path) -> None:
+    text = 'VERSION ""\n\nBO_ 5 A: 8 X\n SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
+    (tmp_path / "own.dbc").write_text(text)
+    found = from_names(tmp_path / "own.dbc", ["vx", "ay"])
+    assert found.factors == {"vx": 1.0, "ay": pytest.approx(9.80665)}
+    with pytest.raises(ConfigurationError, match="the model reads channel 'ax'"):
+        from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"])
+    assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {"vx", "ay"}
+
+
+def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
+    written = write_log(drive(1.0), tmp_path)
+    dataset = {"name": "mine", "source": "can", "dbc": str(written.dbc), "path": str(tmp_path), "rate_hz": 100, "channels": SIGNALS}
+    declared = from_dataset(dataset, CHANNELS)
+    told = from_names(written.dbc, CHANNELS, told=told_for(CHANNELS).split(","))
+    assert declared.factors == told.factors
+    assert {name: (one.message.name, one.signal) for name, one in declared.wanted.items()} == {
+        name: (one.message.name, one.signal) for name, one in told.wanted.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"signals": "ay"}, "takes CHANNEL=MESSAGE.SIGNAL"),
+        ({"signals": "speed=VehSpd"}, "'speed' is no channel"),
+        ({"signals": "steer=SteerAng"}, "'steer', which the model does not read"),
+        ({"signals": "vx=VehSpd"}, "reads channel 'yaw_rate', and no signal"),
+        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")}, "'parsec' is no unit"),
+        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")}, "is in 'km/h' by the file and in 'm/s'"),
+        ({"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")}, "stands in several messages"),
+        ({"dbc": None}, "say what describes the bus"),
+        ({"dataset": "tabular", "signals": ""}, "is of source 'tabular'"),
+        ({"dataset": "can"}, "both say what is which channel"),
+        ({"speed": "fast"}, "--speed must be"),
+        ({"speed": "-1"}, "--speed must be"),
+        ({"speed": "max", "interface": "socketcan"}, "needs the virtual bus"),
+        ({"speed": "1", "interface": "nonsense"}, "cannot open channel 'vehest' of interface 'nonsense'"),
+        ({"identifier": "0x120"}, "has a message 0x120, as estimates would"),
+        ({"identifier": "soon"}, "--id must be an identifier"),
+        ({"bus_rate": 10.0}, "too slow for an estimator that works at 20 Hz"),
+        ({"bus_rate": -1.0}, "must be a positive number"),
+        ({"out": Path("out.parquet")}, "must end in .csv or .asc"),
+        ({"out": Path("/nowhere/at/all.csv")}, "cannot write"),
+        ({"model": "nothing"}, "there is no model 'nothing'"),
+    ],
+)
+def test_words_that_make_no_sense_are_one_line(tmp_path: Path, words: dict[str, Any], said: str) -> None:
+    written = write_log(drive(2.0), tmp_path)
+    with pytest.raises(VehestError, match=said) as caught:
+        replayed(written, **words)
+    assert "\n" not in str(caught.value)
+    assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
+
+
+def test_the_log_itself_is_never_written_over(tmp_path: Path) -> None:
+    written = write_log(drive(2.0), tmp_path)
+    before = written.log.read_bytes()
+    with pytest.raises(ConfigurationError, match="is what is read"):
+        replayed(written, out=written.log)
+    assert written.log.read_bytes() == before
+
+
+def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path: Path) -> None:
+    written = write_log(drive(2.0), tmp_path)
+    lines = written.log.read_text().splitlines()
+    written.log.write_text("\n".join([*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz")]))
+    for speed in ("max", "10"):
+        with pytest.raises(DataError, match="cannot be read as a log of a bus"):
+            replayed(written, speed=speed)
+
+
+def shown(**values: float) -> Shown:
+    figures = Figures(sent=30, received=20, samples=10, lost=1, estimates=2, latest=0.0012)
+    return Shown(figures, Said(0.1, 0.1, values), Sample(10.1, {}, ()), 0.0)
+
+
+def test_the_view_says_estimate_band_health_and_reason_in_words() -> None:
+    rows = dict(
+        rows_of(
+            shown(vy=0.5, sideslip=math.radians(-1.25), band_vy=0.1, band_sideslip=math.radians(0.5), health=2.0, health_reason=3e5), 20.0
+        )
+    )
+    assert rows["v"] == "+0.500 ± 0.100 m/s"
+    assert rows["β"] == "-1.25 ± 0.50 °"
+    assert rows["health"] == "invalid: there is no estimate"
+    assert rows["rate"] == "20.0 estimates/s"
+    assert rows["samples"] == "10, 1 lost"
+    assert dict(rows_of(Shown(Figures(), None, None, 0.0), 0.0))["health"] == "-"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_what_is_no_terminal_gets_plain_lines_and_a_terminal_a_table() -> None:
+    said = shown(vy=0.5, sideslip=0.0, health=0.0, health_reason=0.0)
+    plain = io.StringIO()
+    view = view_on(plain, "drive")
+    assert isinstance(view, PlainView)
+    with view:
+        view.show(said)
+    assert plain.getvalue().count("\n") == 1
+    assert "\x1b" not in plain.getvalue()
+    terminal = Terminal()
+    live = view_on(terminal, "drive")
+    assert isinstance(live, LiveView)
+    with live:
+        live.show(said)
+    assert "+0.500 m/s" in terminal.getvalue()
+
+
+def test_steppers_say_all_that_the_view_and_the_frames_need() -> None:
+    stepper = GuardedStepper(vehest.load_model(), None, RATE)
+    for k in range(300):
+        said = stepper.step({"vx": 20.0, "yaw_rate": 0.1 * math.sin(0.05 * k), "ay": 2.0 * math.sin(0.05 * k), "ax": 0.0})
+    assert {"vy", "sideslip", "health", "health_reason"} <= set(said)
+
+
+def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root: Path, tmp_path: Path) -> None:
+    assert data_root.is_dir()
+    found = compare("pretrained", ferrari(*FERRARI), tmp_path)
+    assert found.lost > 200  # of 15,000 samples and two messages, 1 % each
+    assert max(found.ratios) < 1.05

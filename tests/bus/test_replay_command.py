@@ -1,0 +1,91 @@
+"""`vehest replay` as people call it: figures, files, one line for what is wrong, and a clean end by Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from conftest import planar_drive
+from place import Place
+from vehest.bus.view import Shown, View
+
+pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
+pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+
+from can_drive import SIGNALS, write_log
+from replayed_drive import told_for
+
+TOLD = told_for(("vx", "yaw_rate", "ax", "ay"))
+
+
+@pytest.fixture
+def bus(place: Place) -> Place:
+    """A log of ten seconds, its DBC, and a data set that describes both."""
+    write_log(planar_drive(10.0, 100.0, seed=2), place.folder / "raw" / "bus", jitter=0.001, lost=0.01)
+    channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
+    described = {"name": "bus", "kind": "simulated", "vehicle": "car", "licence": "none", "citation": "none", "source": "can"}
+    described |= {"path": "${root}/bus", "files": "*.asc", "dbc": "${root}/bus/car.dbc", "rate_hz": 100, "channels": channels}
+    (place.folder / "conf" / "dataset" / "bus.yaml").write_text(yaml.safe_dump(described, allow_unicode=True))
+    return place
+
+
+def test_figures_come_as_json_and_estimates_as_a_table(bus: Place) -> None:
+    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--json", "--quiet", "-o", "out.csv")
+    code, out, err = bus("replay", "raw/bus/drive.asc", *words)
+    assert (code, err) == (0, "")
+    figures = json.loads(out)
+    assert figures["samples_hz"] == 100.0
+    assert figures["estimates"] == len(pd.read_csv("out.csv")) == 200
+    assert figures["written"] == ["out.csv"]
+
+
+def test_a_data_set_serves_replays_and_estimates_alike(bus: Place) -> None:
+    code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
+    assert (code, err) == (0, "")
+    code, _, _ = bus("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
+    assert code == 0
+    online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")
+    assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
+
+
+def test_the_dbc_of_estimates_is_written_alone(bus: Place) -> None:
+    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--quiet", "--write-dbc", "own.dbc", "--id", "0x100")
+    assert bus("replay", "raw/bus/drive.asc", *words)[0] == 0
+    assert "BO_ 256 VehestEstimate: 8" in Path("own.dbc").read_text()
+
+
+def test_progress_goes_to_standard_error_in_plain_lines(bus: Place) -> None:
+    code, _, err = bus("replay", "raw/bus/drive.asc", "--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max")
+    assert code == 0
+    assert err.startswith("time ")
+    assert "\x1b" not in err
+
+
+def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus: Place) -> None:
+    assert bus.refused("replay", "raw/bus/nothing.asc", "--dataset", "bus")[0] == 4
+    assert bus.refused("replay", "raw/bus/drive.asc")[0] == 2
+    assert bus.refused("replay", "raw/bus/car.dbc", "--dataset", "bus")[0] == 3
+
+
+def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Impatient(View):
+        def is_due(self, samples: int) -> bool:
+            return samples == 400
+
+        def show(self, shown: Shown) -> None:
+            if shown.figures.samples == 400:
+                monkeypatch.setattr(self, "is_due", lambda samples: False)
+                signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("vehest.stages.replay.standard_view", lambda title, quiet: Impatient())
+    words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "-o", "out.csv")
+    code, out, err = bus("replay", "raw/bus/drive.asc", *words)
+    assert code == 130
+    assert "stopped: True" in out
+    assert err == "error: stopped\n"
+    assert len(pd.read_csv("out.csv")) == 80

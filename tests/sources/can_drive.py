@@ -1,0 +1,166 @@
+"""A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier.
+
+As a script: the Ferrari's drive, or a stretch of it, as a log with its DBC.
+
+    python tests/sources/can_drive.py FOLDER --start 550 --stop 700
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.data.recording import Recording
+
+DBC = """VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: Gateway Logger
+
+BO_ 288 IMU: 8 Gateway
+ SG_ YawRate : 7|16@0- (0.005,0) [-163|163] "deg/s" Logger
+ SG_ AccLat : 23|16@0- (0.001,0) [-32|32] "m/s^2" Logger
+ SG_ AccLong : 39|16@0- (0.001,0) [-32|32] "m/s^2" Logger
+ SG_ Counter : 59|4@0+ (1,0) [0|15] "" Logger
+
+BO_ 2566844672 Speed: 8 Gateway
+ SG_ VehSpd : 0|16@1+ (0.01,0) [0|655] "km/h" Logger
+ SG_ Counter : 60|4@1+ (1,0) [0|15] "" Logger
+
+BO_ 293 Steering: 4 Gateway
+ SG_ SteerAng : 0|16@1- (0.002,0) [-65|65] "deg" Logger
+
+BO_ 1024 Untouched: 8 Gateway
+ SG_ Engine : 0|16@1+ (0.25,0) [0|16000] "rpm" Logger
+
+CM_ SG_ 288 AccLat "positive to the right,
+BO_ 1 nothing: 8 nobody";
+"""
+SIGNALS: dict[str, Any] = {
+    "vx": {"column": "Speed.VehSpd", "unit": "km/h"},
+    "yaw_rate": {"column": "YawRate", "unit": "deg/s"},
+    "ax": {"column": "IMU.AccLong", "unit": "m/s²"},
+    "ay": {"column": "IMU.AccLat", "unit": "m/s²", "sign": -1},
+    "steer": {"column": "SteerAng", "unit": "deg"},
+}
+ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from its first frame
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written.
+
+    Args:
+        dbc: what describes the bus.
+        log: the frames.
+        lost: message -> numbers of the samples whose frames were lost.
+        origin: time of the recording at which the log's clock stands at 0 [s].
+    """
+
+    dbc: Path
+    log: Path
+    lost: dict[str, np.ndarray[Any, Any]]
+    origin: float
+
+
+def write_log(
+    recording: Recording, folder: Path, suffix: str = ".asc", *, jitter: float = 0.0, lost: float = 0.0, seed: int = 0, repeats: int = 1
+) -> Written:
+    """Write a recording as the frames of a bus.
+
+    Args:
+        recording: with vx, yaw_rate, ax, ay, and perhaps steer; a frame of each message a sample.
+        folder: where the log and the DBC go.
+        suffix: of the log: .asc, .blf or .log.
+        jitter: stamps are late by up to twice this, evenly distributed [s].
+        lost: share of frames that are lost.
+        seed: of jitter and losses.
+        repeats: how often the drive is written, one after the other.
+    """
+    import can
+
+    folder.mkdir(parents=True, exist_ok=True)
+    dbc, log = folder / "car.dbc", folder / f"drive{suffix}"
+    dbc.write_text(DBC, encoding="cp1252")
+    messages = _messages(recording)
+    rng = np.random.default_rng(seed)
+    n = len(recording)
+    gone = {name: rng.random(n * repeats) < lost for name in messages}
+    for flags in gone.values():
+        flags[0] = False
+    first = 0.0 if suffix == ".asc" else ORIGIN
+    with can.Logger(log) as writer:
+        for k in range(n * repeats):
+            late = {name: rng.uniform(0.0, 2 * jitter) + 0.0004 * number for number, name in enumerate(messages)}
+            for name in sorted(messages, key=late.__getitem__):
+                if gone[name][k]:
+                    continue
+                identifier, extended, frames = messages[name]
+                stamp = first + k / recording.rate_hz + (late[name] if k else 0.0)
+                writer(can.Message(stamp, identifier, extended, data=frames[k % n], channel=0, is_rx=True))
+    return Written(dbc, log, {name: np.flatnonzero(flags) for name, flags in gone.items()}, recording.start_time - first)
+
+
+def _messages(recording: Recording) -> dict[str, tuple[int, bool, list[bytes]]]:
+    """Message -> its identifier, whether that is extended, and a frame a sample."""
+    import cantools
+
+    database = cantools.database.load_string(DBC, "dbc")
+    values = {
+        "IMU": {
+            "YawRate": np.degrees(recording["yaw_rate"]),
+            "AccLat": -recording["ay"],
+            "AccLong": recording["ax"],
+        },
+        "Speed": {"VehSpd": 3.6 * recording["vx"]},
+    }
+    if "steer" in recording:
+        values["Steering"] = {"SteerAng": np.degrees(recording["steer"])}
+    found = {}
+    for name, signals in values.items():
+        message = database.get_message_by_name(name)
+        counts = any(signal.name == "Counter" for signal in message.signals)
+        frames = [message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False) for k, row in enumerate(_rows(signals))]
+        found[name] = (message.frame_id, message.is_extended_frame, frames)
+    return found
+
+
+def _rows(signals: dict[str, Any]) -> Iterator[dict[str, float]]:
+    for values in zip(*signals.values(), strict=True):
+        yield dict(zip(signals, map(float, values), strict=True))
+
+
+def ferrari(start: float, stop: float) -> Recording:
+    """A stretch of the real Ferrari's drive, as its data set declares it."""
+    from vehest.sources.base import open_source
+    from vehest.stages.config import compose_config
+
+    source = open_source(compose_config("ingest", ["dataset=ferrari_250lm"])["dataset"])
+    recording = source.read(source.ids()[0])
+    return recording.cut(start, stop)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--start", type=float, default=550.0)
+    parser.add_argument("--stop", type=float, default=700.0)
+    parser.add_argument("--suffix", default=".asc")
+    parser.add_argument("--jitter", type=float, default=0.001)
+    parser.add_argument("--lost", type=float, default=0.01)
+    asked = parser.parse_args()
+    written = write_log(ferrari(asked.start, asked.stop), asked.folder, asked.suffix, jitter=asked.jitter, lost=asked.lost)
+    sys.stdout.write(f"{written.log}\n{written.dbc}\n")
+
+
+if __name__ == "__main__":
+    main()

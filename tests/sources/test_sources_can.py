@@ -1,0 +1,256 @@
+"""Logs of python-can's own writers: a drive comes back as it was, and one clear line for what cannot be used."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import planar_drive
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import Recording
+from vehest.sources.base import open_source
+
+can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
+cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
+
+from can_drive import DBC, SIGNALS, Written, write_log  # noqa: E402
+
+FOUR = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
+STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.001}
+
+
+def source(folder: Path, **options: Any) -> Any:
+    told = {"files": "drive.*", "dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": FOUR, **options}
+    return open_source({"name": "mine", "source": "can", "path": str(folder), **told})
+
+
+def read(folder: Path, **options: Any) -> Recording:
+    found = source(folder, **options).read("drive")
+    assert isinstance(found, Recording)
+    return found
+
+
+def drive(seconds: float = 10.0) -> Recording:
+    return planar_drive(seconds, 100.0, seed=3)
+
+
+def log(folder: Path, frames: list[tuple[float, int, bytes]], suffix: str = ".asc", dbc: str = DBC, extended: bool = False) -> Path:
+    folder.mkdir(exist_ok=True)
+    (folder / "car.dbc").write_text(dbc, encoding="cp1252")
+    with can.Logger(folder / f"drive{suffix}") as writer:
+        for stamp, identifier, data in frames:
+            writer(can.Message(stamp, identifier, extended, data=data, channel=0))
+    return folder
+
+
+def one(name: str, dbc_signal: str, length: int = 8) -> str:
+    return f'VERSION ""\n\nBO_ 291 {name}: {length} Car\n {dbc_signal}\n'
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".log"])
+def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path: Path, suffix: str) -> None:
+    sent = drive()
+    write_log(sent, tmp_path, suffix)
+    got = read(tmp_path)
+    k = np.rint((got.time - got.start_time) * 100.0).astype(int)
+    assert len(got) >= len(sent) - 2
+    assert got.rate_hz == 100.0
+    for name, step in STEPS.items():  # frames of the second message come 0.4 ms late: the slope times that
+        slack = 0.0005 * np.abs(np.gradient(sent[name], 0.01)).max()
+        np.testing.assert_allclose(got[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
+
+
+def test_lost_frames_are_bridged_up_to_three_intervals_and_no_further(tmp_path: Path) -> None:
+    frames = [(k / 100, 288, cantools.database.load_string(DBC, "dbc").encode_message("IMU", whole(k), strict=False)) for k in range(300)]
+    kept = [frame for k, frame in enumerate(frames) if k not in (50, 100, 101)]
+    imu = {"ay": SIGNALS["ay"]}
+    assert len(read(log(tmp_path / "few", kept), channels=imu)) == 300
+    kept = [frame for k, frame in enumerate(frames) if not 100 <= k < 110]
+    with pytest.raises(DataError, match=r"signal 'IMU.AccLat' of message 'IMU', for channel 'ay', is not measured for 0.11 s after 0.99 s"):
+        read(log(tmp_path / "many", kept), channels=imu)
+
+
+def whole(k: int) -> dict[str, float]:
+    return {"YawRate": 0.0, "AccLat": 0.001 * k, "AccLong": 0.0, "Counter": k % 16}
+
+
+def test_multiplexed_signals_come_from_the_frames_that_carry_them(tmp_path: Path) -> None:
+    dbc = one("Wheels", 'SG_ Page M : 0|8@1+ (1,0) [0|0] "" Car') + "".join(
+        f' SG_ {name} {mark} : {start}|16@1+ (0.01,0) [0|0] "m/s" Car\n'
+        for name, mark, start in (("Left", "m0", 8), ("Right", "m1", 8), ("Always", "", 32))
+    )
+    database = cantools.database.load_string(dbc, "dbc")
+    frames = []
+    for k in range(400):
+        page = k % 3  # the third page holds neither
+        values = {"Page": page % 2, "Always": 10 + 0.01 * k} | ({"Left": 5 + 0.01 * k} if page % 2 == 0 else {"Right": 7 + 0.01 * k})
+        data = bytearray(database.encode_message("Wheels", values))
+        data[0] = page
+        frames.append((k / 300, 291, bytes(data)))
+    channels = {
+        "vx": {"column": "Left", "unit": "m/s"},
+        "vx_ref": {"column": "Wheels.Right", "unit": "m/s"},
+        "vy_ref": {"column": "Always", "unit": "m/s"},
+    }
+    got = read(log(tmp_path, frames, dbc=dbc), channels=channels, rate_hz=100, accept=["aliasing"])
+    np.testing.assert_allclose(got["vx"], 5 + 3 * got.time, atol=0.006)
+    np.testing.assert_allclose(got["vx_ref"], 7 + 3 * got.time, atol=0.006)
+    np.testing.assert_allclose(got["vy_ref"], 10 + 3 * got.time, atol=0.006)
+
+
+def test_floats_are_read_as_the_dbc_says(tmp_path: Path) -> None:
+    dbc = one("Fine", 'SG_ Speed : 0|32@1- (1,0) [0|0] "m/s" Car') + "SIG_VALTYPE_ 291 Speed : 1;\n"
+    values = np.linspace(1.0, 2.0, 100, dtype=np.float32)
+    frames = [(k / 100, 291, struct.pack("<f4x", value)) for k, value in enumerate(values)]
+    got = read(log(tmp_path, frames, dbc=dbc), channels={"vx": {"column": "Speed", "unit": "m/s"}})
+    np.testing.assert_allclose(got["vx"], values, rtol=1e-6)
+
+
+def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path: Path) -> None:
+    dbc = one("Speed", 'SG_ Speed : 0|16@1+ (0.01,0) [0|0] "m/s" Car')
+    frames = [(k / 100, 291, struct.pack("<H6x", 65535 if 20 <= k < 30 else 1000 + k)) for k in range(100)]
+    entry = {"vx": {"column": "Speed", "unit": "m/s", "invalid": [65535]}}
+    folder = log(tmp_path, frames, dbc=dbc)
+    got = read(folder, channels=entry, gappy=["vx"])
+    assert np.flatnonzero(np.isnan(got["vx"])).tolist() == list(range(20, 30))
+    with pytest.raises(DataError, match="marked invalid"):
+        read(folder, channels=entry)
+
+
+def test_extended_and_standard_identifiers_of_one_number_are_two_messages(tmp_path: Path) -> None:
+    dbc = (
+        one("Short", 'SG_ A : 0|8@1+ (1,0) [0|0] "m/s" Car')
+        + f'BO_ {0x80000000 + 291} Long: 8 Car\n SG_ B : 0|8@1+ (1,0) [0|0] "m/s" Car\n'
+    )
+    tmp_path.joinpath("car.dbc").write_text(dbc)
+    with can.Logger(tmp_path / "drive.asc") as writer:
+        for k in range(200):
+            writer(can.Message(k / 200, 291, bool(k % 2), data=bytes([10 + k % 2] * 8), channel=0))
+    got = read(tmp_path, channels={"vx": {"column": "A", "unit": "m/s"}, "vx_ref": {"column": "B", "unit": "m/s"}})
+    assert set(got["vx"]) == {10.0}
+    assert set(got["vx_ref"]) == {11.0}
+
+
+def test_one_bus_of_several_is_taken(tmp_path: Path) -> None:
+    dbc = one("Speed", 'SG_ Speed : 0|8@1+ (1,0) [0|0] "m/s" Car')
+    (tmp_path / "car.dbc").write_text(dbc)
+    with can.Logger(tmp_path / "drive.asc") as writer:
+        for k in range(200):
+            writer(can.Message((k // 2) / 100, 291, False, data=bytes([10 + k % 2] * 8), channel=k % 2))
+    entry = {"vx": {"column": "Speed", "unit": "m/s"}}
+    with pytest.raises(DataError, match="say which by bus"):
+        read(tmp_path, channels=entry)
+    assert set(read(tmp_path, channels=entry, bus=2)["vx"]) == {11.0}
+    with pytest.raises(DataError, match="never occurs on bus 3"):
+        read(tmp_path, channels=entry, bus=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, r"has no signal 'Speed.VehSpeed' \(near it: Speed.VehSpd\)"),
+        ({"channels": {"vx": {"column": "Counter", "unit": "m/s"}}}, "stands in several messages; write one of IMU.Counter, Speed.Counter"),
+        ({"channels": {"steer": {"column": "SteerAng", "unit": "deg"}}}, "'SteerAng' for channel 'steer' never occurs"),
+        ({"channels": {"vx": {"column": "VehSpd", "unit": "m/s"}}}, "'km/h' by the file and in 'm/s' by conf/dataset"),
+        ({"channels": {"vx": {"column": "VehSpd", "unit": "km/h", "invalid": ["SNA"]}}}, "invalid must list raw values"),
+        ({"dbc": None}, "dbc must name the DBC file"),
+        ({"dbc": "/nowhere/car.dbc"}, "there is no file '/nowhere/car.dbc'"),
+        ({"rate_hz": 50}, "faster than the raster"),
+    ],
+)
+def test_what_is_declared_wrongly_is_said_in_a_line(tmp_path: Path, options: dict[str, Any], said: str) -> None:
+    write_log(drive(), tmp_path)
+    with pytest.raises((ConfigurationError, DataError, MissingError), match=said) as caught:
+        read(tmp_path, **options)
+    assert "\n" not in str(caught.value)
+
+
+SPEED = {"vx": {"column": "Speed", "unit": "m/s"}}
+
+
+@pytest.mark.parametrize(
+    ("dbc", "said"),
+    [
+        (one("Speed", 'SG_ Speed : 0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000), "is 4000000000 bytes long"),
+        (one("Speed", 'SG_ Speed : 0|60000@1+ (1,0) [0|0] "" Car'), "60000 bits from bit 0"),
+        (one("Speed", 'SG_ Speed : 64000|8@1+ (1,0) [0|0] "" Car'), "8 bits from bit 64000"),
+        (one("Speed", 'SG_ Speed : 60|8@1+ (1,0) [0|0] "" Car'), "cannot be decoded"),
+        (one("Speed", 'SG_ Speed : 0|16@1+ (1e999,0) [0|0] "" Car'), "has the scale '1e999'"),
+        (one("Speed", 'SG_ Speed : 0|16@1+ (0,0) [0|0] "" Car'), "has the scale '0'"),
+        (one("Speed", "SG_ Speed : soon"), r"cannot be read \(SG_ Speed : soon\)"),
+        (one("Speed", 'SG_ Speed m3 : 0|16@1+ (1,0) [0|0] "" Car'), "nothing says when frames carry"),
+        ("BO_ 99999999999999 Speed: 8 Car\n", "line 1 begins a message and cannot be read"),
+        ("VERSION", "declares no message"),
+        ("", "is empty"),
+    ],
+)
+def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path: Path, dbc: str, said: str) -> None:
+    log(tmp_path, [(k / 100, 291, bytes(8)) for k in range(50)], dbc=dbc)
+    with pytest.raises((DataError, MissingError), match=said) as caught:
+        read(tmp_path, channels=SPEED)
+    assert "\n" not in str(caught.value)
+
+
+def test_signals_that_nobody_wants_may_be_as_absurd_as_they_like(tmp_path: Path) -> None:
+    dbc = one("Speed", 'SG_ Speed : 0|16@1+ (0.01,0) [0|0] "m/s" Car') + (
+        ' SG_ Absurd : 9|99999@1+ (1,0) [0|0] "" Car\nBO_ 5 Huge: 4000000000 Car\n SG_ X : 0|4000000000@1+ (1,0) [0|0] "" Car\n'
+        'CM_ BO_ 291 "no end of it\n'
+    )
+    folder = log(tmp_path, [(k / 100, 291, struct.pack("<H6x", 1000)) for k in range(50)], dbc=dbc)
+    assert set(read(folder, channels=SPEED)["vx"]) == {10.0}
+
+
+def spoilt(tmp_path: Path, suffix: str, change: Any) -> Written:
+    written = write_log(drive(3.0), tmp_path, suffix)
+    written.log.write_bytes(change(written.log.read_bytes()))
+    return written
+
+
+def blf_with(content: bytes, method: int = 0) -> bytes:
+    """A BLF file with one container of whatever is given."""
+    head = b"LOGG" + struct.pack("<L", 144) + bytes(136)
+    body = content if method == 0 else zlib.compress(content)
+    return head + struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(body), 10) + struct.pack("<H6xL4x", method, len(content)) + body
+
+
+@pytest.mark.parametrize(
+    ("suffix", "change", "said"),
+    [
+        (".blf", lambda content: content[:-20], "is truncated"),
+        (".blf", lambda content: content[:100], "its head says"),
+        (".blf", lambda _: b"LOGG" + struct.pack("<L", 8) + bytes(200), "its head says that it is 8 bytes long"),
+        (".blf", lambda _: b"MDF     " + bytes(200), "is no BLF file"),
+        (".blf", lambda _: blf_with(struct.pack("<4sHHLL", b"LOBJ", 16, 7, 0, 1) + bytes(100)), "says that it is 0 bytes long"),
+        (".blf", lambda _: blf_with(struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 1) + bytes(100)), "is 4294967295 bytes long"),
+        (".blf", lambda _: blf_with(bytes(200 * 2**20), 2), "unpacks to more than 67108864 bytes"),
+        (".blf", lambda _: blf_with(b"nothing that begins an object"), "no object begins"),
+        (".blf", lambda _: blf_with(b"")[:144], "holds no frame"),
+        (".asc", lambda content: content[: content.rindex(b"Rx") + 12], "a frame of message .* holds"),
+        (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "cannot be read as a log of a bus .*zzz"),
+        (".asc", lambda _: b"x" * 200_000, "longer than 65536 bytes"),
+        (".asc", lambda _: bytes(range(256)) * 40, "holds no frame"),
+        (".log", lambda content: content[:-4] + b"\n(1e9) vcan0 120#0", "cannot be read as a log|holds 1 of the 8"),
+        (".log", lambda content: content.replace(b"(17", b"(nan17", 1), "cannot be read as a log"),
+        (".log", lambda content: b"(inf) vcan0 120#0000000000000000\n" + content, "is stamped inf s"),
+    ],
+)
+def test_a_damaged_log_is_one_line(tmp_path: Path, suffix: str, change: Any, said: str) -> None:
+    spoilt(tmp_path, suffix, change)
+    with pytest.raises(VehestError, match=said) as caught:
+        read(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_more_frames_than_the_limits_are_refused(tmp_path: Path) -> None:
+    write_log(drive(3.0), tmp_path, ".blf")
+    with use_limits(Limits(samples=100)), pytest.raises(DataError, match="holds 101 frames or more"):
+        read(tmp_path)
+    write_log(drive(3.0), tmp_path / "text", ".asc")
+    with use_limits(Limits(samples=100)), pytest.raises(DataError, match="rows or more"):
+        read(tmp_path / "text")
