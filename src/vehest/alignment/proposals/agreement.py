@@ -84,7 +84,7 @@ class Agreement:
         if self.relation is None:
             return ""
         scale = f", {abs(self.relation.scale):.2g} times as large" if math.isfinite(self.relation.tolerance) else ""
-        return f"{self.relation.left} and {self.relation.right} agree {self.strength:.2f}{scale}"
+        return f"{self.relation.left} and {self.relation.right} agree {self.relation.correlation:.2f}{scale}"
 
 
 def longitudinal(known: Known, column: Candidate, units: Sequence[str]) -> list[Agreement]:

@@ -24,13 +24,16 @@ from vehest.alignment.proposals.agreement import (
 from vehest.alignment.proposals.by_name import named_channels
 from vehest.alignment.proposals.columns import Candidate, candidates, correlation
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.turning import Turning, find_turning
+from vehest.alignment.proposals.turning import FAR, Turning, find_turning, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, wheel_proposals, with_wheels_for_speed
 from vehest.constants import FloatArray
 from vehest.data.units import factor_to_si
 
-SAME = 0.97  # correlation of one quantity measured twice
-SAME_SCALE = 0.25  # logarithm
+SAME = {"vx": 0.97, "yaw_rate": 0.97}  # correlation of one quantity measured twice
+SAME_NAMED = {"vx": 0.7, "yaw_rate": 0.9}  # of columns that are named alike; wheels slip
+SAME_SCALE = 0.35  # logarithm
+SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
+STANDING = 0.5  # m/s; the car did not move
 CLEAR = 0.6  # correlation that decides where nothing else comes near
 CLEAR_LATERAL = 0.45  # of what hangs on derivatives of noisy channels
 LEAST = 0.3
@@ -95,10 +98,19 @@ def _best(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: flo
         best = max((longitudinal(search.known, columns[k], ["m/s²"])[0].strength for k in free[:40]), default=0.0) if search.known else 0.0
         return one.score + 4.0 * best
 
-    if not turning:
+    if _stands(columns):
         return Search(columns, None, None)
+    if not turning:
+        named = turning_by_names(columns)
+        return Search(columns, None, None) if named is None else _search(columns, named, rate_hz)
     near = [one for one in turning if one.score > turning[0].score - 4.0]
     return _search(columns, max(near, key=support) if len(near) > 1 else near[0], rate_hz)
+
+
+def _stands(columns: Sequence[Candidate]) -> bool:
+    """Whether every column that is named as a speed, in a unit that the header gives, says that the car stands."""
+    told = [one for one in columns if roles.SPEED in one.hints and one.unit and one.measures("m/s")]
+    return bool(told) and all(np.quantile(np.abs(one.slow), 0.99) * factor_to_si(one.unit, "m/s") < STANDING for one in told)
 
 
 def _may_be_ax(column: Candidate) -> bool:
@@ -111,9 +123,9 @@ def _search(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> S
         rate_hz,
         columns[turning.speed].values * factor_to_si(units.speed, "m/s"),
         columns[turning.yaw_rate].values * factor_to_si(units.yaw_rate, "rad/s"),
-        sign * columns[turning.ay].values * factor_to_si(units.ay, "m/s²"),
+        np.empty(0) if turning.ay < 0 else sign * columns[turning.ay].values * factor_to_si(units.ay, "m/s²"),
     )
-    return Search(columns, turning, known, {turning.speed, turning.yaw_rate, turning.ay})
+    return Search(columns, turning, known, {turning.speed, turning.yaw_rate, turning.ay} - {-1})
 
 
 def _rate_by_ax(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> float | None:
@@ -131,20 +143,25 @@ def _rate_by_ax(columns: Sequence[Candidate], turning: Turning, rate_hz: float) 
 
 def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     """Signs as they are where the yaw rate counts as it does in the file."""
-    found: list[Proposal] = []
-    radius = None
+    found: dict[str, Proposal] = {}
+    radius, notes = None, ()
     if search.turning is not None and search.known is not None:
-        found += _turning_proposals(search, wheels)
-        found += _repeated(search)
-        found += _fitting(search)
+        for own in (*_turning_proposals(search, wheels), *_repeated(search, wheels)):
+            before = found.get(own.channel)
+            found[own.channel] = own if before is None or before.column != own.column else before.with_evidence(*own.evidence)
+            found[own.channel] = replace(found[own.channel], asked=own.asked or found[own.channel].asked, others=own.others)
+        fitting, notes = _one_sideslip(search, found, _fitting(search))
+        found |= {one.channel: one for one in fitting}
+        found = _paired(search, found, wheels)
     if wheels:
-        own, radius = wheel_proposals(search.columns, wheels, search.known, made_speed=not any(one.channel == "vx" for one in found))
-        found += own
+        made, radius = wheel_proposals(search.columns, wheels, search.known, made_speed="vx" not in found)
+        found |= {one.channel: one for one in made}
         search.taken.update(wheels.columns.values())
-    held = {one.channel for one in found}
-    found += named_channels(search.columns, search.free(), held, search.known)
+    for own in named_channels(search.columns, search.free(), found, search.known):
+        found[own.channel] = own
     gappy = {column.name for column in search.columns if column.missing > 0.0}
-    return Proposals(tuple(replace(one, gappy=one.column in gappy) for one in found), wheel_radius=radius)
+    channels = tuple(replace(one, gappy=one.column in gappy) for one in found.values())
+    return Proposals(channels, wheel_radius=radius, notes=notes)
 
 
 def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
@@ -152,17 +169,24 @@ def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
     turning, columns = search.turning, search.columns
     assert turning is not None
     units, sign = turning.units, -1 if turning.correlation < 0.0 else 1
-    text = f"ay and vx·yaw_rate agree {abs(turning.correlation):.2f} (sign {sign:+d}), in these units {math.exp(_signed(turning)):.2g} times as large"
-    asked = "" if units.decided else "units that explain the scale as well"
-    speed, yaw_rate, ay = (columns[k] for k in (turning.speed, turning.yaw_rate, turning.ay))
-    found = [
-        Proposal(yaw_rate.name, "yaw_rate", units.yaw_rate, 1, (text,), "" if yaw_rate.unit else asked),
-        Proposal(ay.name, "ay", units.ay, sign, (text,), "" if ay.unit else asked),
-    ]
-    if turning.speed not in wheels.stand_in:
-        backwards = -1 if float(np.median(speed.values)) < 0.0 else 1
-        found.insert(0, Proposal(speed.name, "vx", units.speed, backwards, (text,), "" if speed.unit else asked))
-    return found
+    speed, yaw_rate = columns[turning.speed], columns[turning.yaw_rate]
+    backwards = -1 if float(np.median(speed.slow)) < 0.0 else 1
+    if turning.ay < 0:
+        asked = "" if units.decided else "unit: no lateral acceleration ties speed and yaw rate together"
+        text = "its name and unit" if units.decided else "its name and size"
+        found = [Proposal(yaw_rate.name, "yaw_rate", units.yaw_rate, 1, (text,), asked)]
+        return found if turning.speed in wheels.stand_in else [Proposal(speed.name, "vx", units.speed, backwards, (text,), asked), *found]
+    size = math.exp(_signed(turning))
+    text = f"ay and vx·yaw_rate agree {turning.correlation:.2f}, ay {size:.3g} times as large in these units"
+    asked = "" if units.decided else "other units explain the scale as well"
+    if units.mismatch >= FAR:
+        asked = f"ay is {size:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
+
+    def own(column: Candidate, channel: str, unit: str, sign: int) -> Proposal:
+        return Proposal(column.name, channel, unit, sign, (text,), "" if column.unit and units.mismatch < FAR else asked)
+
+    found = [own(yaw_rate, "yaw_rate", units.yaw_rate, 1), own(columns[turning.ay], "ay", units.ay, sign)]
+    return found if turning.speed in wheels.stand_in else [own(speed, "vx", units.speed, backwards), *found]
 
 
 def _signed(turning: Turning) -> float:
@@ -171,25 +195,28 @@ def _signed(turning: Turning) -> float:
     return math.log(turning.scale / expected)
 
 
-def _repeated(search: Search) -> list[Proposal]:
+def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
     """Columns that repeat the speed or the yaw rate: measured and reference told apart by names, or asked; it corrects the first ones."""
     turning = search.turning
     assert turning is not None
     found: list[Proposal] = []
-    for place, role, channel, si in (
-        (turning.speed, roles.SPEED, "vx", "m/s"),
-        (turning.yaw_rate, roles.YAW_RATE, "yaw_rate", "rad/s"),
+    for place, role, channel, si, unit in (
+        (turning.speed, roles.SPEED, "vx", "m/s", turning.units.speed),
+        (turning.yaw_rate, roles.YAW_RATE, "yaw_rate", "rad/s", turning.units.yaw_rate),
     ):
         first = search.columns[place]
-        unit = {roles.SPEED: turning.units.speed, roles.YAW_RATE: turning.units.yaw_rate}[role]
-        same = [(k, own, sign) for k in search.free() if (own := _same_unit(search.columns[k], first, unit, si, role)) for sign in [_sign(search.columns[k], first)]]
-        search.taken.update(k for k, _, _ in same)
+        units = {k: _same_unit(search.columns[k], first, unit, si, role, channel) for k in search.free()}
+        same = [(search.columns[k], own, _sign(search.columns[k], first)) for k, own in units.items() if own]
+        search.taken.update(k for k, own in units.items() if own)
         if same:
-            found += _told_apart([(first, unit, 1), *((search.columns[k], own, sign) for k, own, sign in same)], channel)
-    for k in search.free():
-        for place in (turning.ay,):
-            if abs(correlation(search.columns[k].slow, search.columns[place].slow)) > 0.99 and search.columns[k].hint(roles.AY) >= 0.0:
-                search.taken.add(k)
+            found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, 1)]), *same], channel)
+    if turning.ay >= 0:
+        first = search.columns[turning.ay]
+        search.taken.update(
+            k
+            for k in search.free()
+            if abs(correlation(search.columns[k].slow, first.slow)) > 0.99 and search.columns[k].hint(roles.AY) >= 0.0
+        )
     return found
 
 
@@ -197,10 +224,11 @@ def _sign(column: Candidate, first: Candidate) -> int:
     return -1 if correlation(column.slow, first.slow) < 0.0 else 1
 
 
-def _same_unit(column: Candidate, first: Candidate, unit: str, si: str, role: str) -> str:
+def _same_unit(column: Candidate, first: Candidate, unit: str, si: str, role: str, channel: str) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
     agreeing = correlation(column.slow, first.slow)
-    if abs(agreeing) < SAME or column.hint(role) < 0.0 or not column.measures(si):
+    least = (SAME_NAMED if role in column.hints else SAME)[channel]
+    if abs(agreeing) < least or column.hint(role) < 0.0 or any(one.startswith("wheel") for one in column.hints) or not column.measures(si):
         return ""
     size = [float(np.sqrt(np.mean(np.square(one.slow)))) for one in (column, first)]
     offered = (column.unit,) if column.unit else (("m/s", "km/h") if si == "m/s" else ("rad/s", "deg/s"))
@@ -235,6 +263,46 @@ def _told_apart(family: Sequence[tuple[Candidate, str, int]], channel: str) -> l
 def _roughness(column: Candidate) -> float:
     """Size of the second difference."""
     return float(np.std(np.diff(column.values, 2))) / max(float(np.std(column.values)), 1e-12)
+
+
+def _paired(search: Search, found: dict[str, Proposal], wheels: Wheels) -> dict[str, Proposal]:
+    """The speed that is named like the lateral velocity is the reference's, where another speed or wheels can be the car's own."""
+    lateral, asked = found.get("vy_ref"), {name for name in ("vx", "vx_ref") if name in found and found[name].asked}
+    if lateral is None or "vx" not in found:
+        return found
+    speeds = {name: found[name] for name in ("vx", "vx_ref") if name in found}
+    named = [name for name, one in speeds.items() if roles.pair_of(one.column, lateral.column)]
+    if named == ["vx"] and asked == {"vx", "vx_ref"}:
+        text = f"named like '{lateral.column}'"
+        own, reference = replace(found["vx_ref"], channel="vx"), replace(found["vx"], channel="vx_ref")
+        evidence = tuple(one for one in reference.evidence if not one.startswith("the rougher"))
+        own = replace(own, evidence=tuple(one for one in own.evidence if not one.startswith("the smoother")))
+        return {**found, "vx": own, "vx_ref": replace(reference, evidence=(*evidence, text))}
+    if wheels and "vx_ref" not in found and (named == ["vx"] or roles.is_reference(found["vx"].column)):
+        told = roles.is_reference(found["vx"].column)
+        reference = replace(found["vx"], channel="vx_ref", others=("vx",)).with_evidence(
+            "named as a reference" if told else f"named like '{lateral.column}', and wheels are there for vx"
+        )
+        reference = replace(reference, asked=reference.asked or ("" if told else "whether it is the car's own speed or the reference's"))
+        return {name: one for name, one in found.items() if name != "vx"} | {"vx_ref": reference}
+    return found
+
+
+def _one_sideslip(search: Search, found: dict[str, Proposal], fitting: list[Proposal]) -> tuple[list[Proposal], tuple[str, ...]]:
+    """Without a sideslip angle that is another one than atan2(vy, vx)."""
+    own = {one.channel: one for one in fitting}
+    if not {"vy_ref", "sideslip_ref"} <= set(own) or "vx" not in found:
+        return fitting, ()
+    by_name = {column.name: column for column in search.columns}
+    speed = found.get("vx_ref", found["vx"])
+    velocity, forward = (by_name[one.column].slow * factor_to_si(one.unit, "m/s") for one in (own["vy_ref"], speed))
+    moving = forward > 0.2 * forward.max()
+    agreeing = correlation(np.arctan2(velocity, forward)[moving], by_name[own["sideslip_ref"].column].slow[moving])
+    if abs(agreeing) >= SAME_ANGLE:
+        return fitting, ()
+    left = own["sideslip_ref"].column
+    note = f"'{left}' is not atan2({own['vy_ref'].column}, {speed.column}) (correlation {agreeing:.2f}), so no sideslip angle; it is left out"
+    return [one for one in fitting if one.channel != "sideslip_ref"], (note,)
 
 
 # --- what agrees with the motion ----------------------------------------------------------------------------------------------------

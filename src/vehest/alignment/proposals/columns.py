@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.alignment.proposals.names import hints, is_filtered, is_reference
@@ -17,6 +18,10 @@ SLOW_HZ = 1.0  # below, a delay of a tenth of a second and vibration matter litt
 KEPT_HZ = 5.0
 MOST_SLOW = 4000  # samples
 MOST_MISSING = 0.5  # of a column's samples, which a line then bridges
+STRAY = 20.0  # times the spread of nearly all samples; beyond lies no sample of a motion
+MOST_STRAY = 0.002
+LONG = 1000  # samples
+FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +81,22 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -
     found = []
     for name, unit, values in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)
-        if known.mean() < 1.0 - MOST_MISSING or not np.ptp(values[known]) > 0.0:
+        missing = float(1.0 - known.mean())
+        if missing > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
+        if len(values) > LONG and np.min(np.diff(values[known])) >= 0.0:  # a clock, a distance: it only grows
+            continue
+        known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), float(1.0 - known.mean()), dict(hints(name))))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), missing, dict(hints(name))))
     return found
+
+
+def _stray(values: FloatArray) -> NDArray[np.bool_]:
+    """Samples that lie far outside of nearly all others, (T,); none where they are not few."""
+    low, middle, high = np.quantile(values, [MOST_STRAY, 0.5, 1.0 - MOST_STRAY])
+    stray = np.abs(values - middle) > STRAY * max(high - low, 1e-300)
+    return stray if stray.mean() <= MOST_STRAY else np.zeros(len(values), dtype=bool)
 
 
 def slow_of(values: FloatArray, rate_hz: float) -> FloatArray:

@@ -14,9 +14,9 @@ LATERAL_VELOCITY, SIDESLIP, HEADING, LATITUDE, LONGITUDE, POSITION_X, POSITION_Y
 )
 
 _STRONG = {  # over the name without blanks
-    OTHER: r"temp|druck_oel|oilp|gear|gang|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|dist|strecke|weg$|"
+    OTHER: r"temp|druck_oel|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|dist|strecke|weg$|"
     r"height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind|"
-    r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|zaehler",
+    r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|zaehler|time|zeit|stamp|safety",
     YAW_RATE: r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|angular(velocity)?z|gyr(o)?z|"
     r"^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     AY: r"latacc|latac|latera?lac|acclat|acc(el)?y|querb|querac|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|accquer|"
@@ -31,8 +31,8 @@ _STRONG = {  # over the name without blanks
     HEADING: r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
     LATITUDE: r"latitude|gpslat$|^lat$|breitengrad",
     LONGITUDE: r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
-    POSITION_X: r"^x$|posx|positionx|posex|xpos|viconx|^xm$",
-    POSITION_Y: r"^y$|posy|positiony|posey|ypos|vicony|^ym$",
+    POSITION_X: r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
+    POSITION_Y: r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     SPEED: r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|"
     r"lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollrate|rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
@@ -126,10 +126,19 @@ def corner_of(words: str) -> str:
         return ""
     for corner, pattern in _CORNERS.items():
         apart = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words)
-        joined = re.search(rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|dreh\w*)(?:{pattern})$", words.replace(" ", ""))
-        if joined or (apart and re.search(r"wh(ee)?l|rad|spd|speed|rpm|dreh|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel", words)):
+        joined = re.search(rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$", words.replace(" ", ""))
+        if joined or (apart and re.search(r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel", words)):
             return corner
     return ""
+
+
+def pair_of(longitudinal: str, lateral: str) -> bool:
+    """Whether two names are one but for x and y, u and v, or long and lat."""
+    words = bare(longitudinal), bare(lateral)
+    swapped = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
+    return any(
+        words[0] != words[1] and re.sub(rf"{one}(?![a-z]*{one})", other, words[0]) == words[1] for one, other in swapped if one in words[0]
+    )
 
 
 def is_reference(name: str) -> bool:

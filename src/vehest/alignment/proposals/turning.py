@@ -22,6 +22,8 @@ APART = 0.2  # by which the next best units must be worse
 RANGES = {SPEED: (0.5, 110.0), YAW_RATE: (0.02, 8.0), AY: (0.3, 60.0)}  # of the 99th percentile, SI
 MOST_COLUMNS = 60
 MOST_KEPT = 8
+LEAST_SCORE = 6.0
+UNNAMED = 3.0  # of score, for a column that no name speaks for where one speaks for another
 NAMELESS = 0.5  # rank of a column whose name says nothing
 
 
@@ -51,7 +53,7 @@ class Turning:
     Args:
         speed: index of the column.
         yaw_rate: likewise.
-        ay: likewise.
+        ay: likewise; -1 where there is none, and names alone tell of the other two.
         correlation: of ay with speed·yaw_rate, with its sign.
         scale: ay over speed·yaw_rate in the file's units, positive.
         units: that explain the scale.
@@ -87,7 +89,26 @@ def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
             if len({s, r, a}) == 3:
                 scale = float(sizes[j] / scales[i])
                 found.append(_scored(columns, (s, r, a), float(agreeing[i, j]), scale))
-    return sorted(found, key=lambda one: -one.score)[:MOST_KEPT]
+    return [one for one in sorted(found, key=lambda one: -one.score)[:MOST_KEPT] if one.score >= LEAST_SCORE]
+
+
+def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
+    """Speed and yaw rate by name, where no lateral acceleration ties them together; None where one has none."""
+    named = {}
+    for role in (SPEED, YAW_RATE):
+        pool = [k for k in _pool(columns, role) if role in columns[k].hints]
+        if not pool:
+            return None
+        named[role] = max(pool, key=lambda k: (columns[k].hints[role], not columns[k].is_filtered, bool(columns[k].unit), -k))
+    if named[SPEED] == named[YAW_RATE]:
+        return None
+    units = []
+    for role, k in named.items():
+        low, high = RANGES[role]
+        fitting = [unit for unit in UNITS[role] if low <= extent(columns[k], unit, factor_unit(role)) <= high]
+        units.append(columns[k].unit or (fitting or [UNITS[role][0]])[0])
+    decided = all(columns[k].unit for k in named.values())
+    return Turning(named[SPEED], named[YAW_RATE], -1, 0.0, 0.0, Units(units[0], units[1], "m/s²", 0.0, decided), 0.0)
 
 
 def _pool(columns: Sequence[Candidate], role: str) -> list[int]:
@@ -122,6 +143,11 @@ def _scored(columns: Sequence[Candidate], triple: tuple[int, int, int], agreeing
     score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
     score += sum(one.hint(role) + (1.5 if one.unit else 0.0) - 0.5 * one.is_filtered for role, one in named.items())
     score -= 0.5 * named[AY].is_reference
+    for role, one in named.items():
+        if role not in one.hints and any(role in other.hints for other in columns):
+            score -= UNNAMED
+    level = np.abs(named[SPEED].slow)
+    score -= 2.0 if float(np.std(level)) < 0.05 * float(np.mean(level)) and SPEED not in named[SPEED].hints else 0.0
     score += 3.0 if units.mismatch < CLOSE else 1.0 if units.mismatch < FAR else -5.0
     for role, unit in zip(UNITS, (units.speed, units.yaw_rate, units.ay), strict=True):
         low, high = RANGES[role]
