@@ -301,7 +301,9 @@ def _one_sideslip(search: Search, found: dict[str, Proposal], fitting: list[Prop
     if abs(agreeing) >= SAME_ANGLE:
         return fitting, ()
     left = own["sideslip_ref"].column
-    note = f"'{left}' is not atan2({own['vy_ref'].column}, {speed.column}) (correlation {agreeing:.2f}), so no sideslip angle; it is left out"
+    note = (
+        f"'{left}' is not atan2({own['vy_ref'].column}, {speed.column}) (correlation {agreeing:.2f}), so no sideslip angle; it is left out"
+    )
     return [one for one in fitting if one.channel != "sideslip_ref"], (note,)
 
 
@@ -385,7 +387,10 @@ def _as_steering(search: Search, column: Candidate) -> tuple[float, Proposal] | 
         return None
     slope, straight = slope_of_steering(known, column)
     sign = agreement.sign if agreement.strength else (-1 if slope < 0.0 else 1)
-    text = (agreement.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}", *_name_text(column, roles.STEER, roles.HANDWHEEL))
+    text = (
+        agreement.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}",
+        *_name_text(column, roles.STEER, roles.HANDWHEEL),
+    )
     found = angles(known, column, [column.unit] if column.unit else ANGLES)
     if roles.HANDWHEEL in column.hints:
         found = [one for one in found if one.channel == HAND_WHEEL] or found
@@ -445,7 +450,11 @@ def _plausible(known: Known, column: Candidate, one: Agreement) -> bool:
 
 
 def _name_text(column: Candidate, *wanted: str) -> tuple[str, ...]:
-    return (f"its name{' and unit' if column.unit else ''}",) if any(role in column.hints for role in wanted) else (("its unit",) if column.unit else ())
+    return (
+        (f"its name{' and unit' if column.unit else ''}",)
+        if any(role in column.hints for role in wanted)
+        else (("its unit",) if column.unit else ())
+    )
 
 
 # --- left and right ------------------------------------------------------------------------------------------------------------------
@@ -462,7 +471,9 @@ def _left_and_right(proposals: Proposals, search: Search, wheels: Wheels, compas
             return replace(proposals if told > 0.0 else proposals.mirrored(), left_right=text)
         agreeing = _with_compass(search, compass)
         if abs(agreeing) > 0.5:
-            text = f"'{compass}', clockwise by its format, runs against yaw_rate, sign {'+' if agreeing > 0 else '-'}1 ({abs(agreeing):.2f})"
+            text = (
+                f"'{compass}', clockwise by its format, runs against yaw_rate, sign {'+' if agreeing > 0 else '-'}1 ({abs(agreeing):.2f})"
+            )
             return replace(proposals if agreeing > 0.0 else proposals.mirrored(), left_right=text)
     return proposals.mirrored() if sum(counts) < 0 else proposals
 
@@ -476,5 +487,3 @@ def _with_compass(search: Search, compass: str) -> float:
     turned = -np.gradient(heading) * search.known.rate_hz
     usual = np.abs(turned) < 8.0
     return correlation(turned[usual], search.known.yaw_rate[usual])
-
-

@@ -78,4 +78,6 @@ def _by_name(column: Candidate, channel: str, units: Sequence[str]) -> Proposal:
     fitting = [unit for unit in units if low <= size * factor_to_si(unit, si) <= high]
     unit = column.unit or (fitting[0] if fitting else units[0])
     told = "its name and unit" if column.unit else f"its name, and {size:.3g} for its 99th percentile"
-    return Proposal(column.name, channel, unit, 1, (told,), "sign" if column.unit else "unit and sign: nothing to hold it against", others=tuple(units))
+    return Proposal(
+        column.name, channel, unit, 1, (told,), "sign" if column.unit else "unit and sign: nothing to hold it against", others=tuple(units)
+    )

@@ -62,13 +62,26 @@ _CORNERS = {
     "rl": r"rl|hl|lr|rear ?left|hinten ?links|left ?rear",
     "rr": r"rr|hr|rear ?right|hinten ?rechts|right ?rear",
 }
-_NO_SPEED_OF_A_WHEEL = re.compile(r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|winkel|disp|damp|tyre|tire")
+_NO_SPEED_OF_A_WHEEL = re.compile(
+    r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|winkel|disp|damp|tyre|tire"
+)
 
 
 def bare(name: str) -> str:
     """A name in lower-case words without marks, umlauts and what stands in brackets."""
     text = re.sub(r"[\[({<].*$", "", name) or name
-    for letter, plain in {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ψ": "psi", "β": "beta", "δ": "delta"}.items():
+    for letter, plain in {
+        "ä": "ae",
+        "ö": "oe",
+        "ü": "ue",
+        "Ä": "Ae",
+        "Ö": "Oe",
+        "Ü": "Ue",
+        "ß": "ss",
+        "ψ": "psi",
+        "β": "beta",
+        "δ": "delta",
+    }.items():
         text = text.replace(letter, plain)
     text = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     return re.sub(r"[\W_]+", " ", text).strip().lower()
@@ -83,7 +96,13 @@ def hints(name: str) -> dict[str, float]:
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
     if re.search(r"brake|brems", words) and re.search(r"press|druck|^p ?brake|bar$", words):
-        axle = "front" if re.search(r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", words) else "rear" if re.search(r"rear|\br\b|hint|\bha\b", words) else ""
+        axle = (
+            "front"
+            if re.search(r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", words)
+            else "rear"
+            if re.search(r"rear|\br\b|hint|\bha\b", words)
+            else ""
+        )
         return {f"brake_pressure_{axle}": STRONG} if axle else {OTHER: STRONG}
     found: dict[str, float] = {}
     for table, score in ((_WEAK, WEAK), (_STRONG, STRONG)):
@@ -126,7 +145,9 @@ def corner_of(words: str) -> str:
         return ""
     for corner, pattern in _CORNERS.items():
         apart = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words)
-        joined = re.search(rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$", words.replace(" ", ""))
+        joined = re.search(
+            rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$", words.replace(" ", "")
+        )
         if joined or (apart and re.search(r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel", words)):
             return corner
     return ""

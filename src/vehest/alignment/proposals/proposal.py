@@ -80,7 +80,5 @@ class Proposals:
         return replace(self, channels=tuple(turned))
 
 
-LATERAL = frozenset(
-    {"yaw_rate", "ay", "steer", "handwheel", "vy_ref", "sideslip_ref", "yaw_rate_ref", "roll", "roll_rate"}
-)
+LATERAL = frozenset({"yaw_rate", "ay", "steer", "handwheel", "vy_ref", "sideslip_ref", "yaw_rate_ref", "roll", "roll_rate"})
 """Channels whose sign depends on which way is left."""

@@ -166,10 +166,15 @@ def wheel_proposals(
         text += (f"{unit} at the rim by {whose}" if at_rim else f"a radius of {radius:.3g} m by {whose} in {unit}",)
     found = [
         Proposal(
-            columns[k].name, f"wheel_speed_{corner}", "rad/s" if at_rim else unit, 1, text, asked, factor=float(f"{factor:.7g}"), others=(UNITS if asked else ())
+            columns[k].name,
+            f"wheel_speed_{corner}",
+            "rad/s" if at_rim else unit,
+            1,
+            text,
+            asked,
+            factor=float(f"{factor:.7g}"),
+            others=(UNITS if asked else ()),
         )
         for corner, k in sorted(wheels.columns.items())
     ]
     return found, (float(f"{radius:.3g}") if made_speed else None)
-
-

@@ -57,5 +57,3 @@ def _begins_as_mdf(path: Path) -> bool:
         return True
     with open(path, "rb") as stream:
         return stream.read(8) in (b"MDF     ", b"UnFinMF ")
-
-

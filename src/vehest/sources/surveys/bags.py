@@ -46,9 +46,7 @@ def survey_bag(path: Path) -> Log:
     if not columns:
         raise DataError(f"'{path}' holds no topic of plain numbers ({'; '.join(skipped[:3]) or 'it is empty'})")
     start = min(float(column.stamps[0]) for column in columns if column.stamps is not None)
-    shifted = [
-        RawColumn(one.name, one.unit, one.values, one.place, None if one.stamps is None else one.stamps - start) for one in columns
-    ]
+    shifted = [RawColumn(one.name, one.unit, one.values, one.place, None if one.stamps is None else one.stamps - start) for one in columns]
     return Log(path, "rosbag", tuple(shifted), skipped=tuple(skipped))
 
 

@@ -174,10 +174,10 @@ def _layout(lines: Sequence[str], delimiter: str) -> _Layout:
     names, units = None, ()
     header = above[-1] if above else 0
     if above:
-        names = tuple(cell.strip() for cell in rows[above[-1]])
+        names = tuple(rows[above[-1]])
         if len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(names):
-            units, header = names, above[-2]
-            names = tuple(cell.strip() for cell in rows[header])
+            units, header = tuple(cell.strip() for cell in names), above[-2]
+            names = tuple(rows[header])
     return _Layout(delimiter, score, decimal, header, first, names, units)
 
 
