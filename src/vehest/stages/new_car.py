@@ -29,6 +29,7 @@ from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.columns import ClockPolicy, plain_rate, uniform_clock
 from vehest.sources.surveys import Log, RawColumn, survey
+from vehest.sources.surveys.clocks import UNITS
 from vehest.sources.unit_spellings import plain_unit
 from vehest.stages.new_car_files import Located, located
 
@@ -77,6 +78,19 @@ class Examined:
     located: Located
     rate_hz: float | None = None
     evidence_seconds: float = 0.0
+
+    def clocked(self, *, rate_hz: float | None = None, unit: str = "") -> Examined:
+        """The same with another rate, or with the clock in another unit."""
+        if unit and self.log.clock is not None:
+            factor = UNITS[unit] / UNITS[self.log.clock.unit]
+            logs = tuple(
+                replace(log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor)
+                if log.clock is not None and log.seconds is not None
+                else log
+                for log in self.logs
+            )
+            return replace(self, logs=logs)
+        return replace(self, rate_hz=rate_hz or self.rate_hz)
 
     @property
     def log(self) -> Log:
@@ -236,13 +250,15 @@ class Draft:
         )
 
 
-def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle, rate_hz: float | None = None) -> Draft:
+def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle) -> Draft:
     """The data set by proposals that were confirmed or corrected, read as an ingest would read it.
 
     Raises:
         VehestError: it cannot be read by it.
     """
-    dataset = _dataset(examined, proposals, vehicle, rate_hz or examined.rate_hz)
+    if not proposals.channels:
+        raise ConfigurationError("no column is left that would be a channel")
+    dataset = _dataset(examined, proposals)
     plain = {**dataset, "transforms": _speed(proposals)}
     longest = max(_recordings(plain), key=lambda own: own.duration)
     late, findings = late_channels(longest), checks_of_recording(longest)
@@ -279,7 +295,7 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return [source.read(name) for name in source.ids()]
 
 
-def _dataset(examined: Examined, proposals: Proposals, vehicle: Vehicle, rate_hz: float | None) -> dict[str, Any]:
+def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
     """Without transforms."""
     log, name = examined.log, examined.name
     common: dict[str, Any] = {
@@ -303,9 +319,7 @@ def _dataset(examined: Examined, proposals: Proposals, vehicle: Vehicle, rate_hz
     if log.source != "vbo":
         common["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         if log.clock is None:
-            if rate_hz is None:
-                raise DataError(f"'{log.file}' has no column of times; give --rate")
-            common["rate_hz"] = rate_hz
+            common["rate_hz"] = examined.rate_hz
     common["clock"] = _policy(examined, len(channels))
     gappy = [one.channel for one in proposals.channels if one.gappy or _has_gaps(examined, one.column)]
     return common | {"channels": channels, "gappy": gappy}

@@ -12,7 +12,6 @@ from typing import Any
 
 import yaml
 
-from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
 
@@ -54,7 +53,8 @@ def located(files: Sequence[Path], source: str) -> Located:
     path = os.path.relpath(folder, here) if folder.is_relative_to(here) else str(folder)
     if source == "rosbag":
         return Located(path, tuple(files), "")
-    patterns = [names[0]] if len(names) == 1 else [f"{os.path.commonprefix(names)}*{_common_end(names)}", f"*{_common_end(names)}"]
+    end = _common_end(names)
+    patterns = [names[0]] if len(names) == 1 else [f"{_common_start(names)}*{end}", f"*{end}"]
     beside = [file.name for file in folder.iterdir() if file.is_file()]
     for pattern in patterns:
         others = sorted(name for name in beside if fnmatch(name, _escaped(pattern)) and name not in names)
@@ -72,8 +72,15 @@ def located(files: Sequence[Path], source: str) -> Located:
     )
 
 
+def _common_start(names: Sequence[str]) -> str:
+    same = 0
+    while all(name[: same + 1] == names[0][: same + 1] for name in names) and same < min(map(len, names)):
+        same += 1
+    return names[0][:same].rstrip("0123456789")
+
+
 def _common_end(names: Sequence[str]) -> str:
-    return os.path.commonprefix([name[::-1] for name in names])[::-1].lstrip("0123456789") or ""
+    return _common_start([name[::-1] for name in names])[::-1]
 
 
 def _escaped(pattern: str) -> str:
@@ -122,6 +129,8 @@ def write_all(files: Sequence[Written], *, force: bool) -> None:
 
 def flow(value: Any) -> str:
     """A value in YAML on one line."""
+    if "${" in str(value):
+        raise ConfigurationError(f"'{printable(str(value)[:60])}' holds '${{', which configurations read as a reference; rename it")
     text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=10_000, sort_keys=False).strip()
     return text.removesuffix("...").strip()
 
@@ -144,8 +153,3 @@ def dataset_text(dataset: Mapping[str, Any], comments: Mapping[str, str], head: 
 
 def _commented(text: str, comment: str) -> str:
     return f"{text:<44} # {printable(comment)}" if comment else text
-
-
-def meaning(channel: str) -> str:
-    """What a channel is, in a word or two."""
-    return CHANNELS[channel].meaning

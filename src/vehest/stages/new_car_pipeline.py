@@ -53,7 +53,13 @@ FAMILIES = (
     Family("static_map"),
     Family("kinematic"),
     Family("data_sheet", about="baseline: steady cornering from the data sheet"),
-    Family("ksnn", ("estimator.n_hidden=0,2", "estimator.bias=true"), ("training.max_epochs=100",), "kinematics-structured network; a minute", seeds=2),
+    Family(
+        "ksnn",
+        ("estimator.n_hidden=0,2", "estimator.bias=true"),
+        ("training.max_epochs=100",),
+        "kinematics-structured network; a minute",
+        seeds=2,
+    ),
     Family("luenberger", (), ("training.grid=2", "training.max_evaluations=100"), "observer; a minute"),
     Family("kalman", (), (), "Kalman filter over a single track; nothing is learnt but noise levels", STIFF),
     Family("rational_ekf", (), ("training.grid=1", "training.max_evaluations=40"), "filter whose tyres adapt; a minute", STIFF),
@@ -81,7 +87,13 @@ FAMILIES = (
         "network trained through its filter; ten minutes and more",
         (*INERTIA, "cg_height"),
     ),
-    Family("learned_ukf", (), ("training.through.max_epochs=50",), "filter whose dynamics are learnt, of electric cars; ten minutes and more", ("mass", "wheelbase")),
+    Family(
+        "learned_ukf",
+        (),
+        ("training.through.max_epochs=50",),
+        "filter whose dynamics are learnt, of electric cars; ten minutes and more",
+        ("mass", "wheelbase"),
+    ),
 )
 """In the order of what is expected of them on a car that nobody knows, cheap ones before dear ones of the same promise."""
 

@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.units import factor_to_si
 from vehest.stages.new_car import Examined, Vehicle
 
-LEFT_RIGHT, RATE, RADIUS = "left_right", "rate", "radius"
+LEFT_RIGHT, RATE, RADIUS, TIME = "left_right", "rate", "radius", "time"
 VEHICLE = {
     "wheelbase": "wheelbase [m]",
     "mass": "mass [kg]",
@@ -70,7 +70,7 @@ def questions_of(examined: Examined) -> list[Question]:
         clock = examined.log.clock
         asked.append(
             Question(
-                f"time:{clock.column}",
+                TIME,
                 f"is '{clock.column}' the time, in {clock.unit}?",
                 clock.unit,
                 ("s", "ms", "us", "ns"),
@@ -139,7 +139,7 @@ def answered(proposals: Proposals, question: Question, answer: str) -> Proposals
         ConfigurationError: the answer is none.
     """
     answer = answer.strip()
-    if not answer or answer == question.proposed or question.key in (RATE, *VEHICLE):
+    if not answer or answer == question.proposed or question.key in (RATE, TIME, *VEHICLE):
         return proposals
     if question.key == LEFT_RIGHT:
         if answer.lower() not in ("y", "yes", "n", "no"):
@@ -148,6 +148,25 @@ def answered(proposals: Proposals, question: Question, answer: str) -> Proposals
     if question.key == RADIUS:
         return replace(proposals, wheel_radius=number(answer, "the radius"))
     return _redeclared(proposals, question.key, answer)
+
+
+def check_answer(question: Question, answer: str) -> None:
+    """See that an answer is one.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    if not answer or answer == question.proposed:
+        return
+    if question.key in (RATE, RADIUS, *VEHICLE):
+        number(answer, question.key)
+    elif question.key == TIME:
+        if answer not in question.candidates:
+            raise ConfigurationError(f"'{answer}' is none of {', '.join(question.candidates)}")
+    elif question.key == LEFT_RIGHT:
+        answered(Proposals(()), question, answer)
+    else:
+        answered(Proposals((Proposal(question.key, question.proposed.split()[0], question.proposed.split()[1]),)), question, answer)
 
 
 def number(text: str, what: str) -> float:

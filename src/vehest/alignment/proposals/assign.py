@@ -323,14 +323,17 @@ def _fitting(search: Search) -> list[Proposal]:
                 offered[channel, k] = proposal
     wanted = ["ax", "steering", "lateral"]
     scores = np.array([[offered[channel, k][0] if (channel, k) in offered else 0.0 for k in free] for channel in wanted])
-    found = []
+    found: list[Proposal] = []
+    chosen: dict[str, int] = {}
     if len(free):
         for row, place in zip(*linear_sum_assignment(scores, maximize=True), strict=True):
             key = (wanted[row], free[place])
             if key in offered and offered[key][0] > 0.0:
-                rivals = [offered[wanted[row], k] for k in free if k != free[place] and (wanted[row], k) in offered]
-                found.append(_with_rivals(offered[key], rivals))
-                search.taken.add(free[place])
+                chosen[wanted[row]] = free[place]
+    search.taken.update(chosen.values())
+    for channel, k in chosen.items():
+        rivals = [offered[channel, other] for other in free if other not in search.taken and (channel, other) in offered]
+        found.append(_with_rivals(offered[channel, k], rivals))
     return found + _second_lateral(search, found, offered, free)
 
 
