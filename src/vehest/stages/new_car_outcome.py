@@ -64,6 +64,7 @@ class Outcome:
             "recordings": [one.id for one in own.contents],
             "rate_hz": min(one.rate_hz for one in own.contents),
             "seconds": own.seconds,
+            "time": _clock_plain(own.examined),
             "channels": [_channel_plain(one) for one in own.proposals.channels],
             "left_right": own.proposals.left_right or None,
             "unused": list(own.proposals.unused),
@@ -78,6 +79,11 @@ class Outcome:
             "written": [str(one.file) for one in self.files],
             "next": self.next_commands(),
         }
+
+
+def _clock_plain(examined: Examined) -> dict[str, Any] | None:
+    clock = examined.log.clock
+    return None if clock is None else {"column": clock.column, "unit": clock.unit, "evidence": clock.evidence, "asked": clock.asked}
 
 
 def _channel_plain(one: Proposal) -> dict[str, Any]:
