@@ -30,6 +30,7 @@ from vehest.sources.base import open_source
 from vehest.sources.columns import ClockPolicy, plain_rate, uniform_clock
 from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.surveys.clocks import UNITS
+from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 from vehest.stages.new_car_files import Located, located
 
@@ -38,10 +39,15 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 POLICIES: tuple[ClockPolicy, ...] = ("strict", "interpolate", "uniform")
 BAG_HZ = 100.0
+MOST_SKIPPED = 5
 LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
 CLOCKWISE = {"vbo": "heading"}
 """Source -> column that counts a heading clockwise by its format."""
+WEST_POSITIVE = ("vbo",)
+TABLES = ("tabular", "text_log")
+BRIDGED = 1.0  # s without a sample that straight lines bridge
+POSE_SECONDS = 0.15  # of the filter that differentiates poses
 
 
 @dataclass(frozen=True)
@@ -118,18 +124,35 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
     longest = max(logs, key=_length)
     columns, rate, seconds = evidence_of(longest)
-    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""))
+    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
+    if longest.source not in TABLES:  # other sources make no reference of positions
+        proposals = replace(proposals, pose=())
     used = {one.column for one in proposals.channels}
     for log in logs:
         missing = sorted(used - {column.name for column in log.columns})
         if missing:
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
     if not proposals.channels:
         names = ", ".join(column.name for column in longest.columns[:8])
         raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
     constant = not longest.has_clock
     first = (longest, *(log for log in logs if log is not longest))
     return Examined(name, first, proposals, located(files, longest.source), proposals.rate_hz if constant else None, seconds)
+
+
+def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
+    """What is to be known of the files themselves."""
+    notes = [f"not read: {text}" for text in longest.skipped[:MOST_SKIPPED]]
+    notes += [f"not read: {len(longest.skipped) - MOST_SKIPPED} more"] if len(longest.skipped) > MOST_SKIPPED else []
+    for log in logs:
+        for run in log.runs if log.seconds is not None else ():
+            steps = np.diff(log.seconds[run]) if log.seconds is not None else np.zeros(0)
+            if len(steps) and steps.max() > BRIDGED:
+                at = float(log.seconds[run][int(np.argmax(steps))]) if log.seconds is not None else 0.0
+                notes.append(f"'{log.file.name}' has a gap of {steps.max():.3g} s, {at:.4g} s after its start, across which lines are drawn; cut it there")
+                break
+    return tuple(notes)
 
 
 def _length(log: Log) -> float:
@@ -162,10 +185,10 @@ def _on_one_clock(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | 
         grid = np.arange(begin, end, 1.0 / rate)
         return [(column.name, _unit(column), np.interp(grid, stamps, column.values)) for column, stamps in timed], rate
     run = log.runs[0]
-    columns = [(column.name, _unit(column), column.values[run]) for column in log.columns]
     if log.seconds is None:
-        return columns, None
+        return [(column.name, _unit(column), column.values[run]) for column in log.columns], None
     stamps = log.seconds[run]
+    columns = [(column.name, _unit(column), bridged(column.values[run], stamps, BRIDGED)) for column in log.columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     rate = plain_rate(1.0 / step, 5e-3)
     even = np.arange(len(stamps)) / rate
@@ -321,12 +344,37 @@ def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
         if log.clock is None:
             common["rate_hz"] = examined.rate_hz
     common["clock"] = _policy(examined, len(channels))
-    gappy = [one.channel for one in proposals.channels if one.gappy or _has_gaps(examined, one.column)]
-    return common | {"channels": channels, "gappy": gappy}
+    gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
+    short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
+    if short and log.source in TABLES and not _is_parquet(log.file):
+        common |= {"source": "text_log", "bridge": math.ceil(100.0 * max(short) * 1.05) / 100.0}
+        gaps = {name: gap for name, gap in gaps.items() if gap > BRIDGED}
+    common |= {"channels": channels, "gappy": [name for name, gap in gaps.items() if gap > 0.0]}
+    if proposals.pose:
+        rate = _rate(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
+        parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
+        made = [name for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref") if name not in channels]
+        common["pose"] = {**parts, "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5), "order": 2, "channels": made}
+    return common
 
 
-def _has_gaps(examined: Examined, column: str) -> bool:
-    return any(not np.isfinite(own.values).all() for log in examined.logs for own in log.columns if own.name == column)
+def _is_parquet(file: Path) -> bool:
+    return file.suffix.lower() in (".parquet", ".pq")
+
+
+def _longest_gap(examined: Examined, column: str) -> float:
+    """Longest time without a sample in any file [s]; infinite where there are no times, 0 where none is missing."""
+    longest = 0.0
+    for log in examined.logs:
+        values = next(own.values for own in log.columns if own.name == column)
+        known = np.isfinite(values)
+        if known.all():
+            continue
+        seconds = log.seconds if log.seconds is not None else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+        for run in log.runs:
+            edges = np.concatenate([seconds[run][:1], seconds[run][known[run]], seconds[run][-1:]])
+            longest = max(longest, float(np.diff(edges).max(initial=0.0))) if known[run].any() else math.inf
+    return longest
 
 
 def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:

@@ -67,6 +67,7 @@ class Outcome:
             "time": _clock_plain(own.examined),
             "channels": [_channel_plain(one) for one in own.proposals.channels],
             "left_right": own.proposals.left_right or None,
+            "pose": {part: {"column": column, "unit": unit} for part, column, unit in own.proposals.pose},
             "unused": list(own.proposals.unused),
             "open": [question.as_plain() for question in self.open],
             "vehicle": {key: getattr(own.vehicle, key) for key in VEHICLE},
@@ -210,6 +211,8 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
         "transforms.velocity_from_sideslip": "the reference that estimates are scored by",
         "transforms.acceleration_from_speed": "there is no ax in the log",
         "transforms.speed_from_wheels": "there is no speed in the log",
+        "bridge": "longest time without a sample that a straight line bridges [s]",
+        "pose": "the reference is made of positions and yaw (z up); yaw_offset, lever_x and lever_y where the markers sit askew",
         "transforms.delay_correction": "the reference's own lateness",
     }
     for one in made.proposals.channels:

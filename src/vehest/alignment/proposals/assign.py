@@ -22,7 +22,8 @@ from vehest.alignment.proposals.agreement import (
     steering,
 )
 from vehest.alignment.proposals.by_name import named_channels
-from vehest.alignment.proposals.columns import Candidate, candidates, correlation
+from vehest.alignment.proposals.columns import Candidate, candidates, correlation, slow_of
+from vehest.alignment.proposals.poses import find_pose
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.turning import FAR, Turning, find_turning, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, wheel_proposals, with_wheels_for_speed
@@ -40,6 +41,7 @@ LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
 RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
+FEWEST = 50  # samples of a course
 ACCELERATIONS, ANGLES = ("m/s²", "g"), ("rad", "deg")
 
 
@@ -64,13 +66,16 @@ class Search:
         return [k for k in range(len(self.columns)) if k not in self.taken]
 
 
-def propose(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float | None, *, compass: str = "") -> Proposals:
+def propose(
+    columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float | None, *, compass: str = "", west_positive: bool = False
+) -> Proposals:
     """What the columns of a log are.
 
     Args:
         columns: name, unit as vehest spells it (empty where the file does not say), values on an even clock, (T,) each.
         rate_hz: of that clock; None where nothing is known of it.
         compass: column that counts the heading clockwise by its file's format; empty where there is none.
+        west_positive: whether longitudes count to the west.
     """
     rate = rate_hz or NOMINAL_RATE
     found = candidates(columns, rate)
@@ -80,11 +85,14 @@ def propose(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float | Non
     if turning and rate_hz is None:
         guessed = _rate_by_ax(with_wheels, turning[0], rate)
         if guessed is not None:
-            return replace(propose(columns, guessed, compass=compass), rate_hz=guessed)
+            found_again = propose(columns, guessed, compass=compass, west_positive=west_positive)
+            return replace(found_again, rate_hz=guessed)
     search = _best(with_wheels, turning, rate)
     proposals = _assigned(search, wheels, rate)
-    proposals = _left_and_right(proposals, search, wheels, compass)
-    used = {one.column for one in proposals.channels}
+    if not {"vy_ref", "sideslip_ref"} & set(proposals.by_channel):
+        proposals = replace(proposals, pose=find_pose(search.columns, search.known))
+    proposals = _left_and_right(proposals, search, wheels, _compasses(search, compass, west_positive))
+    used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, _, _ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
 
@@ -144,7 +152,8 @@ def _rate_by_ax(columns: Sequence[Candidate], turning: Turning, rate_hz: float) 
 def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     """Signs as they are where the yaw rate counts as it does in the file."""
     found: dict[str, Proposal] = {}
-    radius, notes = None, ()
+    radius: float | None = None
+    notes: tuple[str, ...] = ()
     if search.turning is not None and search.known is not None:
         for own in (*_turning_proposals(search, wheels), *_repeated(search, wheels)):
             before = found.get(own.channel)
@@ -208,6 +217,10 @@ def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
         units = {k: _same_unit(search.columns[k], first, unit, si, role, channel) for k in search.free()}
         same = [(search.columns[k], own, _sign(search.columns[k], first)) for k, own in units.items() if own]
         search.taken.update(k for k, own in units.items() if own)
+        scaled = [k for k in search.free() if channel == "vx" and _is_scaled(search.columns[k], first)]
+        if scaled and not same and place not in wheels.stand_in:
+            search.taken.add(scaled[0])
+            found += _scaled_speed(search.columns[scaled[0]], first, unit)
         if same:
             found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, 1)]), *same], channel)
     if turning.ay >= 0:
@@ -218,6 +231,23 @@ def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
             if abs(correlation(search.columns[k].slow, first.slow)) > 0.99 and search.columns[k].hint(roles.AY) >= 0.0
         )
     return found
+
+
+def _is_scaled(column: Candidate, first: Candidate) -> bool:
+    """Whether a column that is named as a speed, without a unit, is one but for its scale, as a motor's speed is."""
+    return column.hints.get(roles.SPEED) == roles.STRONG and not column.unit and abs(correlation(column.slow, first.slow)) > SAME_NAMED["vx"]
+
+
+def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Proposal]:
+    """The car's own speed in counts, and the reference's by which it is scaled."""
+    speed = first.slow * factor_to_si(unit, "m/s")
+    factor = float(column.slow @ speed) / float(column.slow @ column.slow)
+    asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{first.name}' is then the reference's"
+    text = f"follows '{first.name}' ({correlation(column.slow, first.slow):.2f}), no unit of speed explains its scale"
+    return [
+        Proposal(column.name, "vx", "m/s", -1 if factor < 0.0 else 1, (text,), asked, factor=float(f"{abs(factor):.5g}")),
+        Proposal(first.name, "vx_ref", unit, 1, (f"'{column.name}' follows it",), f"the reference's speed, or the car's own ('{column.name}' in counts)"),
+    ]
 
 
 def _sign(column: Candidate, first: Candidate) -> int:
@@ -363,7 +393,8 @@ def _second_lateral(
 
 
 def _as_ax(search: Search, column: Candidate) -> tuple[float, Proposal] | None:
-    assert search.known is not None and search.turning is not None
+    assert search.known is not None
+    assert search.turning is not None
     hint = column.hint(roles.AX)
     if not column.measures("m/s²") or hint < 0.0:
         return None
@@ -463,30 +494,57 @@ def _name_text(column: Candidate, *wanted: str) -> tuple[str, ...]:
 # --- left and right ------------------------------------------------------------------------------------------------------------------
 
 
-def _left_and_right(proposals: Proposals, search: Search, wheels: Wheels, compass: str) -> Proposals:
+def _left_and_right(proposals: Proposals, search: Search, wheels: Wheels, compasses: Sequence[tuple[str, float]]) -> Proposals:
     """Signs as wheels or a compass tell; else as the most of the columns are, the yaw rate's own where they are even."""
     known = search.known
-    counts = [one.sign for one in proposals.channels if one.channel in LATERAL and not (one.channel == "ay" and known is None)]
     if known is not None:
         told = wheels.turning_left(search.columns, known) if wheels else 0.0
         if abs(told) > 0.5:
             text = f"right wheels are faster where yaw_rate, sign {'+' if told > 0 else '-'}1, counts up ({abs(told):.2f})"
             return replace(proposals if told > 0.0 else proposals.mirrored(), left_right=text)
-        agreeing = _with_compass(search, compass)
-        if abs(agreeing) > 0.5:
-            text = (
-                f"'{compass}', clockwise by its format, runs against yaw_rate, sign {'+' if agreeing > 0 else '-'}1 ({abs(agreeing):.2f})"
-            )
-            return replace(proposals if agreeing > 0.0 else proposals.mirrored(), left_right=text)
-    return proposals.mirrored() if sum(counts) < 0 else proposals
+        for name, agreeing in compasses:
+            if abs(agreeing) > 0.5:
+                text = f"{name} runs against yaw_rate, sign {'+' if agreeing > 0 else '-'}1 ({abs(agreeing):.2f})"
+                return replace(proposals if agreeing > 0.0 else proposals.mirrored(), left_right=text)
+        if proposals.pose and _yaw_of_pose(search, proposals) < 0.0:
+            return proposals.mirrored()
+    counts = [one.sign for one in proposals.channels if one.channel in LATERAL]
+    return proposals.mirrored() if sum(counts) < 0 and not proposals.pose else proposals
 
 
-def _with_compass(search: Search, compass: str) -> float:
-    """Correlation of the yaw rate with that of a heading that counts clockwise, reversed."""
-    column = next((one for one in search.columns if one.name == compass), None)
-    if column is None or search.known is None:
-        return 0.0
-    heading = np.unwrap(np.radians(column.values))
-    turned = -np.gradient(heading) * search.known.rate_hz
+def _compasses(search: Search, compass: str, west_positive: bool) -> list[tuple[str, float]]:
+    """What counts clockwise from north, with how much the yaw rate, counting to the left, runs against it."""
+    known = search.known
+    if known is None:
+        return []
+    found = []
+    by_name = {one.name: one for one in search.columns}
+    if compass in by_name:
+        found.append((f"'{compass}', clockwise by its format,", correlation(*_turned(by_name[compass].values, known))))
+    places = [next((one for one in search.columns if role in one.hints), None) for role in (roles.LATITUDE, roles.LONGITUDE)]
+    if places[0] is not None and places[1] is not None:
+        north, east = places[0].slow, places[1].slow * (-1.0 if west_positive else 1.0)
+        east = east * math.cos(math.radians(min(abs(float(north.mean())), 89.0)))
+        slow_rate = slow_of(known.yaw_rate, known.rate_hz)[: len(north)]
+        course = np.unwrap(np.arctan2(np.gradient(east), np.gradient(north)))
+        turned = -np.gradient(course)
+        usual = (np.abs(turned) < 1.0) & (np.hypot(np.gradient(east), np.gradient(north)) > 0.0)
+        if usual.sum() > FEWEST:
+            found.append(("the course over latitude and longitude", correlation(turned[usual], slow_rate[usual])))
+    return found
+
+
+def _turned(degrees: FloatArray, known: Known) -> tuple[FloatArray, FloatArray]:
+    """Yaw rate by a compass, and the one that is known, where both can be."""
+    turned = -np.gradient(np.unwrap(np.radians(degrees))) * known.rate_hz
     usual = np.abs(turned) < 8.0
-    return correlation(turned[usual], search.known.yaw_rate[usual])
+    return turned[usual], known.yaw_rate[usual]
+
+
+def _yaw_of_pose(search: Search, proposals: Proposals) -> float:
+    """Correlation of the yaw rate with the derivative of a pose's yaw, counter-clockwise."""
+    name, unit = next((column, unit) for part, column, unit in proposals.pose if part == "yaw")
+    column = next(one for one in search.columns if one.name == name)
+    assert search.known is not None
+    turned, rate = _turned(-np.degrees(column.values * factor_to_si(unit, "rad")), search.known)
+    return correlation(turned, rate)

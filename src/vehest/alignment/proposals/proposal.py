@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Proposals:
         wheel_radius: rolling radius that the wheels' speeds make with what the car does [m]; None where it is not needed.
         rate_hz: of a log without times, as far as accelerations tell [Hz]; None where it has times.
         unused: columns that belong to no channel.
+        pose: part (``x``, ``y``, ``yaw``), column and unit of poses that a reference can be made of; empty where there are none.
         notes: what else should be known.
     """
 
@@ -67,7 +68,8 @@ class Proposals:
     wheel_radius: float | None = None
     rate_hz: float | None = None
     unused: tuple[str, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    pose: tuple[tuple[str, str, str], ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def by_channel(self) -> dict[str, Proposal]:

@@ -14,6 +14,7 @@ from vehest.sources.surveys.log import Stamps, runs_between
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
 )
+COUNTER = re.compile(r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$")
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SPELLINGS = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
@@ -22,6 +23,7 @@ SPELLINGS = {
     **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
+LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 REGULAR = 0.8  # share of the steps within half a median step
 MOST_RESTARTS = 0.01  # of the rows
 
@@ -65,8 +67,13 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
         stamps = _stamps(name, step, unit, told)
         if stamps is not None:
             seconds = (columns[name] - columns[name][0]) * UNITS[stamps.unit]
-            runs = runs_between(np.diff(columns[name]) < 0, n_rows)
-            return Found(stamps, seconds, runs, _counter(columns, runs) if len(runs) > 1 else "")
+            steps = np.diff(columns[name])
+            counter, breaks = _named_counter(columns, name), runs_between((steps < 0) | (steps > LONG_GAP * step), n_rows)
+            if counter:
+                breaks = runs_between(np.diff(columns[counter]) != 0, n_rows)
+            elif len(breaks) > 1:
+                counter = _counter(columns, breaks)
+            return Found(stamps, seconds, breaks if counter else runs_between(steps < 0, n_rows), counter)
     return Found(None, None, (slice(0, n_rows),))
 
 
@@ -99,6 +106,16 @@ def _stamps(name: str, step: float, unit: str, told: bool) -> Stamps | None:
     rate = 1.0 / (step * UNITS[chosen])
     how = f"unit in the header, {rate:.6g} Hz" if unit else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
     return Stamps(name, chosen, how, asked=chosen not in fitting)
+
+
+def _named_counter(columns: Mapping[str, FloatArray], clock: str) -> str:
+    """A column that is named as a number of runs, and counts some of them, each in one piece."""
+    for name, values in columns.items():
+        if name != clock and COUNTER.match(plain_name(name)) and np.isfinite(values).all() and (values == np.rint(values)).all():
+            starts = np.flatnonzero(np.diff(values)) + 1
+            if 0 < len(starts) <= MOST_RESTARTS * len(values) and len(np.unique(values)) == len(starts) + 1:
+                return name
+    return ""
 
 
 def _counter(columns: Mapping[str, FloatArray], runs: Sequence[slice]) -> str:

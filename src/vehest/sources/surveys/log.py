@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -79,12 +80,6 @@ class Log:
         return self.seconds is not None or any(column.stamps is not None for column in self.columns)
 
 
-def is_constant(values: FloatArray) -> bool:
-    """Whether a column holds the same number throughout, or none."""
-    known = values[np.isfinite(values)]
-    return len(known) < 2 or bool((known == known[0]).all())
-
-
 def runs_between(restarts: NDArray[np.bool_], n_rows: int) -> tuple[slice, ...]:
     """Rows of uninterrupted runs, the longest first.
 
@@ -93,5 +88,5 @@ def runs_between(restarts: NDArray[np.bool_], n_rows: int) -> tuple[slice, ...]:
         n_rows: N.
     """
     edges = np.concatenate([[0], np.flatnonzero(restarts) + 1, [n_rows]]).tolist()
-    pieces = [slice(first, last) for first, last in zip(edges, edges[1:], strict=False)]
+    pieces = [slice(first, last) for first, last in pairwise(edges)]
     return tuple(sorted(pieces, key=lambda piece: piece.start - piece.stop))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from vehest.sources.mdf.files import Wanted, names_in_groups, read_measurement
 from vehest.data.errors import DataError
 from vehest.data.limits import check_limit
+from vehest.sources.mdf.files import Signal, Wanted, names_in_groups, read_measurement
 from vehest.sources.surveys.log import Log, RawColumn
 
 MOST_SIGNALS = 2000
@@ -35,14 +35,15 @@ def survey_mdf(file: Path) -> Log:
     return Log(file, "mdf", tuple(columns), skipped=tuple(skipped))
 
 
-def _read(file: Path, wanted: dict[str, Wanted]) -> tuple[dict, list[str]]:  # type: ignore[type-arg]
+def _read(file: Path, wanted: dict[str, Wanted]) -> tuple[dict[str, Signal], list[str]]:
     """Signals together where all can be read, else one after another."""
     try:
         return dict(read_measurement(file, wanted).signals), []
     except DataError as error:
         if len(wanted) == 1:
             return {}, [str(error).removeprefix(f"'{file}': ")]
-    found, skipped = {}, []
+    found: dict[str, Signal] = {}
+    skipped: list[str] = []
     for shown, one in wanted.items():
         own, failed = _read(file, {shown: one})
         found |= own

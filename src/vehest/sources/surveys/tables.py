@@ -171,7 +171,8 @@ def _layout(lines: Sequence[str], delimiter: str) -> _Layout:
     first = next((k for k, after in pairwise([*data, len(lines)]) if after - k == 1 or k == data[-1]), data[0])
     score = sum(shares[decimal][filled.index(k)] for k in data) / len(filled) + 0.01 * min(n_columns, 20)
     above = [k for k in filled if k < first and len(rows[k]) == n_columns]
-    names, units = None, ()
+    names: tuple[str, ...] | None = None
+    units: tuple[str, ...] = ()
     header = above[-1] if above else 0
     if above:
         names = tuple(rows[above[-1]])
