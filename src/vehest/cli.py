@@ -132,7 +132,7 @@ def new_car(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be written; write nothing.")] = False,
     answer: Annotated[
         list[str] | None,
-        typer.Option("--answer", "-a", help="An answer beforehand, KEY=ANSWER, as --json names the open ones; repeatable."),
+        typer.Option("--answer", "-a", help="KEY=ANSWER beforehand, as --json names what is open; repeatable."),
     ] = None,
     wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")] = None,
     mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
@@ -142,7 +142,7 @@ def new_car(
     """Begin with logs of your own car: `vehest new my_car lap*.csv`.
 
     Proposes for every column channel, unit, sign and delay, with what speaks for it, asks what the logs do not decide, and writes
-    conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables of text, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
+    conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.stages.new_car import Vehicle
     from vehest.stages.new_car_outcome import begin, conclude, in_words, settle

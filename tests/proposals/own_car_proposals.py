@@ -1,7 +1,7 @@
 """`vehest new` on twelve logs in different dress, held against what was written down before: results/own_car/proposals.csv, a row a column.
 
-``answers.yaml`` was committed before anything that proposes existed, and has not been changed since; the method was developed with these logs
-at hand, and revised after their outcome was seen. How it does on logs that it was not developed with, they do not tell.
+``answers.yaml`` was committed before anything that proposes existed, and has not been changed since; the method was developed with these
+logs at hand, and revised after their outcome was seen. How it does on logs that it was not developed with, they do not tell.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ def rows_of(log: str, answers: Mapping[str, Any], proposed: Mapping[str, Any]) -
         if name not in answers["columns"]:
             one = columns.get(name)
             shown = f"{one['channel']}, {one['unit']}" if one else "no channel"
-            rows.append(_line(log, name, "no channel", shown, one["evidence"] if one else [], name in asked, one is None and name not in asked))
+            rows.append(
+                _line(log, name, "no channel", shown, one["evidence"] if one else [], name in asked, one is None and name not in asked)
+            )
     if "time" in answers:
         rows.append(_clock(log, answers["time"], proposed))
     for key in WHOLE:

@@ -1,7 +1,7 @@
 """What `vehest new` makes of logs that nobody has described: proposals, the data set that they come to, and what that reads.
 
-Files are looked into by `vehest.sources.surveys`, columns are told apart by `vehest.alignment.proposals`; here both meet, and what comes out is
-read again as `vehest ingest` would read it.
+Files are looked into by `vehest.sources.surveys`, columns are told apart by `vehest.alignment.proposals`; here both meet, and what comes
+out is read again as `vehest ingest` would read it.
 """
 
 from __future__ import annotations
@@ -150,7 +150,9 @@ def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
             steps = np.diff(log.seconds[run]) if log.seconds is not None else np.zeros(0)
             if len(steps) and steps.max() > BRIDGED:
                 at = float(log.seconds[run][int(np.argmax(steps))]) if log.seconds is not None else 0.0
-                notes.append(f"'{log.file.name}' has a gap of {steps.max():.3g} s, {at:.4g} s after its start, across which lines are drawn; cut it there")
+                notes.append(
+                    f"'{log.file.name}' has a gap of {steps.max():.3g} s, {at:.4g} s after its start, which lines bridge; cut it there"
+                )
                 break
     return tuple(notes)
 

@@ -139,8 +139,14 @@ def settle(
     Raises:
         VehestError: it cannot be read by what was answered.
     """
-    proposals, given, left = examined.proposals, dict(answers or {}), []
-    for question in questions_of(examined):
+    proposals, given = examined.proposals, dict(answers or {})
+    left: list[Question] = []
+    questions = questions_of(examined)
+    unknown = sorted(set(given) - {question.key for question in questions})
+    if unknown:
+        open_ones = ", ".join(question.key for question in questions) or "nothing"
+        raise ConfigurationError(f"nothing is asked of '{unknown[0]}'; what is asked: {open_ones}")
+    for question in questions:
         if ask is None and question.key not in given:
             left.append(question)
             continue
@@ -183,9 +189,10 @@ def split_text(name: str) -> str:
     """A file in conf/split: three blocks that follow one another in each recording."""
     return "\n".join(
         [
-            f"# {name}: of each recording, the first {SHARES['train']} to learn from, the next {SHARES['validation']} to stop the training by,",
-            f"# the last {SHARES['tests']} as test. Blocks follow one another: neighbouring samples are nearly the same, and would tell the answer.",
-            f"# Several laps: `tests: {{test: last lap}}`; a few minutes only: cross-validate, `folds: {{number: 5, of: seconds, gap_seconds: 2}}`.",
+            f"# {name}: of each recording, {SHARES['train']} to learn from, then {SHARES['validation']} to stop the training by, then",
+            f"# {SHARES['tests']} as test. They are blocks, since neighbouring samples are nearly the same, and would tell the answer.",
+            "# Of several laps the last: tests: {test: last lap}. A few minutes only: cross-validate, by report: folds in the pipeline and",
+            "# folds: {number: 5, of: seconds, gap_seconds: 2} here, in place of the three lines at the end.",
             f"name: {name}",
             f"dataset: {name}",
             f"train: {SHARES['train']}",
@@ -218,16 +225,14 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
     for one in made.proposals.channels:
         text = ("asked: " + one.asked + "; ") if one.asked else ""
         comments[f"channels.{one.channel}"] = text + (one.evidence[0] if one.evidence else CHANNELS[one.channel].meaning)
-    head = [
-        f"Recordings of {made.examined.name}: what their columns are, and what speaks for it. `vehest data check {made.examined.name}` looks again."
-    ]
+    head = [f"Recordings of {made.examined.name}: what their columns are, and what speaks for it; `vehest data check` looks again."]
     head += [f"Not decided by the log: {question.text}; taken: {question.proposed or 'nothing'}." for question in left]
     tail = [
-        "reference_point: unknown                      # {x: …, y: …} in metres ahead and to the left of the centre of gravity, where it is known"
+        "reference_point: unknown                     # {x: …, y: …} ahead and to the left of the centre of gravity [m], where it is known"
     ]
     tail += [
-        "imu_point: unknown                            # likewise",
-        "accept: []                                    # checks whose errors do not stop the ingest",
+        "imu_point: unknown                           # likewise",
+        "accept: []                                   # checks whose errors do not stop the ingest",
     ]
     for name, late in made.late.items():
         if not CHANNELS[name].is_reference:
@@ -255,8 +260,8 @@ def in_words(outcome: Outcome) -> list[str]:
         lines += [f"  {question.key}: {question.text}: {question.proposed or 'nothing'}" for question in outcome.open]
     if not own.has_reference:
         lines.append(
-            "there is no reference of lateral velocity or sideslip in these recordings: nothing can be trained on them and no estimator can be "
-            "ranked; what can be done is an estimate by the model that comes with vehest"
+            "there is no reference of lateral velocity or sideslip in these recordings: nothing can be trained on them and no estimator "
+            "can be ranked; what can be done is an estimate by the model that comes with vehest, vehest estimate pretrained"
         )
         lacking = [name for name in PRETRAINED_CHANNELS if name not in own.contents[0].channels]
         lines += [f"which lacks {', '.join(lacking)}"] if lacking else []

@@ -91,7 +91,7 @@ FAMILIES = (
         "learned_ukf",
         (),
         ("training.through.max_epochs=50",),
-        "filter whose dynamics are learnt, of electric cars; ten minutes and more",
+        "filter whose dynamics are learnt, of electric cars; long",
         ("mass", "wheelbase"),
     ),
 )
@@ -210,8 +210,8 @@ def pipeline_text(name: str, plan: Plan, *, assumed: bool) -> str:
     ]
     if assumed:
         lines += [
-            "# Parameters of the car are made of wheelbase and mass: centre of gravity in the middle, yaw inertia m·(L/2)², cornering stiffness of",
-            "# an axle 10/rad times its load, centre of gravity at 0.2·L. Write yours where you know them.",
+            "# The car's parameters are made of wheelbase and mass: centre of gravity in the middle and at 0.2·L, yaw inertia m·(L/2)²,",
+            "# cornering stiffness of an axle 10/rad times its load. Write yours where you know them.",
         ]
     lines += [f"study: {name}", f"title: Estimators on {name}", "report: drive", f"split: {name}", "publish: false", "sweeps:"]
     for sweep, about in plan.sweeps:

@@ -41,6 +41,7 @@ LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
 RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
+CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 FEWEST = 50  # samples of a course
 ACCELERATIONS, ANGLES = ("m/s²", "g"), ("rad", "deg")
 
@@ -235,7 +236,9 @@ def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
 
 def _is_scaled(column: Candidate, first: Candidate) -> bool:
     """Whether a column that is named as a speed, without a unit, is one but for its scale, as a motor's speed is."""
-    return column.hints.get(roles.SPEED) == roles.STRONG and not column.unit and abs(correlation(column.slow, first.slow)) > SAME_NAMED["vx"]
+    return (
+        column.hints.get(roles.SPEED) == roles.STRONG and not column.unit and abs(correlation(column.slow, first.slow)) > SAME_NAMED["vx"]
+    )
 
 
 def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Proposal]:
@@ -246,7 +249,14 @@ def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Propos
     text = f"follows '{first.name}' ({correlation(column.slow, first.slow):.2f}), no unit of speed explains its scale"
     return [
         Proposal(column.name, "vx", "m/s", -1 if factor < 0.0 else 1, (text,), asked, factor=float(f"{abs(factor):.5g}")),
-        Proposal(first.name, "vx_ref", unit, 1, (f"'{column.name}' follows it",), f"the reference's speed, or the car's own ('{column.name}' in counts)"),
+        Proposal(
+            first.name,
+            "vx_ref",
+            unit,
+            1,
+            (f"'{column.name}' follows it",),
+            f"the reference's speed, or the car's own ('{column.name}' in counts)",
+        ),
     ]
 
 
@@ -369,8 +379,17 @@ def _fitting(search: Search) -> list[Proposal]:
 
 def _with_rivals(chosen: tuple[float, Proposal], rivals: Iterable[tuple[float, Proposal]]) -> Proposal:
     score, proposal = chosen
-    near = [one.column for other, one in rivals if other > score - NEAR and one.channel == proposal.channel]
+    named = _is_named(proposal)
+    near = [
+        one.column
+        for other, one in rivals
+        if one.channel == proposal.channel and (other > score - NEAR or (other > 0.0 and _is_named(one) and not named))
+    ]
     return replace(proposal, asked=f"{', '.join(near)} would do as well", others=tuple(near)) if near and not proposal.asked else proposal
+
+
+def _is_named(proposal: Proposal) -> bool:
+    return any(text.startswith("its name") for text in proposal.evidence)
 
 
 def _second_lateral(
@@ -430,7 +449,9 @@ def _as_steering(search: Search, column: Candidate) -> tuple[float, Proposal] | 
         found = [one for one in found if one.channel == HAND_WHEEL] or found
     if not found:
         largest = "no angle of the road wheels or of a steering wheel by its range and slow corners; its scale is to be given"
-        proposal = Proposal(column.name, ROAD_WHEEL, "rad", sign, text, largest, offset=straight)
+        spread = float(np.quantile(np.abs(column.values - straight), 0.995))
+        offset = straight if abs(straight) > CENTRED * spread else 0.0
+        proposal = Proposal(column.name, ROAD_WHEEL, "rad", sign, text, largest, offset=offset)
         return score, proposal
     best = min(found, key=lambda one: _oddness(one.length, one.channel))
     unclear = {(one.channel, one.unit) for one in found} - {(best.channel, best.unit)}

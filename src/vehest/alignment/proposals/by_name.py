@@ -64,10 +64,10 @@ def named_channels(columns: Sequence[Candidate], free: Sequence[int], held: Coll
     for k in free:
         for channel in TOLD:
             column = columns[k]
-            if channel in column.hints and channel not in held and channel not in found and column.measures(CHANNELS[channel].unit):
-                if column.unit or channel in ONE_UNIT:
-                    unit = column.unit or CHANNELS[channel].unit
-                    found[channel] = Proposal(column.name, channel, unit, 1, ("its name" + (" and unit" if column.unit else ""),))
+            told = column.unit or channel in ONE_UNIT
+            if channel in column.hints and channel not in {*held, *found} and column.measures(CHANNELS[channel].unit) and told:
+                unit = column.unit or CHANNELS[channel].unit
+                found[channel] = Proposal(column.name, channel, unit, 1, ("its name" + (" and unit" if column.unit else ""),))
     return list(found.values())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from vehest.alignment.proposals.names import hints, is_filtered, is_reference
+from vehest.alignment.proposals.names import LATITUDE, LONGITUDE, POSITION_X, POSITION_Y, hints, is_filtered, is_reference
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
@@ -22,6 +22,8 @@ STRAY = 20.0  # times the spread of nearly all samples; beyond lies no sample of
 MOST_STRAY = 0.002
 LONG = 1000  # samples
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
+
+_POSITIONS = {LATITUDE, LONGITUDE, POSITION_X, POSITION_Y}
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,9 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -
         missing = float(1.0 - known.mean())
         if missing > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
-        if len(values) > LONG and np.min(np.diff(values[known])) >= 0.0:  # a clock, a distance: it only grows
+        if (
+            len(values) > LONG and not _POSITIONS & set(hints(name)) and np.min(np.diff(values[known])) >= 0.0
+        ):  # a clock, a distance: it only grows
             continue
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])

@@ -14,27 +14,31 @@ LATERAL_VELOCITY, SIDESLIP, HEADING, LATITUDE, LONGITUDE, POSITION_X, POSITION_Y
 )
 
 _STRONG = {  # over the name without blanks
-    OTHER: r"temp|druck_oel|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|dist|strecke|weg$|"
-    r"height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|motordreh|^drehzahl|^rpm$|^nmot|wind|"
-    r"susp|feder|damper|^id$|index|event|friction|accped|orientation|magnet|flag|counter|zaehler|time|zeit|stamp|safety",
-    YAW_RATE: r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|angular(velocity)?z|gyr(o)?z|"
-    r"^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    AY: r"latacc|latac|latera?lac|acclat|acc(el)?y|querb|querac|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|accquer|"
-    r"laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
-    AX: r"longacc|longac|longitudinalac|acclong|acc(el)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|linearaccelerationx|"
-    r"xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle",
-    HANDWHEEL: r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|steerwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
+    OTHER: r"temp|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
+    r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
+    r"motordreh|^drehzahl|^rpm$|^nmot|wind|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
+    r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
+    YAW_RATE: r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
+    r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
+    AY: r"latacc|latac|latera?lac|acclat|acc(el|eleration)?y|querb|querac|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
+    r"linearaccelerationy|yacc|glat|^gy$|quera|accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|"
+    r"ayvehicle",
+    AX: r"longacc|longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
+    r"along$|^along|algt|linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|"
+    r"longg$|lonacc|acclon|gforcelon|axvehicle",
+    HANDWHEEL: r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|steerwheel|handwheel|handlenk|sas(ang)|stwhl|"
+    r"volant",
     STEER: r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenkw|lenkung|lenk|whlang|servo",
-    LATERAL_VELOCITY: r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|linear_?y$|latspeed|velocityvehicley|"
-    r"speedlat|vely",
+    LATERAL_VELOCITY: r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
+    r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
     SIDESLIP: r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
     HEADING: r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
     LATITUDE: r"latitude|gpslat$|^lat$|breitengrad",
     LONGITUDE: r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
     POSITION_X: r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     POSITION_Y: r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
-    SPEED: r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|velx|vlaengs|longitudinalvel|"
-    r"lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
+    SPEED: r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
+    r"velx|vlaengs|longitudinalvel|lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollrate|rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
@@ -55,6 +59,7 @@ _REFERENCE = re.compile(
     r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|optitrack|true|truth|\bgt\b|datron|s350|"
     r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys"
 )
+_STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
 _FILTERED = re.compile(r"filt|smooth|\blp\b|avg|mittel|gemittelt")
 _CORNERS = {
     "fl": r"fl|vl|lf|front ?left|vorne? ?links|left ?front",
@@ -90,8 +95,8 @@ def bare(name: str) -> str:
 @cache
 def hints(name: str) -> dict[str, float]:
     """What a name speaks for: role -> `STRONG` or `WEAK`; a wheel's role is ``wheel_speed_fl`` and so on."""
-    words = bare(name)
-    compact = words.replace(" ", "")
+    words = _FILTERED.sub("", bare(name)).strip()
+    compact = re.sub(r"(ered)?$", "", words.replace(" ", "")) if is_filtered(name) else words.replace(" ", "")
     corner = corner_of(words)
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
@@ -134,7 +139,7 @@ def _settled(found: dict[str, float], compact: str) -> dict[str, float]:
             for other in others:
                 if found.get(other, 0.0) <= STRONG and not (role == SPEED and other in strong):
                     found.pop(other, None)
-    if "deltadelta" in compact or "steeringrate" in compact or "lenkgeschw" in compact or "swarate" in compact or "anglerate" in compact:
+    if _STEERING_RATE.search(compact) and YAW_RATE not in strong:
         return {OTHER: STRONG}
     return found
 

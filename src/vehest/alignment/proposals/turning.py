@@ -1,4 +1,4 @@
-"""Speed, yaw rate and lateral acceleration, which are tied together: ay ≈ vx·yaw_rate. They are looked for first, and their units with them."""
+"""Speed, yaw rate and lateral acceleration, tied together by ay ≈ vx·yaw_rate: they are looked for first, and their units with them."""
 
 from __future__ import annotations
 

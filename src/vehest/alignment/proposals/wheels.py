@@ -159,8 +159,10 @@ def wheel_proposals(
         unit, radius = ranked[0][2], ranked[0][1]
         asked = f"could be in {ranked[1][2]} as well" if len(ranked) > 1 and ranked[1][0] - ranked[0][0] < APART else ""
     at_rim = unit in ("km/h", "m/s")
+    if at_rim and known is not None and not wheels.stand_in:
+        radius = NOMINAL_RADIUS * scale / factor_to_si(unit, "m/s")
     factor = factor_to_si(unit, "m/s") / NOMINAL_RADIUS if at_rim else 1.0
-    text = ("its name",)
+    text: tuple[str, ...] = ("its name",)
     if known is not None:
         whose = "ay over the yaw rate" if wheels.stand_in else "the speed"
         text += (f"{unit} at the rim by {whose}" if at_rim else f"a radius of {radius:.3g} m by {whose} in {unit}",)
