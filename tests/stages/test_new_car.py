@@ -74,7 +74,7 @@ def test_a_column_can_be_declared_otherwise_or_left_out(tmp_path, log) -> None:
 def test_yes_asks_nothing_and_lists_what_it_left_open(capsys, log) -> None:
     code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")
     assert (code, err) == (0, "")
-    assert "open, taken as proposed:\n  left_right: in a left turn" in out
+    assert "open, taken as proposed:\n  left_right: yes (in a left turn" in out
     assert all(f"wrote {file}: " in out for file in FILES)
     assert "Not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
 

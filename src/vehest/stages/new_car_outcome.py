@@ -226,7 +226,7 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
         text = ("asked: " + one.asked + "; ") if one.asked else ""
         comments[f"channels.{one.channel}"] = text + (one.evidence[0] if one.evidence else CHANNELS[one.channel].meaning)
     head = [f"Recordings of {made.examined.name}: what their columns are, and what speaks for it; `vehest data check` looks again."]
-    head += [f"Not decided by the log: {question.text}; taken: {question.proposed or 'nothing'}." for question in left]
+    head += [f"Not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}." for question in left]
     tail = [
         "reference_point: unknown                     # {x: …, y: …} ahead and to the left of the centre of gravity [m], where it is known"
     ]
@@ -252,12 +252,12 @@ def in_words(outcome: Outcome) -> list[str]:
         value, spread = own.ratio
         doubt = "; that is no more than a guess, measure it" if spread > 0.1 * abs(value) else ""
         lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
-    lines += [f"late: {name} {late.evidence}" for name, late in own.late.items()]
+    lines += [f"{name} {late.evidence}" for name, late in own.late.items()]
     lines += [f"note: {note}" for note in own.notes]
     lines += [f"warning: {one.channel + ': ' if one.channel else ''}{one.message}" for one in own.remarks]
     if outcome.open:
         lines.append("open, taken as proposed:")
-        lines += [f"  {question.key}: {question.text}: {question.proposed or 'nothing'}" for question in outcome.open]
+        lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in outcome.open]
     if not own.has_reference:
         lines.append(
             "there is no reference of lateral velocity or sideslip in these recordings: nothing can be trained on them and no estimator "

@@ -83,7 +83,7 @@ class Agreement:
         """For people; the scale where it must be 1."""
         if self.relation is None:
             return ""
-        scale = f", {abs(self.relation.scale):.2g} times as large" if math.isfinite(self.relation.tolerance) else ""
+        scale = f", {abs(self.relation.scale):.3g} times as large" if math.isfinite(self.relation.tolerance) else ""
         return f"{self.relation.left} and {self.relation.right} agree {self.relation.correlation:.2f}{scale}"
 
 
