@@ -109,7 +109,9 @@ def _left_right(lateral: Sequence[Proposal]) -> Question:
     counts = "up" if own.sign == 1 else "down"
     text = f"in a left turn, does column '{own.column}' count {counts}?"
     signs = ", ".join(f"{one.column} {one.sign:+d}" for one in lateral)
-    return Question(LEFT_RIGHT, text, "yes", ("no",), (f"signs that agree with each other, as they would all reversed: {signs}",), "yes or no")
+    return Question(
+        LEFT_RIGHT, text, "yes", ("no",), (f"signs that agree with each other, as they would all reversed: {signs}",), "yes or no"
+    )
 
 
 def vehicle_questions(examined: Examined, vehicle: Vehicle) -> list[Question]:
