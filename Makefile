@@ -16,7 +16,7 @@ KILLS ?= 100
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -127,6 +127,9 @@ trust: $(INSTALLED) ## how far estimates can be trusted: bands, faults; needs VE
 
 online_faults: $(INSTALLED) ## every family online under every fault, a row a case; with VEHEST_DATA also on real recordings; half an hour
 	$(BIN)/python tests/faults/online_faults.py --out results/reliability/online_faults.csv
+
+own_car_proposals: $(INSTALLED) ## what vehest new makes of twelve logs whose columns are known: results/own_car/proposals.csv; needs VEHEST_DATA
+	PYTHONPATH=tests/proposals $(BIN)/python tests/proposals/own_car_proposals.py --out results/own_car/proposals.csv
 
 pretrained: sim_to_real ## the model for cars that nobody has trained on, from the study before
 	$(BIN)/python docs/make_pretrained.py

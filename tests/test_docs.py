@@ -221,7 +221,7 @@ def taken_apart(line: str) -> Given | None:
     assert len(positional) >= len(needed), f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in needed)}"
     if len(positional) > len(needed) and any("=" in word for word in positional[len(needed) : len(fixed)]):
         fixed = needed  # what may be left out is left out
-    takes_overrides = any(parameter.name == "overrides" for parameter in command.params)
+    takes_overrides = any(parameter.name == "overrides" or parameter.nargs == -1 for parameter in command.params)
     assert takes_overrides or len(needed) <= len(positional) <= len(fixed), f"vehest {' '.join(path)} takes no overrides"
     return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
 

@@ -45,6 +45,7 @@ STARTED = time.monotonic()
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
+MOST_ATTEMPTS = 5  # at an answer
 MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
@@ -122,6 +123,86 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
     if version:
         _echo(f"vehest {__version__}")
         raise typer.Exit
+
+
+@app.command("new")
+def new_car(
+    name: Annotated[str, typer.Argument(help="Name of the data set to be, such as my_car.", show_default=False)],
+    files: Annotated[list[Path], typer.Argument(help="Logs of one car with the same columns, a recording each.", show_default=False)],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Take what is proposed, ask nothing, and list what was left open.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write files anew that are there already.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be written; write nothing.")] = False,
+    answer: Annotated[
+        list[str] | None,
+        typer.Option("--answer", "-a", help="KEY=ANSWER beforehand, as --json names what is open; repeatable."),
+    ] = None,
+    wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")] = None,
+    mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
+    steering_ratio: Annotated[float | None, typer.Option("--steering-ratio", help="Steering wheel's angle to the road wheels'.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Begin with logs of your own car: `vehest new my_car lap*.csv`.
+
+    Proposes for every column channel, unit, sign and delay, with what speaks for it, asks what the logs do not decide, and writes
+    conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
+    """
+    from vehest.stages.new_car import Vehicle
+    from vehest.stages.new_car_outcome import begin, conclude, in_words, settle
+
+    given = dict(_key_and_answer(text) for text in answer or [])
+    examined = begin(name, files, force=force)
+    if not as_json:
+        for file in files:
+            _echo(f"read {file}")
+        for proposal in examined.proposals.channels:
+            _echo(f"{'?' if proposal.asked else ' '} {proposal.in_words}")
+        if examined.proposals.left_right:
+            _echo(f"  left and right: {examined.proposals.left_right}")
+        if examined.proposals.unused:
+            _echo(f"  no channel: {_counted(list(examined.proposals.unused))}")
+    draft, left = settle(examined, Vehicle(wheelbase, mass, steering_ratio), None if yes or as_json else _asked, given)
+    outcome = conclude(draft, left, force=force, dry_run=dry_run)
+    if as_json:
+        _echo(_json({**outcome.as_plain(), "dry_run": dry_run}), keep="\n")
+        return
+    for line in in_words(outcome):
+        _echo(line)
+    for written in outcome.files:
+        _echo(f"{'would write' if dry_run else 'wrote'} {written.file}: {written.purpose}")
+    _echo("next:")
+    for command in outcome.next_commands():
+        _echo(f"  {command}")
+
+
+def _key_and_answer(text: str) -> tuple[str, str]:
+    key, equals, answer = text.rpartition("=")
+    if not equals or not key:
+        raise ConfigurationError(f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no")
+    return key, answer
+
+
+def _asked(question: Any) -> str:
+    """An answer from the terminal; Enter takes what is proposed, and what is no answer is asked again."""
+    from vehest.stages.new_car_questions import check_answer
+
+    for line in question.evidence:
+        _echo(f"    {line}")
+    if question.candidates:
+        _echo(f"    other answers: {', '.join(question.candidates)}")
+    text = printable(f"? {question.text} ({question.hint})" if question.hint else f"? {question.text}")
+    for _attempt in range(MOST_ATTEMPTS):
+        try:
+            answer = str(typer.prompt(text, default=question.proposed, show_default=bool(question.proposed))).strip()
+        except typer.Abort:
+            if sys.stdin is not None and sys.stdin.isatty():
+                raise
+            raise ConfigurationError("nobody answers here; add --yes to take what is proposed, or --answer KEY=ANSWER") from None
+        try:
+            check_answer(question, answer)
+            return answer
+        except ConfigurationError as error:
+            _echo(f"    {error}")
+    raise ConfigurationError(f"'{question.key}' got no answer")
 
 
 @app.command(epilog=_offered("dataset"))

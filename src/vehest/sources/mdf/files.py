@@ -84,6 +84,21 @@ def read_measurement(path: Path, wanted: Mapping[str, Wanted]) -> Measurement:
         raise DataError(f"'{path}' asks for more memory than there is; is it damaged? otherwise read fewer signals of it") from None
 
 
+def names_in_groups(path: Path) -> list[tuple[str, int]]:
+    """Signals that a file says it holds, clocks left out, with the number of each one's group.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read or is more than the limits.
+    """
+    try:
+        with open(regular_file(path), "rb") as stream:
+            groups = _contents(BlockFile(stream, path)).groups
+    except OSError as error:
+        raise DataError(f"cannot read '{path}': {error.strerror or error}; check the disk and its permissions") from None
+    return [(channel.name, group.number) for group in groups for channel in group.channels if not channel.is_time]
+
+
 def _contents(file: BlockFile) -> Contents:
     """What the file says that it holds."""
     head = file.read(0, min(file.size, 64))

@@ -100,6 +100,43 @@ def read_bag(path: Path, wanted: Sequence[Wanted], layouts: Mapping[str, str], m
             raise MissingError(f"cannot read '{path}' ({error.strerror or error}); check the disk and its permissions") from None
 
 
+def topics_in(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, str]:
+    """Topics that a bag says it holds messages of -> their type.
+
+    Raises:
+        MissingError: the bag is not there.
+        DataError: it is damaged.
+    """
+    with _unpacked_bag(path, most_bytes) as bag:
+        _require_bag(bag, path)
+        try:
+            with open_bag(bag) as opened:
+                return {topic.name: topic.type for topic in opened.topics if topic.count is None or topic.count}
+        except DamagedBagError as damage:
+            raise _damaged(path, damage, bag) from None
+        except OSError as error:
+            raise MissingError(f"cannot read '{path}' ({error.strerror or error}); check the disk and its permissions") from None
+
+
+def numeric_fields(kind: str, prefix: str = "") -> list[str]:
+    """Paths of the plain numbers in a message type; none of a type that is not ROS's own.
+
+    Raises:
+        MissingError: rosbags is not installed.
+    """
+    types = known_types(())
+    if kind not in types.fielddefs:
+        return []
+    paths: list[str] = []
+    for field, (sort, detail) in types.fielddefs[kind][1]:
+        path = f"{prefix}{field}"
+        if sort.name == "NAME":
+            paths += numeric_fields(str(detail), f"{path}.")
+        elif sort.name == "BASE" and detail[0] not in {"string", "wstring", "byte", "char", "bool"}:
+            paths.append(path)
+    return paths
+
+
 def bag_files(path: Path) -> list[Path]:
     """The files that a bag is made of: the archive or file itself, or what its folder holds.
 

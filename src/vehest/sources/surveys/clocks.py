@@ -1,0 +1,130 @@
+"""Which column of a table is its clock, in which unit, and where runs begin."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.sources.surveys.log import Stamps, runs_between
+
+NAMED = re.compile(
+    r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
+)
+COUNTER = re.compile(r"^(run|session|stint|segment|drive|trial|fahrt|versuch|sequence|episode)( ?(id|nr|no|number|index))?$")
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SPELLINGS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds", "sekunden"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanos", "nanoseconds"), "ns"),
+}
+RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
+LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
+REGULAR = 0.8  # share of the steps within half a median step
+MOST_RESTARTS = 0.01  # of the rows
+
+
+@dataclass(frozen=True)
+class Found:
+    """The clock of a table.
+
+    Args:
+        stamps: which column it is; None where none looks like one.
+        seconds: times of the rows [s], (N,).
+        runs: rows of each run, the longest first.
+        counted_by: column that counts the runs; empty where none does.
+    """
+
+    stamps: Stamps | None
+    seconds: FloatArray | None
+    runs: tuple[slice, ...]
+    counted_by: str = ""
+
+
+def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
+    """The column that grows evenly, by name or unit before another.
+
+    Args:
+        columns: name -> values, (N,).
+        units: name -> unit as the header writes it.
+    """
+    n_rows = len(next(iter(columns.values())))
+    candidates = []
+    for place, (name, values) in enumerate(columns.items()):
+        step = _step(values)
+        if step is None:
+            continue
+        unit, told = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
+        counts = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or told)
+        candidates.append((2 * bool(unit) + told - 2 * counts, -place, name, step, unit, told, counts))
+    for _, _, name, step, unit, told, counts in sorted(candidates, reverse=True):
+        if counts:
+            continue
+        stamps = _stamps(name, step, unit, told)
+        if stamps is not None:
+            seconds = (columns[name] - columns[name][0]) * UNITS[stamps.unit]
+            steps = np.diff(columns[name])
+            counter, breaks = _named_counter(columns, name), runs_between((steps < 0) | (steps > LONG_GAP * step), n_rows)
+            if counter:
+                breaks = runs_between(np.diff(columns[counter]) != 0, n_rows)
+            elif len(breaks) > 1:
+                counter = _counter(columns, breaks)
+            return Found(stamps, seconds, breaks if counter else runs_between(steps < 0, n_rows), counter)
+    return Found(None, None, (slice(0, n_rows),))
+
+
+def plain_name(name: str) -> str:
+    """In lower case, without marks, words apart."""
+    apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return re.sub(r"[\W_]+", " ", apart.replace("#", " ")).strip().lower()
+
+
+def _step(values: FloatArray) -> float | None:
+    """Median step of a column that grows evenly but for restarts; None of another."""
+    if len(values) < 10 or not np.isfinite(values).all():
+        return None
+    steps = np.diff(values)
+    if (steps < 0).mean() > MOST_RESTARTS:
+        return None
+    grown = steps[steps > 0]
+    if len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
+        return None
+    step = float(np.median(steps)) or float(grown.sum() / len(steps))
+    return step if step > 0 and np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR else None
+
+
+def _stamps(name: str, step: float, unit: str, told: bool) -> Stamps | None:
+    """The unit in which a step makes a rate that loggers have."""
+    fitting = [own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]]
+    chosen = unit or (fitting[0] if fitting else "s" if told else "")
+    if not chosen:
+        return None
+    rate = 1.0 / (step * UNITS[chosen])
+    how = f"unit in the header, {rate:.6g} Hz" if unit else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
+    return Stamps(name, chosen, how, asked=chosen not in fitting)
+
+
+def _named_counter(columns: Mapping[str, FloatArray], clock: str) -> str:
+    """A column that is named as a number of runs, and counts some of them, each in one piece."""
+    for name, values in columns.items():
+        if name != clock and COUNTER.match(plain_name(name)) and np.isfinite(values).all() and (values == np.rint(values)).all():
+            starts = np.flatnonzero(np.diff(values)) + 1
+            if 0 < len(starts) <= MOST_RESTARTS * len(values) and len(np.unique(values)) == len(starts) + 1:
+                return name
+    return ""
+
+
+def _counter(columns: Mapping[str, FloatArray], runs: Sequence[slice]) -> str:
+    """A column of whole numbers that changes where runs begin and nowhere else, and never takes a value again."""
+    starts = sorted(run.start for run in runs)[1:]
+    for name, values in columns.items():
+        if np.isfinite(values).all() and (values == np.rint(values)).all():
+            changes = np.flatnonzero(np.diff(values)) + 1
+            numbers = values[[0, *starts]]
+            if changes.tolist() == starts and len(set(numbers.tolist())) == len(numbers):
+                return name
+    return ""

@@ -1,0 +1,289 @@
+"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of units below them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as compute
+import pyarrow.csv as pc
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError, printable
+from vehest.data.limits import check_limit
+from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
+from vehest.data.text_files import first_line
+from vehest.sources.surveys.clocks import SPELLINGS, find_clock
+from vehest.sources.surveys.log import Log, RawColumn
+from vehest.sources.text_tables import check_size, table_stream
+from vehest.sources.unit_spellings import plain_unit
+
+HEAD = 1 << 18  # bytes that are looked at
+MOST_LINES = 400
+MOST_BEFORE = 200  # lines before the names
+DELIMITERS = (";", "\t", ",", "|", " ")
+LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
+MOST_CONTROLS = 0.01
+BLOCK = 1 << 24
+BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How a table of text is laid out.
+
+    Args:
+        encoding: of the text.
+        delimiter: between cells.
+        decimal: mark.
+        skip_rows: lines before the names.
+        names: of the columns.
+        units: below the names; empty where there is no such row.
+    """
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    skip_rows: int
+    names: tuple[str, ...]
+    units: tuple[str, ...] = ()
+
+
+def survey_table(file: Path) -> Log:
+    """What a table holds.
+
+    Raises:
+        DataError: it is no table, has no names, or holds no numbers.
+    """
+    if file.suffix.lower() in (".parquet", ".pq"):
+        with parquet_file(file) as table:
+            schema = table.schema_arrow
+            names = [name for name in schema.names if pa.types.is_integer(kind := schema.field(name).type) or pa.types.is_floating(kind)]
+            check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
+            values = read_numbers(file, table, names)
+        return _log(file, values, {}, {}, [])
+    shape = shape_of(file)
+    check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
+    check_size(file, len(shape.names))
+    values, skipped = _values(file, shape)
+    units = {name: unit for name, unit in zip(shape.names, shape.units, strict=True) if unit} if shape.units else {}
+    options: dict[str, object] = {"delimiter": shape.delimiter, "decimal": shape.decimal}
+    options |= {"encoding": shape.encoding} if shape.encoding != "utf8" else {}
+    options |= {"skip_rows": shape.skip_rows} if shape.skip_rows else {}
+    options |= {"rows_below_names": 1} if shape.units else {}
+    return _log(file, values, units, options, skipped)
+
+
+def _log(file: Path, values: dict[str, FloatArray], units: dict[str, str], options: dict[str, object], skipped: Sequence[str]) -> Log:
+    if not values:
+        raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
+    n_rows = len(next(iter(values.values())))
+    if n_rows < 2:
+        raise DataError(f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names")
+    written = {name: units.get(name) or unit_in_name(name) for name in values}
+    found = find_clock(values, written)
+    if len(found.runs) > 1:
+        options = {**options, "runs": found.counted_by} if found.counted_by else {**options, "time_restarts": True}
+    columns = [
+        RawColumn(name, written[name], samples, {"column": name})
+        for name, samples in values.items()
+        if (found.stamps is None or name != found.stamps.column) and name != found.counted_by
+    ]
+    source = "text_log" if "rows_below_names" in options else "tabular"
+    return Log(file, source, tuple(columns), options, found.stamps, found.seconds, found.runs, tuple(skipped))
+
+
+def unit_in_name(name: str) -> str:
+    """The unit that a column's name ends in, as it is written there: ``Speed [km/h]``, ``ay_mps2``; empty where there is none."""
+    bracketed = BRACKETED.match(name.strip())
+    if bracketed:
+        return bracketed["unit"].strip()
+    words = re.split(r"[_\s]+", name.strip())
+    last = words[-1].lower() if len(words) > 1 else ""
+    short = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
+    if last in short:
+        return short[last]
+    known = plain_unit(last) is not None or last in SPELLINGS
+    return last if known and len(last) > 1 else ""
+
+
+def shape_of(file: Path) -> Shape:
+    """How a table of text is laid out, from its beginning.
+
+    Raises:
+        DataError: it is no table of text, has one column only, or no line of names.
+    """
+    head = _head(file)
+    encoding, text = _decoded(head, file)
+    lines = re.split(r"\r\n|\n|\r", text)
+    lines = lines[: -1 if len(head) >= HEAD else None][: MOST_BEFORE + MOST_LINES]
+    if not any(line.strip() for line in lines):
+        raise DataError(f"'{file}' holds nothing but empty lines")
+    best = max((_layout(lines, delimiter) for delimiter in DELIMITERS), key=lambda layout: layout.score)
+    if best.score <= 0.0:
+        if _layout(lines, "\n").score > 0.0:
+            raise DataError(f"'{file}' has one column only; time and a motion are two at least")
+        raise DataError(f"'{file}' holds no rows of numbers; is it a table of text, with names in its first line and numbers below?")
+    if best.names is None:
+        row = lines[best.first][:60]
+        raise DataError(f"'{file}' has no line of names above its first numbers ({printable(row)}); write one there")
+    doubled = sorted({name for name in best.names if name and best.names.count(name) > 1})
+    if doubled:
+        raise DataError(f"'{file}' has {best.names.count(doubled[0])} columns called '{printable(doubled[0])}'; rename all but one")
+    return Shape(encoding, best.delimiter, best.decimal, best.header, best.names, best.units)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How well a delimiter explains the lines: cells of numbers in rows of the same length."""
+
+    delimiter: str
+    score: float
+    decimal: str = "."
+    header: int = 0
+    first: int = 0
+    names: tuple[str, ...] | None = None
+    units: tuple[str, ...] = ()
+
+
+def _layout(lines: Sequence[str], delimiter: str) -> _Layout:
+    rows = [_cells(line, delimiter) for line in lines]
+    filled = [k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
+    if not filled:
+        return _Layout(delimiter, 0.0)
+    tail = [len(rows[k]) for k in filled[len(filled) // 2 :]]
+    n_columns = max(set(tail), key=tail.count)
+    if n_columns < 2 and delimiter != "\n":
+        return _Layout(delimiter, 0.0)
+    decimals = [mark for mark in (".", ",") if mark != delimiter]
+    shares = {mark: [_share(rows[k], mark) for k in filled] for mark in decimals}
+    decimal = max(decimals, key=lambda mark: sum(shares[mark]))
+    data = [k for k, share in zip(filled, shares[decimal], strict=True) if share >= LEAST_NUMBERS and len(rows[k]) == n_columns]
+    if not data:
+        return _Layout(delimiter, 0.0)
+    first = next((k for k, after in pairwise([*data, len(lines)]) if after - k == 1 or k == data[-1]), data[0])
+    score = sum(shares[decimal][filled.index(k)] for k in data) / len(filled) + 0.01 * min(n_columns, 20)
+    above = [k for k in filled if k < first and len(rows[k]) == n_columns]
+    names: tuple[str, ...] | None = None
+    units: tuple[str, ...] = ()
+    header = above[-1] if above else 0
+    if above:
+        names = tuple(rows[above[-1]])
+        if len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(names):
+            units, header = tuple(cell.strip() for cell in names), above[-2]
+            names = tuple(rows[header])
+    return _Layout(delimiter, score, decimal, header, first, names, units)
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == "\n":
+        return [line]
+    return next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
+
+
+def _share(row: Sequence[str], decimal: str) -> float:
+    """Share of cells that are numbers, empty ones left out; 0 where there is none."""
+    filled = [cell for cell in row if cell.strip()]
+    return sum(_is_number(cell, decimal) for cell in filled) / len(filled) if filled else 0.0
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    text = cell.strip().strip('"')
+    if decimal == ",":
+        if "." in text:
+            return False
+        text = text.replace(",", ".")
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether a row below the names holds units: some that are known, or brackets, and no longer words."""
+    filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
+    if not filled:
+        return any(cell.strip() for cell in cells)
+    known = sum(plain_unit(cell) is not None or cell.lower() in SPELLINGS for cell in filled)
+    return known >= max(1, 0.3 * len(filled)) and all(len(cell) <= 12 for cell in filled)
+
+
+def _head(file: Path) -> bytes:
+    try:
+        with table_stream(file) as stream:
+            return bytes(stream.read(HEAD))
+    except (OSError, pa.ArrowException, MemoryError) as error:
+        raise DataError(f"'{file}' cannot be read ({first_line(error)})") from None
+
+
+def _decoded(head: bytes, file: Path) -> tuple[str, str]:
+    """Encoding and text."""
+    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16", head[: len(head) // 2 * 2].decode("utf-16", errors="replace")
+    controls = sum(head.count(bytes([code])) for code in range(32) if code not in (9, 10, 12, 13))
+    if b"\0" in head or controls > MOST_CONTROLS * max(len(head), 1):
+        raise DataError(f"'{file}' is no table of text (it holds control characters); is it of another format? its ending says which")
+    try:
+        return "utf8", head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if error.start >= len(head) - 4 and len(head) >= HEAD:
+            return "utf8", head[: error.start].decode("utf-8-sig")
+    western = any(0x80 <= byte < 0xA0 for byte in head)
+    return ("cp1252", head.decode("cp1252", errors="replace")) if western else ("latin-1", head.decode("latin-1"))
+
+
+def _values(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], list[str]]:
+    """Columns of numbers, (N,) each, and what was not read."""
+    read = pc.ReadOptions(
+        block_size=BLOCK, encoding=shape.encoding, skip_rows=shape.skip_rows, skip_rows_after_names=1 if shape.units else 0
+    )
+    parse = pc.ParseOptions(delimiter=shape.delimiter)
+    convert = pc.ConvertOptions(decimal_point=shape.decimal)
+    try:
+        with table_stream(file) as stream:
+            table = pc.read_csv(stream, read, parse, convert)
+    except DAMAGE:
+        table = _as_text(file, shape, read, parse)
+    values, skipped = {}, []
+    for name in shape.names:
+        column = table.column(name) if name in table.column_names else None
+        samples = None if column is None else _numbers(column, shape.decimal)
+        if samples is None:
+            skipped.append(f"column '{printable(name)}' holds text")
+        else:
+            values[name] = samples
+    return values, skipped
+
+
+def _as_text(file: Path, shape: Shape, read: pc.ReadOptions, parse: pc.ParseOptions) -> pa.Table:
+    """All cells as they stand, where some columns hold numbers first and text later."""
+    kinds = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
+    try:
+        with table_stream(file) as stream:
+            return pc.read_csv(stream, read, parse, kinds)
+    except DAMAGE as error:
+        raise DataError(f"'{file}' cannot be read as a table ({first_line(error)}); is it truncated?") from None
+
+
+def _numbers(column: pa.ChunkedArray, decimal: str) -> FloatArray | None:
+    """A column as numbers; None where it holds anything else."""
+    kind = column.type
+    if pa.types.is_null(kind):
+        return None
+    if pa.types.is_integer(kind) or pa.types.is_floating(kind):
+        return np.asarray(column.cast(pa.float64()).to_numpy(), dtype=np.float64)
+    if not pa.types.is_string(kind):
+        return None
+    try:
+        plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
+        return np.asarray(compute.cast(plain, pa.float64()).to_numpy(), dtype=np.float64)
+    except pa.ArrowException:
+        return None

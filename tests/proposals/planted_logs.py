@@ -1,0 +1,63 @@
+"""A car that is known, as a logger might have written it; for tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+G = 9.80665
+WHEELBASE, RATIO, RADIUS, TRACK = 2.7, 15.0, 0.31, 1.5
+
+
+def drive(seconds: float = 120.0, rate_hz: float = 50.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """A linear single track on a winding road: SI units, ISO 8855, (T,) each, the wheels' and the steering wheel's angles with them."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(round(seconds * rate_hz)) / rate_hz
+    phases = generator.uniform(0.0, 2.0 * np.pi, 6)
+    vx = 20.0 + 5.0 * np.sin(2 * np.pi * 0.02 * t + phases[0]) + 2.0 * np.sin(2 * np.pi * 0.07 * t + phases[1])
+    ay_wanted = 2.5 * np.sin(2 * np.pi * 0.11 * t + phases[2]) + 1.5 * np.sin(2 * np.pi * 0.23 * t + phases[3])
+    r = ay_wanted / vx
+    vy = r * (1.4 - 0.0045 * vx * vx) + 0.08 * np.sin(2 * np.pi * 0.31 * t + phases[4])
+    steer = WHEELBASE * r / vx + 0.002 * ay_wanted
+    ax, ay = np.gradient(vx, t) - vy * r, np.gradient(vy, t) + vx * r
+
+    def noisy(samples: np.ndarray, level: float) -> np.ndarray:
+        return samples + level * generator.standard_normal(len(t))
+
+    side = 0.5 * TRACK * r
+    wheels = {"fl": vx - side, "fr": vx + side, "rl": vx - side, "rr": vx + side}
+    return {
+        "t": t,
+        "vx": noisy(vx, 0.02),
+        "vy": noisy(vy, 0.005),
+        "r": noisy(r, 0.002),
+        "ax": noisy(ax, 0.05),
+        "ay": noisy(ay, 0.05),
+        "steer": noisy(steer, 2e-4),
+        "handwheel": noisy(RATIO * steer, 2e-3),
+        "sideslip": np.arctan2(vy, vx),
+        **{f"wheel_{corner}": noisy(speed / RADIUS, 0.03) for corner, speed in wheels.items()},
+    }
+
+
+def usual(d: dict[str, np.ndarray]) -> pd.DataFrame:
+    """km/h, deg/s and g under names that an engineer would give."""
+    return pd.DataFrame(
+        {
+            "Time [s]": d["t"],
+            "Speed": 3.6 * d["vx"],
+            "Gyro": np.degrees(d["r"]),
+            "LatAcc": d["ay"] / G,
+            "LongAcc": d["ax"] / G,
+            "Steer": np.degrees(d["handwheel"]),
+            "Beta": np.degrees(d["sideslip"]),
+        }
+    )
+
+
+def write(file: Path, table: pd.DataFrame, **options: object) -> Path:
+    """A table of text."""
+    table.round(5).to_csv(file, index=False, **options)  # type: ignore[call-overload]
+    return file

@@ -1,0 +1,296 @@
+"""What columns are taken for: planted logs whose answers are known, in dresses that names alone do not see through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from dressed_logs import LOGS, write_log
+from own_car_proposals import ANSWERS, rows_of
+from planted_logs import RADIUS, drive, usual, write
+
+from vehest.alignment.proposals.names import hints
+from vehest.alignment.proposals.proposal import Proposal, Proposals
+from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.sources.base import open_source
+from vehest.sources.surveys import survey
+from vehest.stages.new_car import Vehicle, draft, examine
+from vehest.stages.new_car_outcome import conclude
+from vehest.stages.new_car_questions import questions_of
+
+
+def proposed(file: Path) -> dict[str, Proposal]:
+    return examine("my_car", [file]).proposals.by_channel
+
+
+def asked(file: Path) -> list[str]:
+    return [question.key for question in questions_of(examine("my_car", [file]))]
+
+
+def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path) -> None:
+    table = usual(drive())
+    table["Gyro"] *= -1.0
+    found = proposed(write(tmp_path / "lap.csv", table))
+    units = {name: (one.column, one.unit, one.sign) for name, one in found.items()}
+    assert units == {
+        "vx": ("Speed", "km/h", 1),
+        "yaw_rate": ("Gyro", "deg/s", -1),
+        "ay": ("LatAcc", "g", 1),
+        "ax": ("LongAcc", "g", 1),
+        "handwheel": ("Steer", "deg", 1),
+        "sideslip_ref": ("Beta", "deg", 1),
+    }
+    assert "agree" in found["yaw_rate"].in_words
+    assert found["yaw_rate"].in_words.startswith("yaw_rate: column Gyro, deg/s, sign -1: ay and vx·yaw_rate agree -")
+
+
+@pytest.mark.parametrize("unit", ["m/s", "km/h", "mph"])
+@pytest.mark.parametrize("of_rate", ["rad/s", "deg/s"])
+@pytest.mark.parametrize("of_ay", ["m/s²", "g"])
+def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(tmp_path, unit: str, of_rate: str, of_ay: str) -> None:
+    d = drive()
+    columns = {
+        "a": d["t"],
+        "b": d["vx"] * {"m/s": 1.0, "km/h": 3.6, "mph": 1.0 / 0.44704}[unit],
+        "c": d["r"] * {"rad/s": 1.0, "deg/s": 180.0 / np.pi}[of_rate],
+        "d": d["ay"] / {"m/s²": 1.0, "g": 9.80665}[of_ay],
+        "e": d["ax"],
+    }
+    found = proposed(write(tmp_path / "lap.csv", pd.DataFrame(columns)))
+    assert (found["vx"].column, found["vx"].unit) == ("b", unit)
+    assert (found["yaw_rate"].column, found["yaw_rate"].unit) == ("c", of_rate)
+    assert (found["ay"].column, found["ay"].unit) == ("d", of_ay)
+    assert found["ax"].column == "e"
+
+
+def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_tell(tmp_path) -> None:
+    d = drive()
+    mirrored = usual(d)
+    mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
+    assert asked(write(tmp_path / "lap.csv", mirrored)) == ["left_right"]
+    with_wheels = mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in ("fl", "fr", "rl", "rr")})
+    examined = examine("my_car", [write(tmp_path / "wheels.csv", with_wheels)])
+    assert "right wheels are faster" in examined.proposals.left_right
+    found = examined.proposals.by_channel
+    assert {name: found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")} == dict.fromkeys(
+        ("yaw_rate", "ay", "handwheel", "sideslip_ref"), -1
+    )
+
+
+def test_the_course_over_latitude_and_longitude_tells_left_from_right(tmp_path) -> None:
+    d = drive(240.0)
+    heading = np.cumsum(d["r"]) / 50.0  # counter-clockwise from east
+    east, north = np.cumsum(d["vx"] * np.cos(heading)) / 50.0, np.cumsum(d["vx"] * np.sin(heading)) / 50.0
+    table = usual(d)
+    table[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
+    table["Latitude"] = 48.0 + north / 111_000.0
+    table["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
+    table.to_csv(tmp_path / "lap.csv", index=False)
+    proposals = examine("my_car", [tmp_path / "lap.csv"]).proposals
+    assert "course over latitude and longitude" in proposals.left_right
+    assert proposals.by_channel["yaw_rate"].sign == -1
+
+
+def test_wheels_alone_give_a_speed_and_their_radius(tmp_path) -> None:
+    d = drive()
+    table = (
+        usual(d).drop(columns="Speed").assign(**{f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in ("fl", "fr", "rl", "rr")})
+    )
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
+    assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
+    made = draft(examined, examined.proposals, Vehicle())
+    assert {"vx", "vy_ref"} <= made.contents[0].channels
+
+
+def test_road_wheel_and_steering_wheel_are_told_apart_by_range_and_slow_corners(tmp_path) -> None:
+    d = drive()
+    table = usual(d)
+    table["Steer"] = d["steer"]
+    assert proposed(write(tmp_path / "road.csv", table))["steer"].unit == "rad"
+    table["Steer"] = np.degrees(d["handwheel"])
+    assert proposed(write(tmp_path / "hand.csv", table))["handwheel"].unit == "deg"
+
+
+def test_steering_ratio_is_estimated_where_the_wheelbase_is_told(tmp_path) -> None:
+    examined = examine("my_car", [write(tmp_path / "lap.csv", usual(drive(300.0)))])
+    assert draft(examined, examined.proposals, Vehicle()).ratio is None
+    ratio = draft(examined, examined.proposals, Vehicle(wheelbase=2.7)).ratio
+    assert ratio is not None
+    assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
+
+
+def test_two_speeds_that_no_name_tells_apart_are_asked(tmp_path) -> None:
+    d = drive()
+    table = usual(d).assign(Speed2=3.6 * d["vx"] + 0.01)
+    assert {"Speed", "Speed2"} <= set(asked(write(tmp_path / "lap.csv", table)))
+    named = usual(d).assign(GPS_Speed=3.6 * d["vx"] + 0.01)
+    found = proposed(write(tmp_path / "named.csv", named))
+    assert (found["vx"].column, found["vx_ref"].column) == ("Speed", "GPS_Speed")
+    assert asked(tmp_path / "named.csv") == ["left_right"]
+
+
+def test_a_unit_of_the_header_that_contradicts_the_motion_is_asked(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"Gyro": "Gyro [rad/s]", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"})
+    assert "Gyro [rad/s]" in asked(write(tmp_path / "lap.csv", table))
+
+
+def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path) -> None:
+    d = drive(300.0)
+    table = usual(d)
+    table["Gyro"] = np.interp(d["t"] - 0.12, d["t"], table["Gyro"])
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    made = draft(examined, examined.proposals, Vehicle())
+    assert made.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
+    assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), "an estimator in the car gets it late, too"
+
+
+def test_three_hundred_columns_of_noise_do_not_hide_the_car(tmp_path) -> None:
+    d, random = drive(60.0), np.random.default_rng(1)
+    noise = pd.DataFrame({f"S{k}": random.standard_normal(len(d["t"])).cumsum() for k in range(300)})
+    found = proposed(write(tmp_path / "lap.csv", pd.concat([usual(d), noise], axis=1)))
+    assert {name: one.column for name, one in found.items()}.items() >= {
+        "vx": "Speed",
+        "yaw_rate": "Gyro",
+        "ay": "LatAcc",
+        "ax": "LongAcc",
+    }.items()
+
+
+def test_slow_signals_with_empty_cells_are_bridged(tmp_path) -> None:
+    d = drive()
+    table = usual(d)
+    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    made = draft(examined, examined.proposals, Vehicle())
+    assert made.dataset["source"] == "text_log"
+    (recording,) = (open_source(made.dataset).read("lap"),)
+    np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
+    assert np.isfinite(recording["sideslip_ref"]).all()
+
+
+def test_a_log_without_reference_cannot_rank_anything(tmp_path) -> None:
+    examined = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
+    outcome = conclude(draft(examined, examined.proposals, Vehicle()), (), force=False, dry_run=True)
+    assert outcome.plan is None
+    assert [one.file.parts[0] for one in outcome.files] == ["conf"]
+    assert outcome.next_commands()[-1].startswith("vehest estimate pretrained ")
+
+
+def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_path) -> None:
+    d = drive(120.0)
+    yaw = np.cumsum(d["r"]) / 50.0
+    x = np.cumsum(d["vx"] * np.cos(yaw) - d["vy"] * np.sin(yaw)) / 50.0
+    y = np.cumsum(d["vx"] * np.sin(yaw) + d["vy"] * np.cos(yaw)) / 50.0
+    table = usual(d).drop(columns="Beta").assign(pose_x=x, pose_y=y, pose_yaw=yaw)
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    made = draft(examined, examined.proposals, Vehicle())
+    assert made.has_reference
+    recording = open_source(made.dataset).read("lap")
+    assert np.corrcoef(recording["vy_ref"], d["vy"])[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is empty"),
+        (b"\n\n\n", "empty lines"),
+        (b"time,name\n" + b"a,b\n" * 50, "no rows of numbers"),
+        (b"speed\n" + b"1.0\n2.0\n" * 50, "one column only"),
+        (b"\x00\x01\x02\x03" * 500, "no table of text"),
+        (bytes(range(256)) * 40, "no table of text"),
+        (b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
+        (b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
+        (b"t,v\n1,2\n", "1 row of numbers"),
+        (b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column could be told"),
+    ],
+)
+def test_what_is_no_log_is_one_line(tmp_path, content: bytes, said: str) -> None:
+    file = tmp_path / "lap.csv"
+    file.write_bytes(content)
+    with pytest.raises((DataError, MissingError), match=said) as refusal:
+        examine("my_car", [file])
+    assert "\n" not in str(refusal.value)
+    assert "lap.csv" in str(refusal.value)
+
+
+@pytest.mark.parametrize("ending", [".mf4", ".vbo", ".db3", ".mcap", ".parquet", ".zip", ".bag"])
+def test_junk_under_every_ending_is_one_line(tmp_path, ending: str) -> None:
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    file = tmp_path / f"lap{ending}"
+    file.write_bytes(b"junk\x00" * 1000)
+    with pytest.raises(VehestError) as refusal:
+        examine("my_car", [file])
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path) -> None:
+    d = drive(30.0)
+    rows = [
+        f'"{t:.2f}","{3.6 * v:.4f}","{np.degrees(r):.5f}","{a:.5f}"' for t, v, r, a in zip(d["t"], d["vx"], d["r"], d["ay"], strict=True)
+    ]
+    head = [
+        '"Format","MoTeC CSV File"',
+        '"Venue","Somewhere"',
+        "",
+        '"Time","Ground Speed","Gyro Yaw","G Lat"',
+        '"s","km/h","deg/s","m/s^2"',
+    ]
+    (tmp_path / "lap.csv").write_text("\n".join([*head, *rows, ""]))
+    log = survey(tmp_path / "lap.csv")
+    assert (log.source, log.options["skip_rows"]) == ("text_log", 3)
+    assert {column.name: column.unit for column in log.columns} == {"Ground Speed": "km/h", "Gyro Yaw": "deg/s", "G Lat": "m/s^2"}
+    examined = examine("my_car", [tmp_path / "lap.csv"])
+    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
+
+
+def test_a_column_that_counts_runs_makes_recordings_of_them(tmp_path) -> None:
+    parts = [usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)]
+    log = survey(write(tmp_path / "laps.csv", pd.concat(parts)))
+    assert log.options["runs"] == "run"
+    assert sorted((one.start, one.stop) for one in log.runs) == [(0, 2000), (2000, 4000)]
+
+
+def test_mirroring_turns_lateral_channels_alone() -> None:
+    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
+    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("Querbeschleunigung", "ay"),
+        ("Gierrate", "yaw_rate"),
+        ("Lenkradwinkel", "handwheel"),
+        ("Schwimmwinkel", "sideslip"),
+        ("v_Fzg", "speed"),
+        ("WheelSpeedFL", "wheel_speed_fl"),
+        ("n_HR", "wheel_speed_rr"),
+        ("FLwhlspd", "wheel_speed_fl"),
+        ("angular_velocity.z", "yaw_rate"),
+        ("linear_acceleration.x", "ax"),
+        ("Drehzahl", "other"),
+        ("Lenkradwinkelgeschwindigkeit", "other"),
+        ("yawAngAcc", "other"),
+    ],
+)
+def test_names_speak_for_one_role(name: str, role: str) -> None:
+    assert list(hints(name)) == [role]
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log: str) -> None:
+    if log == "mdf":
+        pytest.importorskip("asammdf", reason="the log is written by asammdf")
+    if log == "bag":
+        pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    files = write_log(log, data_root, tmp_path)
+    examined = examine("my_car", files)
+    made = draft(examined, examined.proposals, Vehicle())
+    outcome = conclude(made, tuple(questions_of(examined)), force=False, dry_run=True)
+    answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
+    assert [row for row in rows_of(log, answers, outcome.as_plain()) if row["correct"] != "yes"] == []
