@@ -37,7 +37,7 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log) 
     assert dataset["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
     assert [entry["name"] for entry in dataset["transforms"]] == ["velocity_from_sideslip", "steering_ratio"]
     pipeline = yaml.safe_load(Path(FILES[2]).read_text(encoding="utf-8"))
-    sweeps = [" ".join(sweep) for sweep in pipeline["sweeps"]]
+    sweeps = [" ".join(sweep) for sweep in pipeline["parts"]["all"]["sweeps"]]
     assert sweeps[0] == "estimator=zero,static_map,kinematic"
     assert sweeps[1] == "estimator=data_sheet estimator.wheelbase=2.7"
     assert any("estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps)

@@ -20,7 +20,8 @@ from vehest.stages.new_car_pipeline import Plan, pipeline_text, plan_of
 from vehest.stages.new_car_questions import RATE, TIME, VEHICLE, Question, answered, number, questions_of, vehicle_questions
 from vehest.stages.usable import SCORED
 
-SHARES = {"train": "60 %", "validation": "20 %", "tests": "20 %"}
+SHARES = {"train": "50 %", "validation": "20 %", "tests": "30 %"}
+LEARNT = 0.7  # of the recordings: training and validation
 SHORT = 120.0  # s of recordings; below, hardly any comparison tells estimators apart
 PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
 
@@ -48,7 +49,7 @@ class Outcome:
         name, file = self.draft.examined.name, self.draft.examined.located.files[0]
         commands = [f"vehest data check {name}", f"vehest data usable {name}"]
         if self.plan is not None:
-            return [*commands, f"vehest run {name}"]
+            return [*commands, f"vehest run {name} --minutes 15"]
         lacking = set(PRETRAINED_CHANNELS) - self.draft.contents[0].channels
         if file.is_dir():
             return commands
@@ -179,7 +180,13 @@ def conclude(made: Draft, left: tuple[Question, ...], *, force: bool, dry_run: b
     if plan is not None:
         files.append(Written(split, split_text(name), "what is learnt from, what stops the training, what is tested"))
         assumed = any(".car." in word for sweep, _ in plan.sweeps for word in sweep)
-        files.append(Written(pipeline, pipeline_text(name, plan, assumed=assumed), f"what is tried: {', '.join(plan.estimators)}"))
+        files.append(
+            Written(
+                pipeline,
+                pipeline_text(name, plan, LEARNT * made.seconds / 60.0, assumed=assumed),
+                f"what is tried: {', '.join(plan.estimators)}",
+            )
+        )
     if not dry_run:
         write_all(files, force=force)
     return Outcome(made, plan, left, tuple(files))

@@ -48,6 +48,11 @@ IDENTIFIED = (
     *("training.identification.tyres_from='*'", "training.identification.restarts=1", "training.identification.generations=60"),
 )
 DUGOFF = (*SEARCH, "training.tyres_from='*'", "training.restarts=1", "training.generations=60")
+SHIPPED = ("estimator.n_local=2", "estimator.n_hidden=2")
+"""Settings of the KS-NN that comes with vehest."""
+SHIPPED_RATE = 20.0  # Hz
+MINUTES = (0.5, 1.0, 2.0, 5.0)
+"""Of reference, that the curve is made of, where there are more."""
 FAMILIES = (
     Family("zero", about="baselines: v = 0, two numbers, leaky integration; seconds"),
     Family("static_map"),
@@ -55,9 +60,16 @@ FAMILIES = (
     Family("data_sheet", about="baseline: steady cornering from the data sheet"),
     Family(
         "ksnn",
+        SHIPPED,
+        ("training.start_from=pretrained", "training.max_epochs=100"),
+        "the network that comes with vehest, trained on; half a minute",
+        seeds=2,
+    ),
+    Family(
+        "ksnn",
         ("estimator.n_hidden=0,2", "estimator.bias=true"),
         ("training.max_epochs=100",),
-        "kinematics-structured network; a minute",
+        "the same family from scratch; a minute",
         seeds=2,
     ),
     Family("luenberger", (), ("training.grid=2", "training.max_evaluations=100"), "observer; a minute"),
@@ -130,6 +142,8 @@ def plan_of(contents: Sequence[Contents], vehicle: Vehicle) -> Plan:
         car, wanted = _car(family, vehicle)
         settings = [*family.settings, *car]
         lack = wanted or _lack(family.name, settings, contents)
+        if not lack and family.settings == SHIPPED and not _takes_shipped(contents):
+            continue  # the same family stands below, from scratch
         if lack:
             lacking[family.name] = lack
             continue
@@ -140,11 +154,17 @@ def plan_of(contents: Sequence[Contents], vehicle: Vehicle) -> Plan:
             sweeps[-1] = ((f"{before[0]},{family.name}", *own[1:]), sweeps[-1][1])
         else:
             sweeps.append((own, family.about))
+    lacking = {name: what for name, what in lacking.items() if not any(name in sweep[0].split("=")[1].split(",") for sweep, _ in sweeps)}
     known = {family.name for family in FAMILIES}
     for name in dict.fromkeys((*choices("estimator"), *estimator_names())):
         if name not in known:
             lacking[name] = "not one of vehest's own families; add it as you need it"
     return Plan(tuple(sweeps), lacking)
+
+
+def _takes_shipped(contents: Sequence[Contents]) -> bool:
+    """Whether recordings come at the rate of the model that comes with vehest, or faster."""
+    return all(own.rate_hz >= SHIPPED_RATE * (1 - 1e-9) for own in contents)
 
 
 def _car(family: Family, vehicle: Vehicle) -> tuple[list[str], str]:
@@ -195,34 +215,58 @@ def _in_words(found: Usability) -> str:
     return ", ".join(parts) or found.to_give or "more than these recordings have"
 
 
-def pipeline_text(name: str, plan: Plan, *, assumed: bool) -> str:
+def pipeline_text(name: str, plan: Plan, minutes: float, *, assumed: bool) -> str:
     """A file in pipelines/.
 
     Args:
         name: of the study and of its split.
         plan: what it tries.
+        minutes: of reference to learn and to stop by.
         assumed: whether parameters of the car were made of wheelbase and mass.
     """
     lines = [
         f"# What is tried on {name}: every family that its channels allow, the most promising first, with small budgets. Run it by",
-        f"#   vehest run {name}",
-        "# Lines may go, budgets may grow (training.max_epochs=1000 is what the papers' comparisons use); what is done is not done again.",
+        f"#   vehest run {name} --minutes 15",
+        "# which does as much as fits, and goes on when it is run again. Lines may go, budgets may grow (training.max_epochs=1000 is what",
+        "# the papers' comparisons use); what is done is not done again.",
     ]
     if assumed:
         lines += [
             "# The car's parameters are made of wheelbase and mass: centre of gravity in the middle and at 0.2·L, yaw inertia m·(L/2)²,",
             "# cornering stiffness of an axle 10/rad times its load. Write yours where you know them.",
         ]
-    lines += [f"study: {name}", f"title: Estimators on {name}", "report: drive", f"split: {name}", "publish: false", "sweeps:"]
+    lines += [f"study: {name}", f"title: Which estimator to trust on {name}", "report: own_car", "publish: false"]
+    lines += ["evaluation:", "  rate_hz: 20                                # every estimate is read at this rate", "parts:"]
+    lines += ["  all:", "    title: all recordings", f"    split: {name}", "    sweeps:"]
     for sweep, about in plan.sweeps:
-        text = f"  - [{', '.join(_quoted(word) for word in sweep)}]"
-        lines += [f"  # {about}"] if about else []
-        lines.append(text)
+        lines += [f"      # {about}"] if about else []
+        lines.append(_sweep(sweep))
     if plan.lacking:
-        lines.append("# Left out, with what each lacks:")
-        lines += [f"#   {own}: {what}" for own, what in plan.lacking.items()]
-    lines += ["evaluation:", "  rate_hz: 20                                # every estimate is read at this rate", ""]
-    return "\n".join(lines)
+        lines.append("  # Left out, with what each lacks:")
+        lines += [f"  #   {own}: {what}" for own, what in plan.lacking.items()]
+    return "\n".join([*lines, *_curve(name, plan, minutes), ""])
+
+
+def _curve(name: str, plan: Plan, minutes: float) -> list[str]:
+    """Parts with less reference: the network that comes with vehest, the same from scratch, and two numbers."""
+    fewer = [own for own in MINUTES if own < 0.8 * minutes]
+    if not fewer or "ksnn" not in plan.estimators:
+        return []
+    scratch = ("estimator=ksnn", *SHIPPED, "training.max_epochs=100")
+    shipped = any("training.start_from=pretrained" in sweep for sweep, _ in plan.sweeps)
+    lines = ["  # How many minutes of reference are needed: the same test, less to learn from."]
+    for own in fewer:
+        head = [f"    split: {name}", f"    overrides: [++split.minutes={own:g}]", "    sweeps:"]
+        lines += [f"  minutes_{own:g}:", f"    title: {own:g} min of reference", *head]
+        lines += [_sweep(("estimator=zero,static_map",)), _sweep(scratch)]
+        if shipped:
+            tuned = (*scratch, "training.start_from=pretrained")
+            lines += [f"  minutes_{own:g}_tuned:", f"    title: {own:g} min of reference, trained on", *head, _sweep(tuned)]
+    return lines
+
+
+def _sweep(words: Sequence[str]) -> str:
+    return f"      - [{', '.join(_quoted(word) for word in words)}]"
 
 
 def _quoted(word: str) -> str:

@@ -33,6 +33,7 @@ from vehest.studies.artefacts import (
     of_parts,
     read_frame,
 )
+from vehest.studies.kit.reference_minutes import start_in_words
 from vehest.studies.kit.timings import timings_of_study
 from vehest.studies.registry import study_module, study_module_name
 
@@ -248,7 +249,7 @@ def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
             EvaluatedModel(
                 estimator=estimator.name,
                 variant=estimator.variant,
-                title=estimator.full_title,
+                title=estimator.full_title + start_in_words(member.job.training),
                 seed=member.job.seed,
                 model_folder=member.model.folder,
                 evaluation_folder=member.evaluation.folder,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from vehest.data.splits import Split
@@ -28,9 +27,3 @@ def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Ar
     folder = find_model(str(start), job.plan.output, lambda _: None)
     plan = replace(job.plan, inputs={**job.plan.inputs, f"start from {start}": model_artefact(folder).digest})
     return replace(job, plan=plan, training={**job.training, "start_from": str(folder.resolve())})
-
-
-def starts_in_words(training: Mapping[str, Any]) -> str:
-    """``, starting from MODEL``; empty where a training starts from scratch."""
-    start = training.get("start_from")
-    return "" if start is None else f", starting from {Path(str(start)).name}"

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from vehest.data.errors import DataError
 from vehest.data.limits import check_limit
-from vehest.sources.mdf.files import Signal, Wanted, names_in_groups, read_measurement
+from vehest.sources.mdf.files import Wanted, names_in_groups, read_measurement
+from vehest.sources.signals import Signal
 from vehest.sources.surveys.log import Log, RawColumn
 
 MOST_SIGNALS = 2000

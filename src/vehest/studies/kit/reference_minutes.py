@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,7 +94,7 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
             models.setdefault((model.estimator, model.variant, start_of(model), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
     points = {
-        Point(estimator, variant, as_text(own[0].title), start, minutes, len(own)): own
+        Point(estimator, variant, as_text(own[0].title.removesuffix(start_in_words(own[0].training))), start, minutes, len(own)): own
         for (estimator, variant, start, minutes), own in models.items()
         if counts[estimator, variant] > 1 or estimator in BASELINES
     }
@@ -117,6 +117,12 @@ def start_of(model: EvaluatedModel) -> str:
     """What a training started from, for people."""
     start = model.training.get("start_from")
     return SCRATCH if start is None else f"from {Path(str(start)).name}"
+
+
+def start_in_words(training: Mapping[str, object]) -> str:
+    """Behind a title: ``, starting from MODEL``; empty where a training starts from nothing."""
+    start = training.get("start_from")
+    return "" if start is None else f", starting from {Path(str(start)).name}"
 
 
 def minutes_of(part: PartArtefacts) -> float:
