@@ -16,7 +16,7 @@ KILLS ?= 100
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -164,6 +164,9 @@ replay_check: $(INSTALLED) ## models on the frames of a bus against themselves o
 
 replay_30min: $(INSTALLED) ## 30 minutes of a bus at 100 Hz in real time: deadlines and memory; on an idle machine (MINUTES=30)
 	$(BIN)/python benchmarks/replay.py soak --minutes $(MINUTES)
+
+own_car: $(INSTALLED) ## from a raw CSV of the real Ferrari to a verdict, timed: vehest new, then vehest run --minutes 15; needs VEHEST_DATA
+	$(BIN)/python benchmarks/own_car.py
 
 examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
 	$(BIN)/python docs/compare_examples.py
