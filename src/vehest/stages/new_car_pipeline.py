@@ -82,13 +82,13 @@ FAMILIES = (
     Family("factor_graph", ("estimator.window=0.5",), (), "factor graph over half a second, causal; nothing is learnt", STIFF),
     Family(
         "velocity_gru",
-        ("estimator.inputs=[yaw_rate,ax,ay,vx,steer]", "estimator.outputs=[vx,vy,yaw_rate]"),
+        ("estimator.inputs=[yaw_rate,ax,ay,vx,steer]", "estimator.outputs=[vy]", "estimator.rate_hz=20"),
         ("training.phase.max_epochs=100",),
         "recurrent networks over all samples so far; minutes",
     ),
     Family(
         "velocity_lstm",
-        ("estimator.inputs=[yaw_rate,ax,ay,vx,steer]", "estimator.outputs=[vx,vy,yaw_rate]"),
+        ("estimator.inputs=[yaw_rate,ax,ay,vx,steer]", "estimator.outputs=[vy]", "estimator.rate_hz=20"),
         ("training.phase.max_epochs=100",),
     ),
     Family("ensemble_ukf", (IMU, "estimator.members=5"), IDENTIFIED, "filter with an ensemble's angle; minutes", (*INERTIA, "cg_height")),
