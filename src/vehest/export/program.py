@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from vehest.export.estimator_source import estimator_files
@@ -14,8 +16,8 @@ TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
 
 
-def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, str]:
-    """Sources that build anywhere: the model, and `main` around it; name -> text.
+def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> tuple[dict[str, str], tuple[str, ...]]:
+    """Sources that build anywhere: the model, and `main` around it, name -> text; and the notes of the method.
 
     Raises:
         ConfigurationError: the estimator cannot be written in C.
@@ -24,9 +26,15 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     files = {"vehest_method.h": method.header, "vehest_method.c": method.source}
     files |= estimator_files(stepper, precision, title, method.notes)
     sources = sorted(name for name in files if name.endswith(".c"))
-    context = {"names": list(stepper.estimator.channels), "tolerance": TOLERANCES[precision], "sources": sources}
-    main = render("main.c.j2", "double", **context, exact=precision == "double")  # files hold double, whatever the model computes in
-    return files | {"main.c": main, "Makefile": render("makefile.j2", precision, **context)}
+    names, exact = list(stepper.estimator.channels), precision == "double"
+    files["main.c"] = render_text("main.c.j2", names=names, tolerance=TOLERANCES[precision], exact=exact)
+    files["Makefile"] = render_text("makefile.j2", sources=sources, exact=exact)
+    return files, method.notes
+
+
+def render_text(template: str, **values: Any) -> str:
+    """The text of a template that is no part of the model: files hold double, whatever the model computes in."""
+    return render(template, "double", **values)
 
 
 def vector_files(stepper: GuardedStepper) -> dict[str, str]:
