@@ -16,7 +16,7 @@ from vehest.trust import bands as band_rules
 from vehest.trust import health_kernel as kernel
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.front_end import CUTOFF, FrontEnd
-from vehest.trust.guard import Guard
+from vehest.trust.guard import ENDLESS, Guard
 from vehest.trust.health import PackedHealth
 from vehest.trust.health_kernel import N_FEATURES, N_FORMS, N_LEVELS, Layout
 
@@ -25,9 +25,15 @@ MOST_OF = 1_000_000  # largest denominator of the ratio of rates
 
 
 def guard_table(guard: Guard) -> dict[str, Any]:
-    """Limits a channel, longest runs in samples, samples that are bridged and that a new level has to stand."""
+    """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged and that a new level has to stand."""
     runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard._limits[:, 3]]
-    return {"limits": guard._limits[:, :3].tolist(), "runs": runs, "bridged": int(guard._settings[2]), "persists": int(guard._settings[3])}
+    limits = _endless(guard._limits[:, [0, 1, 2, 4, 5]]).tolist()
+    return {"limits": limits, "runs": runs, "bridged": int(guard._settings[2]), "persists": int(guard._settings[3])}
+
+
+def _endless(values: FloatArray) -> FloatArray:
+    """The same with infinity for what stands for it."""
+    return np.where(np.abs(values) >= ENDLESS, np.copysign(np.inf, values), values)
 
 
 def front_end_table(front: FrontEnd) -> dict[str, Any]:
@@ -104,6 +110,7 @@ def health_table(packed: PackedHealth | None) -> dict[str, Any] | None:
         "forget_energy": table(kernel.AT_FORGET_ENERGY, layout.energies),
         "forget_ratio": table(kernel.AT_FORGET_RATIO, layout.ratios),
         "forget_average": table(kernel.AT_FORGET_AVERAGE, layout.averages),
+        "stops": _endless(table(kernel.AT_STOPS, 2, C)),
         "limits": table(kernel.AT_LIMITS, K),
         "inverse": table(kernel.AT_INVERSE, K),
         "priority": table(kernel.AT_PRIORITY, K),
