@@ -17,6 +17,8 @@ FAMILIES = {
     "static_map": "baselines",
     "kinematic": "baselines",
     "data_sheet": "baselines",
+    "luenberger": "luenberger",
+    "kalman": "kalman",
 }
 """Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -97,8 +97,8 @@ def _environment(precision: Precision) -> Environment:
         loader=PackageLoader("vehest.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters |= {
-        "real": lambda value: literal(value, precision),
-        "table": lambda values: table(values, precision),
+        "real": partial(literal, precision=precision),
+        "table": partial(table, precision=precision),
         "ascii": ascii_only,
         "unit": unit_of,
     }
