@@ -19,6 +19,7 @@ FAMILIES = {
     "data_sheet": "baselines",
     "luenberger": "luenberger",
     "kalman": "kalman",
+    "ksnn": "ksnn",
 }
 """Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 
