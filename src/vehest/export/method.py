@@ -20,6 +20,11 @@ FAMILIES = {
     "luenberger": "luenberger",
     "kalman": "kalman",
     "ksnn": "ksnn",
+    "gru": "recurrent",
+    "lstm": "recurrent",
+    "velocity_gru": "recurrent",
+    "velocity_lstm": "recurrent",
+    "sideslip_ffnn": "sample_networks",
 }
 """Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 

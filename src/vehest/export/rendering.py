@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 Precision = Literal["double", "float"]
 
-A_ROW = 6  # numbers on a line of a table
+WIDTH = 128  # of a line of a table, its indent aside
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _ASCII = {"²": "^2", "³": "^3", "·": "*", "°": "deg", "ω": "omega", "β": "beta", "δ": "delta", "ä": "ae", "ö": "oe", "ü": "ue"}
@@ -68,11 +69,9 @@ def table(values: Any, precision: Precision) -> str:
 
 def _nested(array: np.ndarray[Any, Any], precision: Precision, indent: str) -> str:
     if array.ndim == 1:
-        words = [literal(float(value), precision) for value in array]
-        rows = [", ".join(words[first : first + A_ROW]) for first in range(0, len(words), A_ROW)]
-        if len(rows) == 1:
-            return f"{{{rows[0]}}}"
-        return "{\n" + ",\n".join(f"{indent}{row}" for row in rows) + f"\n{indent[:-4]}}}"
+        words = ", ".join(literal(float(value), precision) for value in array)
+        lines = textwrap.wrap(words, WIDTH)
+        return "{" + f"\n{indent}".join(lines) + "}"
     inner = [_nested(part, precision, indent + "    ") for part in array]
     return "{\n" + ",\n".join(f"{indent}{part}" for part in inner) + f"\n{indent[:-4]}}}"
 
