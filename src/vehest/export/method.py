@@ -25,6 +25,7 @@ FAMILIES = {
     "velocity_gru": "recurrent",
     "velocity_lstm": "recurrent",
     "sideslip_ffnn": "sample_networks",
+    "rational_ekf": "rational_ekf",
 }
 """Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 
