@@ -26,6 +26,9 @@ FAMILIES = {
     "velocity_lstm": "recurrent",
     "sideslip_ffnn": "sample_networks",
     "rational_ekf": "rational_ekf",
+    "dugoff_ukf": "track_ukf",
+    "ensemble_ukf": "track_ukf",
+    "cnn_ukf": "track_ukf",
 }
 """Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 
