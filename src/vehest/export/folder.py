@@ -14,7 +14,7 @@ from vehest.export.estimator_source import context_of
 from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
 from vehest.export.program import TOLERANCES, program_files, render_text, vector_files
 from vehest.export.rendering import Precision
-from vehest.export.vectors import SECONDS
+from vehest.export.vectors import SECONDS, in_float64
 from vehest.trust import health, verdict
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
@@ -64,7 +64,7 @@ def export_model(
     files, notes = program_files(stepper, kind, estimator.full_title)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
     files["README.md"] = readme(stepper, kind, notes, found, has_trust=trust is not None, elsewhere=elsewhere)
-    files |= vector_files(stepper)
+    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere))
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in files.items():

@@ -10,6 +10,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
+from vehest.estimators.base import Estimator
 from vehest.trust.contract import GuardedStepper
 
 SECONDS = 12.0
@@ -33,6 +34,16 @@ def replayed(stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, F
         said = stepper.step(sample, None if math.isnan(time) else time)
         found[k] = [said.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS]
     return found
+
+
+def in_float64(estimator: Estimator) -> Estimator:
+    """The same estimator with weights that compute in float64, which networks that were trained in float32 do not."""
+    twin = type(estimator)(estimator.settings)
+    twin.preparation = estimator.preparation
+    twin.load_weights(
+        {name: values.astype(np.float64) if np.issubdtype(values.dtype, np.floating) else values for name, values in estimator.weights().items()}
+    )
+    return twin
 
 
 def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray]]:
