@@ -26,6 +26,7 @@ FAMILIES = {
     "velocity_lstm": "recurrent",
     "sideslip_ffnn": "sample_networks",
     "rational_ekf": "rational_ekf",
+    "learned_ukf": "learned_ukf",
     "dugoff_ukf": "track_ukf",
     "ensemble_ukf": "track_ukf",
     "cnn_ukf": "track_ukf",
@@ -56,14 +57,14 @@ class MethodTemplate:
         name: template in ``templates/methods``, without ending.
         values: what it needs of the fitted estimator.
         refuses_nan: channels whose absence ends in an error in Python's stepper.
-        refuses_infinite: whether an infinite value does.
+        refuses_infinite: channels whose infinite value does.
         notes: see `MethodSource`; they also stand at the top of the source.
     """
 
     name: str
     values: Mapping[str, Any]
     refuses_nan: tuple[str, ...] = ()
-    refuses_infinite: bool = False
+    refuses_infinite: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
 
 

@@ -35,7 +35,7 @@ def kalman(estimator: KalmanFilter, precision: Precision) -> MethodTemplate:
         "R": [levels["ay"] ** 2, levels["yaw_rate"] ** 2],
         "initial": s.initial_deviation**2,
     }
-    return MethodTemplate("kalman", values, ("vx", "steer"), refuses_infinite=True)
+    return MethodTemplate("kalman", values, ("vx", "steer"), refuses_infinite=estimator.channels)
 
 
 def gate_values(gate: Gate | None) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def rational_ekf(estimator: RationalFilter, precision: Precision) -> MethodTempl
         "lost": LOST**2,
         "tyre_covariance": first.covariance[4:, 4:],
     }
-    return MethodTemplate("rational_ekf", values, ("vx", "steer"), refuses_infinite=True)
+    return MethodTemplate("rational_ekf", values, ("vx", "steer"), refuses_infinite=estimator.channels)
 
 
 def _adapted(name: str) -> dict[str, str]:

@@ -24,7 +24,7 @@ from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST
 def dugoff_ukf(estimator: DugoffUkf, precision: Precision) -> MethodTemplate:
     """The filter alone."""
     needed = tuple(name for name in estimator.channels if name not in estimator.skippable)
-    return MethodTemplate("track_ukf", {**_filter_values(estimator), "network": False}, needed, refuses_infinite=True)
+    return MethodTemplate("track_ukf", {**_filter_values(estimator), "network": False}, needed, refuses_infinite=estimator.channels)
 
 
 def ensemble_ukf(estimator: EnsembleUkf, precision: Precision) -> MethodTemplate:
@@ -41,7 +41,7 @@ def cnn_ukf(estimator: CnnUkf, precision: Precision) -> MethodTemplate:
 def _with_network(estimator: NetworkUkf, own: dict[str, Any]) -> MethodTemplate:
     values = {**_filter_values(estimator.model), **network_values(estimator.network), **own}
     values |= {"network": True, "seen": estimator.inputs, "least_variance": LEAST_VARIANCE, "m": values["m"] + 1}
-    return MethodTemplate("track_ukf", values, estimator.channels, refuses_infinite=True)
+    return MethodTemplate("track_ukf", values, estimator.channels, refuses_infinite=estimator.channels)
 
 
 def _filter_values(model: DugoffUkf) -> dict[str, Any]:
