@@ -17,12 +17,13 @@ def kalman(estimator: KalmanFilter, precision: Precision) -> MethodTemplate:
     car, levels = s.car, estimator.levels
     kept = math.exp(-1.0 / (s.offsets.seconds * s.rate_hz))
     offsets = [
-        {"name": name, "row": row, "initial": getattr(s.offsets, name) ** 2, "variance": getattr(s.offsets, name) ** 2 * (1.0 - kept**2)}
+        {"name": name, "row": row, "initial": getattr(s.offsets, name), "wander": getattr(s.offsets, name) * math.sqrt(1.0 - kept**2)}
         for row, name in enumerate(s.offsets.given, 2)
     ]
     values = {
         **gate_values(Gate.of(s.gate, s.rate_hz)),
         "n": 2 + len(offsets),
+        "columns": 4 + len(offsets) + (len(offsets) > 1),
         "offsets": offsets,
         "kept": kept,
         "car": car,
@@ -32,8 +33,8 @@ def kalman(estimator: KalmanFilter, precision: Precision) -> MethodTemplate:
         "damping": car.cg_to_front_axle**2 * car.cornering_stiffness_front + car.cg_to_rear_axle**2 * car.cornering_stiffness_rear,
         "minimum_speed": s.minimum_speed,
         "steer_level": levels["steer"] * s.noise.steer_factor,
-        "R": [levels["ay"] ** 2, levels["yaw_rate"] ** 2],
-        "initial": s.initial_deviation**2,
+        "sensors": [levels["ay"], levels["yaw_rate"]],
+        "initial": s.initial_deviation,
     }
     return MethodTemplate("kalman", values, ("vx", "steer"), refuses_infinite=estimator.channels)
 

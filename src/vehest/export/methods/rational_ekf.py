@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.rational_ekf import CURVES, LOST, ROLLING, RationalFilter
 from vehest.export.method import MethodTemplate
@@ -27,6 +30,7 @@ def rational_ekf(estimator: RationalFilter, precision: Precision) -> MethodTempl
     values = {
         **gate_values(estimator.gate()),
         "n": 4 + len(adapted),
+        "columns": 4 + len(adapted) + max(2, 1 + len(adapted)),
         "linear": s.tyres == "linear",
         "adapted": adapted,
         "wanted": [part for part in ("c1", "friction") if any(part in tyre["slope"] for tyre in adapted)],
@@ -36,13 +40,13 @@ def rational_ekf(estimator: RationalFilter, precision: Precision) -> MethodTempl
         "step": step,
         "minimum_speed": s.minimum_speed,
         "adapt_above": s.adapt_above,
-        "R": np.square([estimator.levels["yaw_rate"], estimator.levels["ay"]]),
-        "steer_spread": step * estimator.levels["steer"] ** 2,
-        "tyre_spread": step * estimator.levels["tyres"] ** 2,
+        "sensors": [estimator.levels["yaw_rate"], estimator.levels["ay"]],
+        "steer_spread": math.sqrt(step) * estimator.levels["steer"],
+        "tyre_spread": math.sqrt(step) * estimator.levels["tyres"],
         "bounds": estimator.bounds(),
-        "rolling": np.square(ROLLING),
-        "lost": LOST**2,
-        "tyre_covariance": first.covariance[4:, 4:],
+        "rolling": ROLLING,
+        "lost": LOST,
+        "tyre_root": _root(first.covariance[4:, 4:]),
     }
     return MethodTemplate("rational_ekf", values, ("vx", "steer"), refuses_infinite=estimator.channels)
 
@@ -54,3 +58,9 @@ def _adapted(name: str) -> dict[str, str]:
     assert name in CURVES
     curve, axle = name.split("_")
     return {"name": name, "axle": axle, "slope": "force" if curve == "c2" else "per_log_c1"}
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Lower triangular L with L Lᵀ = covariance, which need not be definite."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r").T
