@@ -11,13 +11,12 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.estimators.base import Estimator
+from vehest.export.tables import health_table
 from vehest.trust.contract import GuardedStepper
 
 SECONDS = 12.0
 COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
-UNDERSTEER = 0.002  # s²/m, of the drive's car
-WHEELBASE = 2.6  # m
-RADIUS = 0.3  # m
+RADIUS = 0.3  # m, of a wheel where nothing was learnt
 
 
 def replayed(stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, FloatArray]) -> FloatArray:
@@ -74,26 +73,37 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
 
 
 def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
-    """Steady cornering of a car with a wheel's radius of 0.3 m, and noise that is the same on every machine."""
-    top, limits = stepper._watch._settings[0], dict(zip(stepper._channels, stepper._guard._limits[:, :2].tolist(), strict=True))
-    u = min(0.25 * top, 20.0) * (1.0 + 0.2 * np.sin(0.7 * times))
-    steer = 0.05 * np.sin(2.0 * times) * np.sin(0.3 * times)
-    yaw_rate = u * steer / (WHEELBASE + UNDERSTEER * np.square(u))
-    ax = np.gradient(u, times)
-    known = {"vx": u, "yaw_rate": yaw_rate, "ax": ax, "ay": u * yaw_rate, "steer": steer, "handwheel": 15.0 * steer}
-    size = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 5.0, "steer": 0.05, "handwheel": 0.75}
+    """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that is the same on every machine."""
+    names, limits = list(stepper._channels), stepper._guard._limits[:, :2]
+    sizes, usual = _sizes(stepper)
+    speed, swerve = 1.0 + 0.2 * np.sin(0.7 * times), np.sin(2.0 * times) * np.sin(0.3 * times)
     found = {}
-    for number, name in enumerate(stepper._channels):
-        if name.startswith("wheel_speed") or name == "motor_speed":
-            values, scale = u / RADIUS, 60.0
-        elif name in known:
-            values, scale = known[name], size[name]
+    for number, name in enumerate(names):
+        size = sizes[name]
+        if name == "vx" or name == "motor_speed" or name.startswith("wheel_speed"):
+            values = usual[name] * speed
+        elif name == "ax" and "vx" in names:
+            values = np.gradient(usual["vx"] * speed, times)
+        elif name == "ay" and {"vx", "yaw_rate"} <= set(names):
+            values = usual["vx"] * speed * 0.3 * sizes["yaw_rate"] * swerve
+        elif name in ("yaw_rate", "ay", "steer", "handwheel", "roll_rate"):
+            values = 0.3 * size * swerve
         else:
-            scale = 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high))
-            values = scale * np.sin(1.3 * times + number)
-        low, high = limits[name]
-        found[name] = np.clip(values + 0.002 * scale * _noise(len(times), number), 0.9 * low, 0.9 * high)
+            values = usual[name] + 0.05 * size * np.sin(1.3 * times + number)
+        low, high = limits[number]
+        found[name] = np.clip(values + 0.002 * size * _noise(len(times), number), 0.9 * low, 0.9 * high)
     return found
+
+
+def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
+    """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
+    names, table = stepper._channels, health_table(stepper._monitor._health)
+    if table is not None:
+        return dict(zip(names, table["largest"].tolist(), strict=True)), dict(zip(names, table["usual"].tolist(), strict=True))
+    known = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 8.0, "steer": 0.1, "handwheel": 1.5}
+    sizes = {name: known.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high))) for name in names}
+    speeds = {name: known["vx"] / RADIUS for name in names if name == "motor_speed" or name.startswith("wheel_speed")}
+    return {**sizes, **speeds}, {name: speeds.get(name, known["vx"] if name == "vx" else 0.0) for name in names}
 
 
 def _noise(n: int, seed: int) -> FloatArray:
