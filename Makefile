@@ -15,7 +15,10 @@ FUZZ ?= 3000
 KILLS ?= 100
 SEED ?= 0
 
-.PHONY: help install run test lint test-apart test-docs test-fuzz test-wheel test-processes test-slow ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
+.PHONY: help install run test lint test-apart test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rules and emulators, as far as these are installed (15 minutes)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -rs -m "export and not slow" tests/export
+
+test-docs test-fuzz test-wheel test-processes test-slow test-export export_all ui docs clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -41,7 +44,7 @@ run: $(INSTALLED) ## train and compare four families on simulated drives (a few 
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
 test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not export"
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
@@ -138,6 +141,9 @@ bench-trust: $(INSTALLED) ## what contract, band and health cost a step online a
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
+
+export_all: $(INSTALLED) ## every family in C against Python: digits, time, bytes; with VEHEST_DATA and trained models also over real drives
+	$(BIN)/python benchmarks/export.py --out results/export
 
 examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
 	$(BIN)/python docs/compare_examples.py

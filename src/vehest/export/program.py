@@ -8,7 +8,7 @@ import numpy as np
 
 from vehest.export.estimator_source import estimator_files
 from vehest.export.method import method_source
-from vehest.export.rendering import Precision, render
+from vehest.export.rendering import Precision, ascii_only, render
 from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
 from vehest.trust.contract import GuardedStepper
 
@@ -26,9 +26,9 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     files = {"vehest_method.h": method.header, "vehest_method.c": method.source}
     files |= estimator_files(stepper, precision, title, method.notes)
     sources = sorted(name for name in files if name.endswith(".c"))
-    names, exact = list(stepper.estimator.channels), precision == "double"
-    files["main.c"] = render_text("main.c.j2", names=names, tolerance=TOLERANCES[precision], exact=exact)
-    files["Makefile"] = render_text("makefile.j2", sources=sources, exact=exact)
+    exact, notes = precision == "double", [ascii_only(note) for note in method.notes]
+    values = {"names": list(stepper.estimator.channels), "tolerance": TOLERANCES[precision], "exact": exact, "notes": notes, "sources": sources}
+    files |= {"main.c": render_text("main.c.j2", **values), "Makefile": render_text("makefile.j2", **values)}
     return files, method.notes
 
 

@@ -562,6 +562,8 @@ bool vehest_missing(vehest_state *state, vehest_estimate *estimate)
     return step_received(state, row, estimate);
 }
 
+#define MOST_BRIDGED 251 /* missing samples that are stood for; longer gaps end all that is known, too */
+
 bool vehest_step_at(vehest_state *state, double time, const vehest_sample *sample, vehest_estimate *estimate)
 {
     const double gap = time - state->last_time; /* NaN at the first sample */
@@ -570,12 +572,13 @@ bool vehest_step_at(vehest_state *state, double time, const vehest_sample *sampl
     if (repeated) {
         *estimate = state->last;
     } else {
-        double missing = (double)0.0f;
+        int32_t missing = 0;
         if ((gap > (double)0.0f) && (gap < (double)INFINITY)) {
-            missing = rint(gap * (double)VEHEST_INPUT_RATE_HZ) - (double)1.0f;
+            const double before = rint(gap * (double)VEHEST_INPUT_RATE_HZ) - (double)1.0f; /* this one */
+            missing = (before < (double)MOST_BRIDGED) ? (int32_t)before : MOST_BRIDGED;
         }
         state->last_time = time;
-        for (int32_t n = 0; (n < 251) && ((double)n < missing); n++) { /* longer gaps end all that is known, too */
+        for (int32_t n = 0; n < missing; n++) {
             due = vehest_missing(state, estimate) || due;
         }
         due = vehest_step(state, sample, estimate) || due;

@@ -651,8 +651,10 @@ static int32_t judge_relation(const vehest_health *h, int32_t j)
         found = UNIT;
     } else if (h->product[j] < (REVERSED * VEHEST_SQRT(expected * shown))) {
         found = SIGN;
+    } else if (h->product[j] > (HOLDS * VEHEST_SQRT(expected * shown))) {
+        found = FREE;
     } else {
-        found = (h->product[j] > (HOLDS * VEHEST_SQRT(expected * shown))) ? FREE : NONE;
+        found = NONE;
     }
     return found;
 }

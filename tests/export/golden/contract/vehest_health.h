@@ -1,4 +1,5 @@
-/* vehest_health.h: whether the channels are as they were where the model learnt. */
+/* vehest_health.h: whether the channels are as they were where the model learnt.
+ */
 #ifndef VEHEST_HEALTH_H
 #define VEHEST_HEALTH_H
 
