@@ -62,7 +62,8 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
         samples[name][first + 3] = -1e30
         if name in stepper.estimator.skippable or at == 0:
             samples[name][round(4.0 * rate) : round(4.3 * rate)] = math.nan
-    samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][round(5.0 * rate)]
+    if stepper._front is None or not len(stepper._front._sections):  # behind a low-pass it stands still once digits run out: sooner in float
+        samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][round(5.0 * rate)]
     samples[names[-1]][round(6.5 * rate) : round(7.5 * rate)] *= 1.6
     kept = np.ones(steps, bool)
     kept[round(8.0 * rate) : round(8.03 * rate) + 1] = False
