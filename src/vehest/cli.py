@@ -369,12 +369,16 @@ def estimate(
 @app.command()
 def export(
     model: Annotated[
-        str, typer.Argument(help="A model's folder, or the start of its name; or pretrained.", autocompletion=_complete_model, show_default=False)
+        str,
+        typer.Argument(
+            help="A model's folder, or the start of its name; or pretrained.", autocompletion=_complete_model, show_default=False
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; an earlier export there is replaced.")] = Path("export"),
     precision: Annotated[str, typer.Option("--precision", help="Of all numbers: double or float.")] = "double",
     bus_rate: Annotated[
-        float | None, typer.Option("--bus-rate", metavar="HZ", help="Rate at which samples come, if it is above the model's [Hz].", show_default=False)
+        float | None,
+        typer.Option("--bus-rate", metavar="HZ", help="Rate at which samples come, if it is above the model's [Hz].", show_default=False),
     ] = None,
     elsewhere: Annotated[
         bool, typer.Option("--elsewhere", help="For a car or tyres that the model was not calibrated on: bands twice as wide.")

@@ -10,8 +10,8 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).parents[1] / part) for part in (".", "estimators", "export")]
 
 import numpy as np
-
 from exports import FAMILIES, LARGEST, WEIGHTS, model
+
 from vehest.estimators.base import Estimator
 from vehest.export.method import method_source, types_header
 from vehest.export.program import program_files
@@ -85,7 +85,11 @@ def differences(text: str, golden: str) -> list[str]:
     ours, theirs = text.splitlines(), golden.splitlines()
     if len(ours) != len(theirs):
         return [f"{len(ours)} lines instead of {len(theirs)}"]
-    return [f"line {at}: {own} instead of {other}" for at, (own, other) in enumerate(zip(ours, theirs, strict=True), 1) if not _alike(own, other)]
+    return [
+        f"line {at}: {own} instead of {other}"
+        for at, (own, other) in enumerate(zip(ours, theirs, strict=True), 1)
+        if not _alike(own, other)
+    ]
 
 
 def _alike(own: str, other: str) -> bool:

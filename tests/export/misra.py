@@ -1,4 +1,7 @@
-"""Rules of MISRA C:2012 that cppcheck finds broken in the golden files, counted. `python tests/export/misra.py` prints the table of docs/export.md."""
+"""Rules of MISRA C:2012 that cppcheck finds broken in the golden files, counted.
+
+`python tests/export/misra.py` prints the counts of docs/export.md.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,19 @@ def found() -> tuple[Counter[str], list[str]]:
     rules: Counter[str] = Counter()
     others = []
     for folder in sorted(path for path in GOLDEN.iterdir() if path.is_dir()):
-        words = ["cppcheck", "--std=c99", "--enable=warning,portability", "--addon=misra", "--quiet", "--template={id} {file}:{line} {message}"]
-        words += ["--suppress=missingIncludeSystem", f"-I{GOLDEN / 'kinematic'}", *(str(path) for path in sorted(folder.glob("vehest_*.c")))]
+        words = [
+            "cppcheck",
+            "--std=c99",
+            "--enable=warning,portability",
+            "--addon=misra",
+            "--quiet",
+            "--template={id} {file}:{line} {message}",
+        ]
+        words += [
+            "--suppress=missingIncludeSystem",
+            f"-I{GOLDEN / 'kinematic'}",
+            *(str(path) for path in sorted(folder.glob("vehest_*.c"))),
+        ]
         said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=600.0).stderr
         for line in said.splitlines():
             kind, _, rest = line.partition(" ")

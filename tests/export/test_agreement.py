@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from exports import FAMILIES, Export, command
+
 from vehest.export.program import TOLERANCES
 
 pytestmark = pytest.mark.export

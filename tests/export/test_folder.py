@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 import pytest
+from exports import command, model, tool, trust
 
 from every_estimator import fitted
-from exports import command, model, tool, trust
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.model_files import save_model
 from vehest.export.folder import FILES, export_model

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
 from exports import tool
 from misra import VERSION, documented, found, version
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 import pytest
-
 from exports import FAMILIES, STRICT, Export, command, tool
+
 from vehest.export.measure import CORTEX_M4F, HOST, TARGETS, footprint, worst_stack
 from vehest.export.program import TOLERANCES, program_files
 

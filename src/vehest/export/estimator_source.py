@@ -16,9 +16,22 @@ from vehest.trust.contract import GuardedStepper
 from vehest.trust.guard import BRIDGED_SECONDS, STANDSTILL_SPEED, STANDSTILL_YAW_RATE
 
 KINDS = (
-    ("FREE", "FROZEN", "HELD", "JUMP", "OFFSET", "SCALE", "SIGN", "UNIT", "CONTRADICTION", "OUTSIDE", "MISSING", "SPIN", "LOCKED")
-    + ("DROPOUT", "LATE")
-)  # fmt: skip
+    "FREE",
+    "FROZEN",
+    "HELD",
+    "JUMP",
+    "OFFSET",
+    "SCALE",
+    "SIGN",
+    "UNIT",
+    "CONTRADICTION",
+    "OUTSIDE",
+    "MISSING",
+    "SPIN",
+    "LOCKED",
+    "DROPOUT",
+    "LATE",
+)
 
 
 def brief(value: float) -> str:

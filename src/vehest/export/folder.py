@@ -73,7 +73,13 @@ def export_model(
 
 
 def readme(
-    stepper: GuardedStepper, precision: Precision, notes: Sequence[str], footprints: Sequence[Footprint], *, has_trust: bool, elsewhere: bool
+    stepper: GuardedStepper,
+    precision: Precision,
+    notes: Sequence[str],
+    footprints: Sequence[Footprint],
+    *,
+    has_trust: bool,
+    elsewhere: bool,
 ) -> str:
     """What people need to know of an export: how it is called, units, what it takes, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title, notes)
@@ -108,4 +114,6 @@ def _refuse_foreign(out: Path) -> None:
     held = sorted(entry.name for entry in out.iterdir())
     foreign = [name for name in held if name not in FILES or not (out / OWN).is_file()]
     if foreign:
-        raise ConfigurationError(f"'{printable(str(out))}' holds '{printable(foreign[0])}', which is no part of an export; name another folder")
+        raise ConfigurationError(
+            f"'{printable(str(out))}' holds '{printable(foreign[0])}', which is no part of an export; name another folder"
+        )

@@ -27,7 +27,13 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     files |= estimator_files(stepper, precision, title, method.notes)
     sources = sorted(name for name in files if name.endswith(".c"))
     exact, notes = precision == "double", [ascii_only(note) for note in method.notes]
-    values = {"names": list(stepper.estimator.channels), "tolerance": TOLERANCES[precision], "exact": exact, "notes": notes, "sources": sources}
+    values = {
+        "names": list(stepper.estimator.channels),
+        "tolerance": TOLERANCES[precision],
+        "exact": exact,
+        "notes": notes,
+        "sources": sources,
+    }
     files |= {"main.c": render_text("main.c.j2", **values), "Makefile": render_text("makefile.j2", **values)}
     return files, method.notes
 

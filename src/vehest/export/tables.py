@@ -85,7 +85,17 @@ def health_table(packed: PackedHealth | None) -> dict[str, Any] | None:
         return sizes[sizes[at] : sizes[at] + math.prod(shape)].reshape(shape)
 
     settings = table(kernel.AT_SETTINGS, 9)
-    names = ("least_speed", "still_yaw_rate", "still_ay", "step", "spin_yaw_rate", "spin_turning", "forget_share", "forget_ax", "forget_late")
+    names = (
+        "least_speed",
+        "still_yaw_rate",
+        "still_ay",
+        "step",
+        "spin_yaw_rate",
+        "spin_turning",
+        "forget_share",
+        "forget_ax",
+        "forget_late",
+    )
     wheels = index(kernel.AT_WHEEL, C)
     return {
         **layout._asdict(),

@@ -40,7 +40,10 @@ def in_float64(estimator: Estimator) -> Estimator:
     twin = type(estimator)(estimator.settings)
     twin.preparation = estimator.preparation
     twin.load_weights(
-        {name: values.astype(np.float64) if np.issubdtype(values.dtype, np.floating) else values for name, values in estimator.weights().items()}
+        {
+            name: values.astype(np.float64) if np.issubdtype(values.dtype, np.floating) else values
+            for name, values in estimator.weights().items()
+        }
     )
     return twin
 
@@ -62,7 +65,9 @@ def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray
         samples[name][first + 3] = -1e30
         if name in stepper.estimator.skippable or at == 0:
             samples[name][round(4.0 * rate) : round(4.3 * rate)] = math.nan
-    if stepper._front is None or not len(stepper._front._sections):  # behind a low-pass it stands still once digits run out: sooner in float
+    if stepper._front is None or not len(
+        stepper._front._sections
+    ):  # behind a low-pass it stands still once digits run out: sooner in float
         samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][round(5.0 * rate)]
     samples[names[-1]][round(6.5 * rate) : round(7.5 * rate)] *= 1.6
     kept = np.ones(steps, bool)
