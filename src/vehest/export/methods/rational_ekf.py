@@ -63,4 +63,5 @@ def _adapted(name: str) -> dict[str, str]:
 def _root(covariance: FloatArray) -> FloatArray:
     """Lower triangular L with L Lᵀ = covariance, which need not be definite."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r").T
+    upper = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T)[1]
+    return np.ascontiguousarray(upper.T)
