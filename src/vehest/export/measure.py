@@ -53,7 +53,8 @@ class Footprint:
         target: title of the target.
         compiler: first line of what it says of itself.
         state: bytes of ``vehest_state``.
-        code: bytes of instructions.
+        method_code: bytes of instructions of the method alone.
+        code: bytes of all instructions.
         tables: bytes of constants.
         data: bytes of variables, which an export has none of.
         stack: bytes of the deepest chain of calls, without what the C library takes.
@@ -63,6 +64,7 @@ class Footprint:
     target: str
     compiler: str
     state: int
+    method_code: int
     code: int
     tables: int
     data: int
@@ -94,13 +96,14 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
             _run([target.compiler, *options, "-c", *sources, "probe.c"], folder)
             objects = [Path(name).with_suffix(".o").name for name in sources]
             sections = _sections(_run([f"{target.prefix}size", "-A", *objects], folder))
+            method = _sections(_run([f"{target.prefix}size", "-A", "vehest_method.o"], folder))[0]
             symbols = _run([f"{target.prefix}nm", "-S", "probe.o"], folder)
         except (OSError, subprocess.SubprocessError):
             return None
         graphs = [(folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources]
     stack, library = worst_stack(graphs, ENTRIES)
     state = int(next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16)
-    return Footprint(target.title, _version(target.compiler), state, *sections, stack, library)
+    return Footprint(target.title, _version(target.compiler), state, method, *sections, stack, library)
 
 
 def _run(command: list[str], folder: Path) -> str:
