@@ -1,13 +1,14 @@
 """Every trained model in C against Python, over real drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
-Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test range, 550 to 700 s,
-and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in float64 for the
+Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test
+range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in float64 for the
 differences; its time is that of the model as it is. One core, the least of some passes over the whole drive, both in the same run.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import platform
 import subprocess
 import sys
@@ -32,6 +33,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     """Data set and folder of one model of each family and variant on each of `DRIVES`; one that learns nothing goes with the Ferrari."""
     from vehest.data.errors import VehestError
     from vehest.estimators.model_files import read_description
+    from vehest.export.method import exportable
     from vehest.stages.calibrate import trust_of
 
     found: dict[tuple[str, str, str], Path] = {}
@@ -40,7 +42,13 @@ def models(output: Path) -> list[tuple[str, Path]]:
             own = read_description(folder)
             for dataset in own.about.datasets or ("ferrari_250lm",):
                 key = (dataset, own.estimator, own.variant)
-                if dataset in DRIVES and len(own.about.datasets) < 2 and key not in found and trust_of(folder, output) is not None:
+                if (
+                    own.estimator in exportable()
+                    and dataset in DRIVES
+                    and len(own.about.datasets) < 2
+                    and key not in found
+                    and trust_of(folder, output) is not None
+                ):
                     found[key] = folder
         except VehestError:
             continue
@@ -51,7 +59,7 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str) -> dict[str, np.n
     """The drive's channels at the model's rate."""
     from vehest.sources.base import open_source
     from vehest.stages.config import compose_config
-    from vehest.stages.estimate import prepared_recording, preparation_of
+    from vehest.stages.estimate import preparation_of, prepared_recording
 
     name, first, last = DRIVES[dataset]
     source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
@@ -62,7 +70,9 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str) -> dict[str, np.n
 
 def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[str, Any]]:
     """A row for each precision."""
+    from vehest.data.errors import ConfigurationError
     from vehest.estimators.model_files import load_model
+    from vehest.export.folder import refuse_unresolved
     from vehest.export.measure import CORTEX_M4F, HOST, footprint
     from vehest.export.program import program_files
     from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
@@ -74,13 +84,21 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     samples = {name: samples[name] for name in model.channels}
     steps = len(next(iter(samples.values())))
     wanted = replayed(GuardedStepper(in_float64(model), trust), np.full(steps, np.nan), samples)
-    stepper, sampled = GuardedStepper(model, trust), [dict(zip(samples, row, strict=True)) for row in zip(*(v.tolist() for v in samples.values()))]
+    stepper, sampled = (
+        GuardedStepper(model, trust),
+        [dict(zip(samples, row, strict=True)) for row in zip(*(v.tolist() for v in samples.values()), strict=True)],
+    )
     begun = time.process_time()
     for sample in sampled:
         stepper.step(sample)
     python = 1e6 * (time.process_time() - begun) / steps
     rows = []
     for precision in ("double", "float"):
+        try:
+            refuse_unresolved(trust if precision == "float" else None)
+        except ConfigurationError as error:
+            print(f"{folder.name}: {error}")
+            continue
         files = program_files(GuardedStepper(model, trust), precision, model.full_title)[0]  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary)
@@ -90,9 +108,13 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
             (place / "in.csv").write_text(table_text(tuple(samples), np.column_stack(list(samples.values()))))
             sources = sorted(name for name in files if name.startswith("vehest_") and name.endswith(".c"))
             subprocess.run(["gcc", *FLAGS, "main.c", *sources, "-lm", "-o", "main"], cwd=place, check=True)
-            subprocess.run(["gcc", *FLAGS, "-I.", str(ROOT / "benchmarks/export_time.c"), *sources, "-lm", "-o", "timed"], cwd=place, check=True)
+            subprocess.run(
+                ["gcc", *FLAGS, "-I.", str(ROOT / "benchmarks/export_time.c"), *sources, "-lm", "-o", "timed"], cwd=place, check=True
+            )
             subprocess.run(["./main", "in.csv", "out.csv"], cwd=place, check=True, capture_output=True)
-            said = subprocess.run(["./timed", "rows.bin", str(PASSES)], cwd=place, check=True, capture_output=True, text=True).stdout.split()
+            said = subprocess.run(
+                ["./timed", "rows.bin", str(PASSES)], cwd=place, check=True, capture_output=True, text=True
+            ).stdout.split()
             own = np.genfromtxt(place / "out.csv", delimiter=",", skip_header=1)
         assert own.shape[1] == len(COLUMNS)
         host, arm = (footprint(files, target) for target in (HOST, CORTEX_M4F))
@@ -125,23 +147,33 @@ def report(table: pd.DataFrame) -> str:
     for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
         good = rows["largest_difference_vy"] <= limit
         beyond = ", ".join(f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}" for row in rows[~good].itertuples())
-        lines.append(f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64" + (f"; beyond: {beyond}." if beyond else "."))
-    lines.append(f"- C takes {double['python_over_c'].min():.3g} to {double['python_over_c'].max():.3g} times less than Python, with guard, health and bands.")
+        lines.append(
+            f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64"
+            + (f"; beyond: {beyond}." if beyond else ".")
+        )
+    lines.append(
+        f"- C takes {double['python_over_c'].min():.3g} to {double['python_over_c'].max():.3g} times less than Python, with guard, health and bands."
+    )
     for start, goal in GOALS.items():
         named = (double["family"] + "-" + double["variant"]).str.startswith(start)
         if named.any():
             lines.append(f"- {start}: {double[named]['c_method_ns'].max() / 1e3:.3g} µs a step of the method; asked for were {goal:g} µs.")
     columns = list(table.columns)
     lines += ["", "| " + " | ".join(columns) + " |", "| " + " | ".join("--" for _ in columns) + " |"]
-    lines += ["| " + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row) + " |" for row in table.itertuples(index=False)]
-    lines += ["", f"gcc {' '.join(FLAGS)}; {platform.machine()}, one core; times are those of this run and machine, their ratios travel better.", ""]
+    lines += [
+        "| " + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row) + " |"
+        for row in table.itertuples(index=False)
+    ]
+    lines += [
+        "",
+        f"gcc {' '.join(FLAGS)}; {platform.machine()}, one core; times are those of this run and machine, their ratios travel better.",
+        "",
+    ]
     return "\n".join(lines)
 
 
 def main() -> None:
     """Measure, write, print."""
-    import os
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "export")
     words = parser.parse_args()
@@ -154,7 +186,7 @@ def main() -> None:
     for dataset, folder in found:
         try:
             rows += measured(dataset, folder, output, root)
-        except Exception as error:
+        except Exception as error:  # one model that cannot be measured hides no other
             print(f"{folder.name} on {dataset}: {type(error).__name__}: {error}", file=sys.stderr)
     table = pd.DataFrame(rows)
     words.out.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from exports import command, model, tool, trust
@@ -55,6 +56,14 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
 def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, words):
     with pytest.raises(ConfigurationError, match=words):
         export_model(model("zero"), None, tmp_path / "c", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_channel_that_was_computed_from_another_is_not_for_float(tmp_path):
+    own = trust("kalman")
+    health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
+    with pytest.raises(ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"):
+        export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
@@ -21,6 +23,7 @@ from vehest.trust.record import Trust
 from vehest.version import __version__
 
 PRECISIONS = get_args(Precision)
+LEAST_DIGITS = 8.0  # roundings of a float, that a channel's innovations have to exceed
 OWN = "vehest_estimator.h"
 """The file that shows a folder to be an export."""
 FILES = frozenset(
@@ -53,7 +56,8 @@ def export_model(
         What it takes, one for each compiler that was found.
 
     Raises:
-        ConfigurationError: the estimator cannot be written in C, the bus is slower than it, or the folder holds something else.
+        ConfigurationError: the estimator cannot be written in C, the bus is slower than it, float cannot resolve a channel, or the folder
+            holds something else.
         MissingError: the folder cannot be written.
     """
     if precision not in PRECISIONS:
@@ -61,6 +65,8 @@ def export_model(
     kind: Precision = precision  # type: ignore[assignment]
     _refuse_foreign(out)
     stepper = GuardedStepper(estimator, trust, bus_rate_hz, elsewhere=elsewhere)
+    if precision == "float":
+        _refuse_unresolved(trust)
     files, notes = program_files(stepper, kind, estimator.full_title)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
     files["README.md"] = readme(stepper, kind, notes, found, has_trust=trust is not None, elsewhere=elsewhere)
@@ -97,6 +103,19 @@ def readme(
         "kind": precision,
     }
     return render_text("readme.md.j2", **context)
+
+
+def _refuse_unresolved(trust: Trust | None) -> None:
+    """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float."""
+    if trust is None or trust.health is None:
+        return
+    own = trust.health
+    for name, deviation, largest, weights in zip(own.channels, own.deviation, own.largest, own.precision, strict=True):
+        if max(weights) > 0.0 and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest:
+            raise ConfigurationError(
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot resolve; "
+                f"export with --precision double"
+            )
 
 
 def _reasons() -> dict[int, str]:
