@@ -1,8 +1,8 @@
 """Every trained model in C against Python, over real drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
 Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test
-range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in float64 for the
-differences; its time is that of the model as it is. One core, the least of some passes over the whole drive, both in the same run.
+range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the
+same in float64 for the differences; its time is that of the model as it is. One core, the least of some passes over the whole drive, both in the same run.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def report(table: pd.DataFrame) -> str:
             + (f"; beyond: {beyond}." if beyond else ".")
         )
     lines.append(
-        f"- C takes {double['python_over_c'].min():.3g} to {double['python_over_c'].max():.3g} times less than Python, with guard, health and bands."
+        f"- C is {double['python_over_c'].min():.3g} to {double['python_over_c'].max():.3g} times as fast as Python, with guard, health and bands."
     )
     for start, goal in GOALS.items():
         named = (double["family"] + "-" + double["variant"]).str.startswith(start)

@@ -66,7 +66,7 @@ def export_model(
     _refuse_foreign(out)
     stepper = GuardedStepper(estimator, trust, bus_rate_hz, elsewhere=elsewhere)
     if precision == "float":
-        _refuse_unresolved(trust)
+        refuse_unresolved(trust)
     files, notes = program_files(stepper, kind, estimator.full_title)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
     files["README.md"] = readme(stepper, kind, notes, found, has_trust=trust is not None, elsewhere=elsewhere)
@@ -105,16 +105,20 @@ def readme(
     return render_text("readme.md.j2", **context)
 
 
-def _refuse_unresolved(trust: Trust | None) -> None:
-    """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float."""
+def refuse_unresolved(trust: Trust | None) -> None:
+    """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float.
+
+    Raises:
+        ConfigurationError: there is one.
+    """
     if trust is None or trust.health is None:
         return
     own = trust.health
     for name, deviation, largest, weights in zip(own.channels, own.deviation, own.largest, own.precision, strict=True):
         if max(weights) > 0.0 and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest:
             raise ConfigurationError(
-                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot resolve; "
-                f"export with --precision double"
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
+                f"resolve; export with --precision double"
             )
 
 
