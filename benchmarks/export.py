@@ -1,8 +1,9 @@
 """Every trained model in C against Python, over real drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
 Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test
-range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the
-same in float64 for the differences; its time is that of the model as it is. One core, the least of some passes over the whole drive, both in the same run.
+range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in
+float64 for the differences; its time is that of the model as it is. One core, the least of some passes over the whole drive in C, one pass
+in Python, both in the same run.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
 def report(table: pd.DataFrame) -> str:
     """The page: verdicts, then the table."""
     double, single = (table[table["precision"] == kind] for kind in ("double", "float"))
-    lines = ["# Models in C against Python", ""]
+    lines, ratio = ["# Models in C against Python", ""], double["python_over_c"]
     for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
         good = rows["largest_difference_vy"] <= limit
         beyond = ", ".join(f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}" for row in rows[~good].itertuples())
@@ -151,9 +152,7 @@ def report(table: pd.DataFrame) -> str:
             f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64"
             + (f"; beyond: {beyond}." if beyond else ".")
         )
-    lines.append(
-        f"- C is {double['python_over_c'].min():.3g} to {double['python_over_c'].max():.3g} times as fast as Python, with guard, health and bands."
-    )
+    lines.append(f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands.")
     for start, goal in GOALS.items():
         named = (double["family"] + "-" + double["variant"]).str.startswith(start)
         if named.any():
