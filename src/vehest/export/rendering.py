@@ -21,13 +21,14 @@ Precision = Literal["double", "float"]
 WIDTH = 128  # of a line of a table, its indent aside
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
+_BLANK = re.compile(r"\n{3,}")
 _ASCII = {"²": "^2", "³": "^3", "·": "*", "°": "deg", "ω": "omega", "β": "beta", "δ": "delta", "ä": "ae", "ö": "oe", "ü": "ue"}
 
 
 def render(template: str, precision: Precision, **values: Any) -> str:
     """The text of a template of `vehest.export`; every floating literal outside comments has the type of ``vehest_real``."""
     text = _environment(precision).get_template(template).render(values)
-    return typed(text, precision)
+    return typed(_BLANK.sub("\n\n", text), precision)
 
 
 def render_block(template: str, block: str, precision: Precision, **values: Any) -> str:
