@@ -181,7 +181,6 @@ static bool lifted_n(vehest_real a[N][N], vehest_real lower[N][N])
     return cholesky_n(a, lower);
 }
 
-
 /* Lower factor L of a symmetric matrix, L L' = a; false where it is not positive definite, or not finite. */
 static bool cholesky_m(vehest_real a[M][M], vehest_real lower[M][M])
 {
@@ -288,7 +287,6 @@ static bool lifted_m(vehest_real a[M][M], vehest_real lower[M][M])
     }
     return cholesky_m(a, lower);
 }
-
 
 /* Sigma points: the mean, and mean +- SPREAD columns of the covariance's factor; a covariance that is not positive definite is repaired, in place. */
 static void draw(vehest_real mean[N], vehest_real cov[N][N], vehest_real points[POINTS][N])
@@ -446,7 +444,6 @@ static void update(vehest_real mean[N], vehest_real cov[N][N], vehest_real point
         }
     }
 }
-
 
 /* From the last sample to this one, with the variances of the step. */
 static void predict(vehest_method *m, const vehest_real process[N])

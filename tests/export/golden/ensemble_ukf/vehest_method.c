@@ -139,7 +139,6 @@ static void network_of(const vehest_real measured[INPUTS], int member, vehest_re
     }
 }
 
-
 static const vehest_real UNIT = 0.25; /* of the network's angles [rad] */
 static const vehest_real STEEPEST = 1.5; /* beyond which no angle is believed [rad] */
 static const vehest_real LEAST_VARIANCE = 1e-06; /* of an angle of the network [rad^2] */
@@ -320,7 +319,6 @@ static bool lifted_n(vehest_real a[N][N], vehest_real lower[N][N])
     return cholesky_n(a, lower);
 }
 
-
 /* Lower factor L of a symmetric matrix, L L' = a; false where it is not positive definite, or not finite. */
 static bool cholesky_m(vehest_real a[M][M], vehest_real lower[M][M])
 {
@@ -427,7 +425,6 @@ static bool lifted_m(vehest_real a[M][M], vehest_real lower[M][M])
     }
     return cholesky_m(a, lower);
 }
-
 
 /* Sigma points: the mean, and mean +- SPREAD columns of the covariance's factor; a covariance that is not positive definite is repaired, in place. */
 static void draw(vehest_real mean[N], vehest_real cov[N][N], vehest_real points[POINTS][N])
@@ -585,7 +582,6 @@ static void update(vehest_real mean[N], vehest_real cov[N][N], vehest_real point
         }
     }
 }
-
 
 /* From the last sample to this one, with the variances of the step. */
 static void predict(vehest_method *m, const vehest_real process[N])

@@ -81,13 +81,11 @@ static inline vehest_real tanh_of(vehest_real x)
     return 2.0 * second / (1.0 + second * second);
 }
 
-
 /* 1/(1 + exp(-x)) = (1 + tanh(x/2))/2. */
 static inline vehest_real sigmoid_of(vehest_real x)
 {
     return 0.5 + 0.5 * tanh_of(0.5 * x);
 }
-
 
 /* One step of the cell, in place. */
 static void advance(vehest_real driven[GATES][STATES], vehest_real h[STATES])

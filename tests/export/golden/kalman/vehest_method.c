@@ -78,7 +78,6 @@ static void triangularise(int rows, vehest_real a[M + N][COLUMNS])
     }
 }
 
-
 /* x- = A x + B delta,  L- L-' = A L (A L)' + Q: from the last sample to this one. */
 static void predict(vehest_method *m)
 {

@@ -57,7 +57,6 @@ static inline vehest_real tanh_of(vehest_real x)
     return 2.0 * second / (1.0 + second * second);
 }
 
-
 void vehest_method_start(vehest_method *m)
 {
     m->next = 0;

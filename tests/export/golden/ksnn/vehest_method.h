@@ -18,7 +18,7 @@ typedef struct {
         vehest_real thrust;    /* tau a_x [m/s] */
         vehest_real gamma[2];  /* gamma_1, gamma_2 [1] */
         vehest_real beta;      /* beta_2 [1] */
-        vehest_real weight[2]; /* w_1 of f_1 [1/rad * rad/s] and of f_2 [1] */
+        vehest_real weight[2]; /* w_1 of f_1 [s/rad] and of f_2 [1] */
         vehest_real share[2];  /* of the local models that are active [1] */
         int32_t model;         /* the first of them */
     } window[30];    /* the last samples, as a ring */

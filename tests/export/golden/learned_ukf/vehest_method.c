@@ -214,7 +214,6 @@ static bool lifted_n(vehest_real a[N][N], vehest_real lower[N][N])
     return cholesky_n(a, lower);
 }
 
-
 /* Lower factor L of a symmetric matrix, L L' = a; false where it is not positive definite, or not finite. */
 static bool cholesky_m(vehest_real a[M][M], vehest_real lower[M][M])
 {
@@ -321,7 +320,6 @@ static bool lifted_m(vehest_real a[M][M], vehest_real lower[M][M])
     }
     return cholesky_m(a, lower);
 }
-
 
 /* Sigma points: the mean, and mean +- SPREAD columns of the covariance's factor; a covariance that is not positive definite is repaired, in place. */
 static void draw(vehest_real mean[N], vehest_real cov[N][N], vehest_real points[POINTS][N])
@@ -493,7 +491,6 @@ static void update(vehest_real mean[N], vehest_real cov[N][N], vehest_real point
     }
 }
 
-
 /* Covariance of a step. */
 static void process_noise(vehest_real out[N][N])
 {
@@ -512,7 +509,6 @@ static void process_noise(vehest_real out[N][N])
     }
 }
 
-
 /* Covariance of measurements. */
 static void observation_noise(vehest_real out[M][M])
 {
@@ -529,7 +525,6 @@ static void observation_noise(vehest_real out[M][M])
         }
     }
 }
-
 
 void vehest_method_start(vehest_method *m)
 {

@@ -68,7 +68,6 @@ static void triangularise(int rows, vehest_real a[M + N][COLUMNS])
     }
 }
 
-
 static void clip(vehest_real mean[N])
 {
     for (int i = 0; i < N; i++) {

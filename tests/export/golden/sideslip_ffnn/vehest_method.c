@@ -85,7 +85,6 @@ static void network_of(const vehest_real measured[INPUTS], int member, vehest_re
     }
 }
 
-
 static const vehest_real UNIT = 0.4; /* of the network's output [rad] */
 static const vehest_real STEEPEST = 1.5; /* beyond which no angle is believed [rad] */
 
