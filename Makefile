@@ -16,7 +16,7 @@ KILLS ?= 100
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-export export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -42,13 +42,16 @@ run: $(INSTALLED) ## train and compare four families on simulated drives (a few 
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
 test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export"
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
 
 test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow" $(TESTS_$(@:test-%=%))
+
+test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rules and emulators, as far as these are installed (15 minutes)
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -rs -m "export and not slow" tests/export
 
 test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
 	$(BIN)/python -m pytest -m "page and not slow" -rs
@@ -167,6 +170,9 @@ replay_30min: $(INSTALLED) ## 30 minutes of a bus at 100 Hz in real time: deadli
 
 own_car: $(INSTALLED) ## from a raw CSV of the real Ferrari to a verdict, timed: vehest new, then vehest run --minutes 15; needs VEHEST_DATA
 	$(BIN)/python benchmarks/own_car.py
+
+export_all: $(INSTALLED) ## every family in C against Python: digits, time, bytes; with VEHEST_DATA and trained models also over real drives
+	$(BIN)/python benchmarks/export.py --out results/export
 
 examples: $(INSTALLED) ## the worked examples of docs/adding_an_estimator.md trained and compared on the quickstart's drives (a minute)
 	$(BIN)/python docs/compare_examples.py

@@ -509,6 +509,53 @@ def replay(
         raise typer.Exit(128 + stop.number)
 
 
+@app.command()
+def export(
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="A model's folder, or the start of its name; or pretrained.", autocompletion=_complete_model, show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; an earlier export there is replaced.")] = Path("export"),
+    precision: Annotated[str, typer.Option("--precision", help="Of all numbers: double or float.")] = "double",
+    bus_rate: Annotated[
+        float | None,
+        typer.Option("--bus-rate", metavar="HZ", help="Rate at which samples come, if it is above the model's [Hz].", show_default=False),
+    ] = None,
+    elsewhere: Annotated[
+        bool, typer.Option("--elsewhere", help="For a car or tyres that the model was not calibrated on: bands twice as wide.")
+    ] = False,
+    onnx: Annotated[
+        bool,
+        typer.Option("--onnx", help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a model as C99 for a control unit: `vehest export MODEL -o c --precision float`.
+
+    One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
+    file, test vectors, and a README with units and the bytes that it takes.
+    """
+    from vehest.estimators.model_files import load_model
+    from vehest.export.folder import export_model
+    from vehest.stages.calibrate import trust_of
+    from vehest.stages.estimate import find_model
+
+    config = _compose("estimate", [])
+    output = Path(config["output"])
+    folder = find_model(model, output, _note)
+    fitted = load_model(folder)
+    if onnx:
+        from vehest.export.onnx_model import write_onnx
+
+        write_onnx(fitted, out)
+        _say(as_json, {"out": str(out), "model": str(folder)})
+        return
+    found = export_model(fitted, trust_of(folder, output), out, precision, bus_rate, elsewhere=elsewhere)
+    _say(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
+
+
 def _is_file_name(word: str) -> bool:
     """Whether a word is no override; a file that is there may have an ``=`` in its name."""
     return ("=" not in word and not word.startswith("~")) or Path(word).is_file()

@@ -44,7 +44,7 @@ class FrontEnd:
         self.channels = tuple(channels)
         usual = usual_limits(channels, bus_rate_hz)  # jumps are those of another rate; ranges are the same
         merged = {
-            name: type(own)(own.low, own.high, max(usual.channels[name].jump, own.jump), own.run)
+            name: type(own)(own.low, own.high, max(usual.channels[name].jump, own.jump), own.run, own.stops)
             for name, own in (limits.channels or usual.channels).items()
         }
         self._guard = Guard(channels, skippable, GuardLimits(merged, limits.top_speed, limits.largest_tan_sideslip), bus_rate_hz)

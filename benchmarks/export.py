@@ -1,0 +1,198 @@
+"""Every trained model in C against Python, over real drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
+
+Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test
+range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in
+float64 for the differences; its time is that of the model as it is. One core, the least of some passes over the whole drive in C, one pass
+in Python, both in the same run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+ROOT = Path(__file__).parents[1]
+PASSES = 3
+DRIVES = {"ferrari_250lm": ("20140222_01_01_03_250lm", 550.0, 700.0), "f1tenth": ("hoons_all_test_run_4", 0.0, 150.0)}
+GOALS = {"ksnn-linear": 0.5, "ksnn-nonlinear": 4.0, "gru": 7.0, "rational_ekf": 5.0, "learned_ukf": 150.0}
+"""Start of family-variant -> microseconds a step of the method in double that were asked for."""
+FLAGS = ["-std=c99", "-O2", "-ffp-contract=off"]
+
+
+def models(output: Path) -> list[tuple[str, Path]]:
+    """Data set and folder of one model of each family and variant on each of `DRIVES`; one that learns nothing goes with the Ferrari."""
+    from vehest.data.errors import VehestError
+    from vehest.estimators.model_files import read_description
+    from vehest.export.method import exportable
+    from vehest.stages.calibrate import trust_of
+
+    found: dict[tuple[str, str, str], Path] = {}
+    for folder in sorted((output / "train").glob("[!.]*")):
+        try:
+            own = read_description(folder)
+            for dataset in own.about.datasets or ("ferrari_250lm",):
+                key = (dataset, own.estimator, own.variant)
+                if (
+                    own.estimator in exportable()
+                    and dataset in DRIVES
+                    and len(own.about.datasets) < 2
+                    and key not in found
+                    and trust_of(folder, output) is not None
+                ):
+                    found[key] = folder
+        except VehestError:
+            continue
+    return [(dataset, folder) for (dataset, _, _), folder in sorted(found.items(), key=lambda entry: entry[0])]
+
+
+def rows_of(model: Any, folder: Path, dataset: str, root: str) -> dict[str, np.ndarray]:
+    """The drive's channels at the model's rate."""
+    from vehest.sources.base import open_source
+    from vehest.stages.config import compose_config
+    from vehest.stages.estimate import preparation_of, prepared_recording
+
+    name, first, last = DRIVES[dataset]
+    source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
+    recording = source.read(name).without_references()
+    cut = recording.cut(max(first, recording.start_time), min(last, recording.start_time + recording.duration))
+    return dict(prepared_recording(model, cut, preparation_of(folder)).channels)
+
+
+def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[str, Any]]:
+    """A row for each precision."""
+    from vehest.data.errors import ConfigurationError
+    from vehest.estimators.model_files import load_model
+    from vehest.export.folder import refuse_unresolved
+    from vehest.export.measure import CORTEX_M4F, HOST, footprint
+    from vehest.export.program import program_files
+    from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
+    from vehest.stages.calibrate import trust_of
+    from vehest.trust.contract import GuardedStepper
+
+    model, trust = load_model(folder), trust_of(folder, output)
+    samples = {name: values for name, values in rows_of(model, folder, dataset, root).items() if name in model.channels}
+    samples = {name: samples[name] for name in model.channels}
+    steps = len(next(iter(samples.values())))
+    wanted = replayed(GuardedStepper(in_float64(model), trust), np.full(steps, np.nan), samples)
+    stepper, sampled = (
+        GuardedStepper(model, trust),
+        [dict(zip(samples, row, strict=True)) for row in zip(*(v.tolist() for v in samples.values()), strict=True)],
+    )
+    begun = time.process_time()
+    for sample in sampled:
+        stepper.step(sample)
+    python = 1e6 * (time.process_time() - begun) / steps
+    rows = []
+    for precision in ("double", "float"):
+        try:
+            refuse_unresolved(trust if precision == "float" else None)
+        except ConfigurationError as error:
+            print(f"{folder.name}: {error}")
+            continue
+        files = program_files(GuardedStepper(model, trust), precision, model.full_title)[0]  # type: ignore[arg-type]
+        with tempfile.TemporaryDirectory() as temporary:
+            place = Path(temporary)
+            for name, text in files.items():
+                (place / name).write_text(text)
+            np.column_stack(list(samples.values())).astype(np.float64).tofile(place / "rows.bin")
+            (place / "in.csv").write_text(table_text(tuple(samples), np.column_stack(list(samples.values()))))
+            sources = sorted(name for name in files if name.startswith("vehest_") and name.endswith(".c"))
+            subprocess.run(["gcc", *FLAGS, "main.c", *sources, "-lm", "-o", "main"], cwd=place, check=True)
+            subprocess.run(
+                ["gcc", *FLAGS, "-I.", str(ROOT / "benchmarks/export_time.c"), *sources, "-lm", "-o", "timed"], cwd=place, check=True
+            )
+            subprocess.run(["./main", "in.csv", "out.csv"], cwd=place, check=True, capture_output=True)
+            said = subprocess.run(
+                ["./timed", "rows.bin", str(PASSES)], cwd=place, check=True, capture_output=True, text=True
+            ).stdout.split()
+            own = np.genfromtxt(place / "out.csv", delimiter=",", skip_header=1)
+        assert own.shape[1] == len(COLUMNS)
+        host, arm = (footprint(files, target) for target in (HOST, CORTEX_M4F))
+        difference = np.abs(own[:, 0] - wanted[:, 0])
+        rows.append(
+            {
+                "family": model.name,
+                "variant": model.variant,
+                "drive": dataset,
+                "precision": precision,
+                "steps": steps,
+                "largest_difference_vy": float(np.nanmax(difference)),
+                "other_health_rows": int((own[:, 4] != wanted[:, 4]).sum()),
+                "c_ns": float(said[0]),
+                "c_method_ns": float(said[1]),
+                "python_ns": 1e3 * python,
+                "python_over_c": 1e3 * python / float(said[0]),
+                **({f"{k}_bytes": getattr(host, k) for k in ("state", "method_code", "code", "tables", "stack")} if host else {}),
+                **({f"m4f_{k}_bytes": getattr(arm, k) for k in ("state", "method_code", "code", "tables", "stack")} if arm else {}),
+            }
+        )
+        print(rows[-1], flush=True)
+    return rows
+
+
+def report(table: pd.DataFrame) -> str:
+    """The page: verdicts, then the table."""
+    double, single = (table[table["precision"] == kind] for kind in ("double", "float"))
+    lines, ratio = ["# Models in C against Python", ""], double["python_over_c"]
+    for rows, limit, words in ((double, 1e-9, "double"), (single, 1e-4, "float")):
+        good = rows["largest_difference_vy"] <= limit
+        beyond = ", ".join(f"{row.family} {row.variant} {row.largest_difference_vy:.1e} on {row.drive}" for row in rows[~good].itertuples())
+        lines.append(
+            f"- {words}: {int(good.sum())} of {len(rows)} within {limit:.0e} m/s of Python in float64"
+            + (f"; beyond: {beyond}." if beyond else ".")
+        )
+    lines.append(f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands.")
+    for start, goal in GOALS.items():
+        named = (double["family"] + "-" + double["variant"]).str.startswith(start)
+        if named.any():
+            lines.append(f"- {start}: {double[named]['c_method_ns'].max() / 1e3:.3g} µs a step of the method; asked for were {goal:g} µs.")
+    columns = list(table.columns)
+    lines += ["", "| " + " | ".join(columns) + " |", "| " + " | ".join("--" for _ in columns) + " |"]
+    lines += [
+        "| " + " | ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row) + " |"
+        for row in table.itertuples(index=False)
+    ]
+    lines += [
+        "",
+        f"gcc {' '.join(FLAGS)}; {platform.machine()}, one core; times are those of this run and machine, their ratios travel better.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure, write, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "results" / "export")
+    words = parser.parse_args()
+    root, output = os.environ.get("VEHEST_DATA"), Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
+    found = models(output)
+    if root is None or not found:
+        sys.exit("export_all needs VEHEST_DATA and models that learnt on real cars: make ferrari_drive, make real_cars, make learned_ukf")
+    torch.set_num_threads(1)
+    rows = []
+    for dataset, folder in found:
+        try:
+            rows += measured(dataset, folder, output, root)
+        except Exception as error:  # one model that cannot be measured hides no other
+            print(f"{folder.name} on {dataset}: {type(error).__name__}: {error}", file=sys.stderr)
+    table = pd.DataFrame(rows)
+    words.out.mkdir(parents=True, exist_ok=True)
+    table.to_csv(words.out / "metrics.csv", index=False, float_format="%.6g")
+    (words.out / "report.md").write_text(report(table), encoding="utf-8")
+    print(report(table))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""An export on disk: sources, vectors and what people need to know, written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from vehest.data.channels import CHANNELS
+from vehest.data.errors import ConfigurationError, printable
+from vehest.data.files import written_aside
+from vehest.estimators.base import Estimator
+from vehest.export.estimator_source import context_of
+from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
+from vehest.export.program import TOLERANCES, program_files, render_text, vector_files
+from vehest.export.rendering import Precision
+from vehest.export.vectors import SECONDS, in_float64
+from vehest.trust import health, verdict
+from vehest.trust.contract import GuardedStepper
+from vehest.trust.record import Trust
+from vehest.version import __version__
+
+PRECISIONS = get_args(Precision)
+LEAST_DIGITS = 8.0  # roundings of a float, that a channel's innovations have to exceed
+OWN = "vehest_estimator.h"
+"""The file that shows a folder to be an export."""
+FILES = frozenset(
+    {f"vehest_{part}.{ending}" for part in ("types", "method", "health", "estimator") for ending in ("h", "c")}
+    | {"main.c", "Makefile", "test_vectors.csv", "expected.csv", "README.md", "main", "outcome.csv"}
+)
+"""All that an export and its Makefile write."""
+
+
+def export_model(
+    estimator: Estimator,
+    trust: Trust | None,
+    out: Path,
+    precision: str = "double",
+    bus_rate_hz: float | None = None,
+    *,
+    elsewhere: bool = False,
+) -> list[Footprint]:
+    """Write a fitted estimator as C99 into a folder of its own; an earlier export there is replaced.
+
+    Args:
+        estimator: fitted, causal.
+        trust: learnt with it; without it limits are those of any car, and there is neither band nor health of channels.
+        out: the folder.
+        precision: of all numbers in C, ``double`` or ``float``.
+        bus_rate_hz: rate at which samples come, if it is not the estimator's [Hz]; a causal low-pass leads down to that.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are twice as wide then.
+
+    Returns:
+        What it takes, one for each compiler that was found.
+
+    Raises:
+        ConfigurationError: the estimator cannot be written in C, the bus is slower than it, float cannot resolve a channel, or the folder
+            holds something else.
+        MissingError: the folder cannot be written.
+    """
+    if precision not in PRECISIONS:
+        raise ConfigurationError(f"precision must be {' or '.join(PRECISIONS)}, not '{precision}'")
+    kind: Precision = precision  # type: ignore[assignment]
+    _refuse_foreign(out)
+    stepper = GuardedStepper(estimator, trust, bus_rate_hz, elsewhere=elsewhere)
+    if precision == "float":
+        refuse_unresolved(trust)
+    files, notes = program_files(stepper, kind, estimator.full_title)
+    found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
+    files["README.md"] = readme(stepper, kind, notes, found, has_trust=trust is not None, elsewhere=elsewhere)
+    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere))
+    with written_aside(out, replace_folder=True) as aside:
+        aside.mkdir()
+        for name, text in files.items():
+            (aside / name).write_text(text, encoding="utf-8")
+    return found
+
+
+def readme(
+    stepper: GuardedStepper,
+    precision: Precision,
+    notes: Sequence[str],
+    footprints: Sequence[Footprint],
+    *,
+    has_trust: bool,
+    elsewhere: bool,
+) -> str:
+    """What people need to know of an export: how it is called, units, what it takes, licences."""
+    context = context_of(stepper, precision, stepper.estimator.full_title, notes)
+    context |= {
+        "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
+        "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
+        "reasons": sorted(_reasons().items()),
+        "footprints": footprints,
+        "options": {target.title: " ".join((*STRICT, *target.options)) for target in TARGETS},
+        "trust": has_trust,
+        "elsewhere": elsewhere,
+        "version": __version__,
+        "seconds": SECONDS,
+        "tolerance": f"{TOLERANCES[precision]:.0e}",
+        "kind": precision,
+    }
+    return render_text("readme.md.j2", **context)
+
+
+def refuse_unresolved(trust: Trust | None) -> None:
+    """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float.
+
+    Raises:
+        ConfigurationError: there is one.
+    """
+    if trust is None or trust.health is None:
+        return
+    own = trust.health
+    for name, deviation, largest, weights in zip(own.channels, own.deviation, own.largest, own.precision, strict=True):
+        if max(weights) > 0.0 and deviation < LEAST_DIGITS * float(np.finfo(np.float32).eps) * largest:
+            raise ConfigurationError(
+                f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
+                f"resolve; export with --precision double"
+            )
+
+
+def _reasons() -> dict[int, str]:
+    """Kind of a reason -> what it says."""
+    words = {kind: text.format(channel="CHANNEL", partner="PARTNER") for kind, text in health.WORDS.items() if kind}
+    return words | verdict.OWN_WORDS
+
+
+def _refuse_foreign(out: Path) -> None:
+    """Only an earlier export is replaced."""
+    if not out.exists() and not out.is_symlink():
+        return
+    if out.is_symlink() or not out.is_dir():
+        raise ConfigurationError(f"'{printable(str(out))}' is no folder; name another")
+    held = sorted(entry.name for entry in out.iterdir())
+    foreign = [name for name in held if name not in FILES or not (out / OWN).is_file()]
+    if foreign:
+        raise ConfigurationError(
+            f"'{printable(str(out))}' holds '{printable(foreign[0])}', which is no part of an export; name another folder"
+        )

@@ -1,0 +1,163 @@
+"""What an export takes: bytes of state, code and tables, and the worst case of its stack, as compilers that are there say it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+STRICT = ("-std=c99", "-ffp-contract=off")
+ENTRIES = ("vehest_start", "vehest_step", "vehest_missing", "vehest_step_at")
+SECONDS = 120.0  # after which a compiler is given up
+
+_NODE = re.compile(r'node: \{ title: "([^"]+)" label: "([^"]*)"')
+_EDGE = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')
+_STACK = re.compile(r"(\d+) bytes \((\w+)")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A compiler and what it compiles for.
+
+    Args:
+        title: for people.
+        prefix: of its tools' names.
+        options: beside those of all.
+    """
+
+    title: str
+    prefix: str = ""
+    options: tuple[str, ...] = ("-O2",)
+
+    @property
+    def compiler(self) -> str | None:
+        """Where its gcc is; None if it is not there."""
+        return shutil.which(f"{self.prefix}gcc")
+
+
+HOST = Target("this machine")
+CORTEX_M4F = Target("Cortex-M4F", "arm-none-eabi-", ("-O2", "-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"))
+TARGETS = (HOST, CORTEX_M4F)
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What an export takes on a target.
+
+    Args:
+        target: title of the target.
+        compiler: first line of what it says of itself.
+        state: bytes of ``vehest_state``.
+        method_code: bytes of instructions of the method alone.
+        code: bytes of all instructions.
+        tables: bytes of constants.
+        data: bytes of variables, which an export has none of.
+        stack: bytes of the deepest chain of calls, without what the C library takes.
+        library: functions of the C library that are called.
+    """
+
+    target: str
+    compiler: str
+    state: int
+    method_code: int
+    code: int
+    tables: int
+    data: int
+    stack: int
+    library: tuple[str, ...] = field(default=())
+
+    def figures(self) -> dict[str, int]:
+        """What people ask for first, by name."""
+        return {f"{self.target}, bytes of {name}": getattr(self, name) for name in ("state", "code", "tables", "stack")}
+
+
+def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
+    """What an export takes on a target; None where there is no compiler for it, or it cannot say.
+
+    Args:
+        files: name -> text, as those of `vehest.export.program`; main.c does not count.
+        target: to compile for.
+    """
+    if target.compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        sources = [name for name in files if name.endswith(".c") and name != "main.c"]
+        for name in (*sources, *(name for name in files if name.endswith(".h"))):
+            (folder / name).write_text(files[name], encoding="utf-8")
+        (folder / "probe.c").write_text('#include "vehest_estimator.h"\nchar probe[sizeof(vehest_state)];\n', encoding="utf-8")
+        try:
+            options = [*STRICT, *target.options, "-fcallgraph-info=su"]
+            _run([target.compiler, *options, "-c", *sources, "probe.c"], folder)
+            objects = [Path(name).with_suffix(".o").name for name in sources]
+            sections = _sections(_run([f"{target.prefix}size", "-A", *objects], folder))
+            method = _sections(_run([f"{target.prefix}size", "-A", "vehest_method.o"], folder))[0]
+            symbols = _run([f"{target.prefix}nm", "-S", "probe.o"], folder)
+        except (OSError, subprocess.SubprocessError):
+            return None
+        graphs = [(folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources]
+    stack, library = worst_stack(graphs, ENTRIES)
+    state = int(next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16)
+    return Footprint(target.title, _version(target.compiler), state, method, *sections, stack, library)
+
+
+def _run(command: list[str], folder: Path) -> str:
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS).stdout
+
+
+@cache
+def _version(compiler: str) -> str:
+    said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    return said.partition("\n")[0]
+
+
+def _sections(said: str) -> tuple[int, int, int]:
+    """Bytes of code, constants and variables, from what ``size -A`` says of objects."""
+    code = tables = data = 0
+    for words in (line.split() for line in said.splitlines()):
+        if len(words) < 3 or not words[1].isdigit():
+            continue
+        name, size = words[0], int(words[1])
+        if name.startswith(".text"):
+            code += size
+        elif name.startswith((".rodata", ".data.rel.ro")):
+            tables += size
+        elif name.startswith((".data", ".bss")):
+            data += size
+    return code, tables, data
+
+
+def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
+    """Bytes of the deepest chain of calls from one of the entries, and functions that are called but not there.
+
+    Args:
+        graphs: of each source, as ``gcc -fcallgraph-info=su`` writes them.
+        entries: functions that are called from outside.
+
+    Raises:
+        RecursionError: a function calls itself, directly or not.
+    """
+    own: dict[str, int] = {}
+    calls: dict[str, set[str]] = {}
+    known: set[str] = set()
+    for graph in graphs:
+        for title, label in _NODE.findall(graph):
+            known.add(title)
+            if found := _STACK.search(label):
+                own[title] = int(found[1])
+        for source, target in _EDGE.findall(graph):
+            calls.setdefault(source, set()).add(target)
+
+    def deepest(function: str, above: tuple[str, ...]) -> int:
+        if function in above:
+            raise RecursionError(f"{function} calls itself")
+        below = (deepest(inner, (*above, function)) for inner in calls.get(function, ()))
+        return own.get(function, 0) + max(below, default=0)
+
+    stack = max(deepest(entry, ()) for entry in entries)
+    return stack, tuple(sorted(name for name in known - own.keys() if not name.startswith("__indirect")))

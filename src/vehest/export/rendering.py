@@ -1,0 +1,106 @@
+"""From templates to C: constants as literals that read back to the same number, float builds with suffixes."""
+
+from __future__ import annotations
+
+import math
+import re
+import textwrap
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from vehest.data.channels import channel
+from vehest.data.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+Precision = Literal["double", "float"]
+
+WIDTH = 128  # of a line of a table, its indent aside
+_COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
+_FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
+_BLANK = re.compile(r"\n{3,}")
+_ASCII = {"²": "^2", "³": "^3", "·": "*", "°": "deg", "ω": "omega", "β": "beta", "δ": "delta", "ä": "ae", "ö": "oe", "ü": "ue"}
+
+
+def render(template: str, precision: Precision, **values: Any) -> str:
+    """The text of a template of `vehest.export`; every floating literal outside comments has the type of ``vehest_real``."""
+    text = _environment(precision).get_template(template).render(values)
+    return typed(_BLANK.sub("\n\n", text), precision)
+
+
+def render_block(template: str, block: str, precision: Precision, **values: Any) -> str:
+    """The text of one block of a template."""
+    found = _environment(precision).get_template(template)
+    if block not in found.blocks:
+        return ""
+    context = found.new_context(dict(values))
+    return typed("".join(found.blocks[block](context)), precision)
+
+
+def typed(source: str, precision: Precision) -> str:
+    """C source whose floating literals are those of a precision: ``0.5`` stays, or becomes ``0.5f``."""
+    if precision == "double":
+        return source
+    pieces = _COMMENT.split(source)
+    return "".join(piece if piece.startswith("/*") else _FLOATING.sub(r"\1f", piece) for piece in pieces)
+
+
+def literal(value: float, precision: Precision) -> str:
+    """A C literal, without suffix, that reads back to the same double or to the float nearest to the value.
+
+    Raises:
+        ConfigurationError: the value is not finite in this precision.
+    """
+    with np.errstate(over="ignore"):
+        number = float(np.float32(value)) if precision == "float" else float(value)
+    if not math.isfinite(number):
+        raise ConfigurationError(f"the model holds {value}, which is no {precision} number; fit it anew, or export with precision double")
+    text = f"{number:.9g}" if precision == "float" else repr(number)
+    return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def table(values: Any, precision: Precision) -> str:
+    """The initialiser of a constant array, nested as the array is."""
+    array = np.asarray(values, np.float64)
+    return _nested(array, precision, "    ")
+
+
+def _nested(array: np.ndarray[Any, Any], precision: Precision, indent: str) -> str:
+    if array.ndim == 1:
+        words = ", ".join(literal(float(value), precision) for value in array)
+        lines = textwrap.wrap(words, WIDTH)
+        return "{" + f"\n{indent}".join(lines) + "}"
+    inner = [_nested(part, precision, indent + "    ") for part in array]
+    return "{\n" + ",\n".join(f"{indent}{part}" for part in inner) + f"\n{indent[:-4]}}}"
+
+
+def ascii_only(text: str) -> str:
+    """Text for comments and units in C, which not every compiler takes in UTF-8."""
+    for mark, word in _ASCII.items():
+        text = text.replace(mark, word)
+    return text.encode("ascii", "replace").decode()
+
+
+def unit_of(name: str) -> str:
+    """Unit of a channel, for a comment."""
+    return ascii_only(channel(name).unit)
+
+
+@cache
+def _environment(precision: Precision) -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("vehest.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    environment.filters |= {
+        "real": partial(literal, precision=precision),
+        "table": partial(table, precision=precision),
+        "ascii": ascii_only,
+        "unit": unit_of,
+    }
+    environment.globals["precision"] = precision
+    return environment

@@ -1,0 +1,130 @@
+"""Test vectors of an export: a short drive with everything that goes wrong on a bus, and what Python makes of it."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.estimators.base import Estimator
+from vehest.export.tables import health_table
+from vehest.trust.contract import GuardedStepper
+
+SECONDS = 12.0
+COLUMNS = ("vy", "sideslip", "band_vy", "band_sideslip", "health", "reason")
+RADIUS = 0.3  # m, of a wheel where nothing was learnt
+
+
+def replayed(stepper: GuardedStepper, times: FloatArray, samples: Mapping[str, FloatArray]) -> FloatArray:
+    """What a stepper says after each row: `COLUMNS`, (T, 6); NaN where it says nothing.
+
+    Args:
+        stepper: in its initial state.
+        times: of the rows, (T,) [s]; where one is NaN the row follows the last one without a gap.
+        samples: channel -> (T,).
+    """
+    found = np.full((len(times), len(COLUMNS)), np.nan)
+    for k, time in enumerate(times.tolist()):
+        sample = {name: float(values[k]) for name, values in samples.items()}
+        said = stepper.step(sample, None if math.isnan(time) else time)
+        found[k] = [said.get("health_reason" if name == "reason" else name, math.nan) for name in COLUMNS]
+    return found
+
+
+def in_float64(estimator: Estimator) -> Estimator:
+    """The same estimator with weights that compute in float64, which networks that were trained in float32 do not."""
+    twin = type(estimator)(estimator.settings)
+    twin.preparation = estimator.preparation
+    twin.load_weights(
+        {
+            name: values.astype(np.float64) if np.issubdtype(values.dtype, np.floating) else values
+            for name, values in estimator.weights().items()
+        }
+    )
+    return twin
+
+
+def drive_for(stepper: GuardedStepper) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Times (T,) [s] and samples, channel -> (T,), that a stepper is tried on: swerves at the speed that its limits allow, and faults.
+
+    The faults: values that are NaN, infinite or beyond physics, one channel after another; a channel that stands still; an offset; rows
+    that are lost for 0.03 s and for 0.7 s; a row that comes twice.
+    """
+    rate = stepper._rate
+    steps = round(SECONDS * rate)
+    times = np.arange(steps) / rate
+    samples = _motion(stepper, times, rate)
+    names = list(samples)
+    for at, name in enumerate(names):
+        first = round((3.0 + 0.3 * at / len(names)) * rate)
+        samples[name][first : first + 2] = (math.nan, math.inf)
+        samples[name][first + 3] = -1e30
+        if name in stepper.estimator.skippable or at == 0:
+            samples[name][round(4.0 * rate) : round(4.3 * rate)] = math.nan
+    if stepper._front is None or not len(
+        stepper._front._sections
+    ):  # behind a low-pass it stands still once digits run out: sooner in float
+        samples[names[0]][round(5.0 * rate) : round(5.6 * rate)] = samples[names[0]][round(5.0 * rate)]
+    samples[names[-1]][round(6.5 * rate) : round(7.5 * rate)] *= 1.6
+    kept = np.ones(steps, bool)
+    kept[round(8.0 * rate) : round(8.03 * rate) + 1] = False
+    kept[round(9.0 * rate) : round(9.7 * rate)] = False
+    kept_rows = np.flatnonzero(kept)
+    again = np.sort(np.append(kept_rows, round(2.0 * rate)))
+    return times[again], {name: values[again] for name, values in samples.items()}
+
+
+def _motion(stepper: GuardedStepper, times: FloatArray, rate: float) -> dict[str, FloatArray]:
+    """Swerves at a varying speed, as large as 0.3 of the largest values in training, and noise that is the same on every machine."""
+    names, limits = list(stepper._channels), stepper._guard._limits[:, :2]
+    sizes, usual = _sizes(stepper)
+    speed, swerve = 1.0 + 0.2 * np.sin(0.7 * times), np.sin(2.0 * times) * np.sin(0.3 * times)
+    found = {}
+    for number, name in enumerate(names):
+        size = sizes[name]
+        if name == "vx" or name == "motor_speed" or name.startswith("wheel_speed"):
+            values = usual[name] * speed
+        elif name == "ax" and "vx" in names:
+            values = np.gradient(usual["vx"] * speed, times)
+        elif name == "ay" and {"vx", "yaw_rate"} <= set(names):
+            values = usual["vx"] * speed * 0.3 * sizes["yaw_rate"] * swerve
+        elif name in ("yaw_rate", "ay", "steer", "handwheel", "roll_rate"):
+            values = 0.3 * size * swerve
+        else:
+            values = usual[name] + 0.05 * size * np.sin(1.3 * times + number)
+        low, high = limits[number]
+        found[name] = np.clip(values + 0.002 * size * _noise(len(times), number), 0.9 * low, 0.9 * high)
+    return found
+
+
+def _sizes(stepper: GuardedStepper) -> tuple[dict[str, float], dict[str, float]]:
+    """Largest and usual values of channels in training; round ones of a passenger car where nothing was learnt."""
+    names, table = stepper._channels, health_table(stepper._monitor._health)
+    if table is not None:
+        return dict(zip(names, table["largest"].tolist(), strict=True)), dict(zip(names, table["usual"].tolist(), strict=True))
+    known = {"vx": 20.0, "yaw_rate": 0.5, "ax": 3.0, "ay": 8.0, "steer": 0.1, "handwheel": 1.5}
+    sizes = {name: known.get(name, 0.02 * min(abs(CHANNELS[name].low), abs(CHANNELS[name].high))) for name in names}
+    speeds = {name: known["vx"] / RADIUS for name in names if name == "motor_speed" or name.startswith("wheel_speed")}
+    return {**sizes, **speeds}, {name: speeds.get(name, known["vx"] if name == "vx" else 0.0) for name in names}
+
+
+def _noise(n: int, seed: int) -> FloatArray:
+    """Uniform between -1 and 1, (n,), by a linear congruential generator (Numerical Recipes, 2007, Section 7.1)."""
+    state, found = (1664525 * seed + 1013904223) % 2**32, np.empty(n)
+    for k in range(n):
+        state = (1664525 * state + 1013904223) % 2**32
+        found[k] = state / 2**31 - 1.0
+    return found
+
+
+def table_text(columns: Sequence[str], rows: FloatArray) -> str:
+    """A table as CSV, every number so that it reads back to the same."""
+    out = io.StringIO()
+    out.write(",".join(columns) + "\n")
+    for row in rows.tolist():
+        out.write(",".join("nan" if math.isnan(value) else f"{value:.17g}" for value in row) + "\n")
+    return out.getvalue()

@@ -1,0 +1,163 @@
+"""Exports of every family: fitted for a moment, with limits, health and bands, written, built and run."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import planar_drive
+from every_estimator import fitted
+from single_track_drive import linear_drive
+from small_car_drive import small_car_drive
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.export.method import exportable
+from vehest.export.program import program_files
+from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
+from vehest.trust.bands import Bands, Quantity
+from vehest.trust.contract import GuardedStepper
+from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
+from vehest.trust.guard import learn_limits
+from vehest.trust.health import learn_health
+from vehest.trust.record import About, Trust
+
+FAMILIES = exportable()
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-ffp-contract=off"]
+WEIGHTS = {"variance": 1.2, "one": 0.01, "vx": 1e-5, "ay": 0.001, "vy": 0.02, "yaw_rate_vx": 0.001}
+LARGEST = {"vx": 20.0, "ax": 3.0, "ay": 5.0, "yaw_rate_vx": 5.0, "steer_vx": 1.0, "vy": 0.5}
+SECONDS = 120.0  # after which a program is taken to hang
+
+
+def tool(name: str) -> str:
+    """A compiler or an emulator; the test is skipped without it."""
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"{name} is not installed")
+    return found
+
+
+WELL_CONDITIONED = {"learned_ukf": {"dynamics": "pacejka", "noise": "constant"}}
+"""Variants that do not amplify rounding: two seconds of training leave the learnt noise ill-conditioned, so that a last digit grows."""
+
+
+@cache
+def model(name: str) -> Estimator:
+    return fitted(name, **WELL_CONDITIONED.get(name, {}))
+
+
+def drive(estimator: Estimator, seed: int, seconds: float = 40.0) -> Recording:
+    rate = estimator.settings.rate_hz
+    if "motor_current" in estimator.channels:
+        return small_car_drive(seconds, seed)
+    if "steer" in estimator.channels:
+        own = linear_drive(seconds, rate, seed, {"yaw_rate": 0.005, "ay": 0.2, "steer": 0.0005})[0]
+    else:
+        own = planar_drive(seconds, rate, seed=seed, noise=0.02)
+    generator = np.random.default_rng(seed)
+    return replace(own, channels={name: values + 1e-3 * generator.standard_normal(len(own)) for name, values in own.channels.items()})
+
+
+@cache
+def trust(name: str) -> Trust:
+    """Limits and health learnt on two drives, bands set by hand."""
+    estimator = model(name)
+    drives, rate = [drive(estimator, seed) for seed in (1, 2)], estimator.settings.rate_hz
+    own = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
+    bands = Bands(
+        ("car",),
+        ("set",),
+        ("a",),
+        ("b",),
+        "range",
+        10,
+        100.0,
+        estimator.channels,
+        estimator.horizon_steps,
+        LARGEST,
+        own,
+        replace(own, floor=0.001),
+    )
+    health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
+    return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
+
+
+def faulted(estimator: Estimator, rate_hz: float, seconds: float = 30.0, seed: int = 0) -> dict[str, np.ndarray]:
+    """A drive with a fault of any kind in any channel every few seconds, at a rate."""
+    plain, generator = drive(estimator, seed + 3, seconds), np.random.default_rng(seed)
+    times = np.arange(0.0, seconds - 0.1, 1.0 / rate_hz)
+    samples = {name: np.interp(times, np.arange(len(plain)) / plain.rate_hz, plain[name]) for name in estimator.channels}
+    at, number = 2.0, 0
+    while at < seconds - 2.0:
+        channel = str(generator.choice(estimator.channels))
+        kind = str(generator.choice([kind for kind in KINDS if applies(kind, channel)]))
+        fault = Fault(kind, channel, SEVERITIES[generator.integers(3)], at, generator.uniform(0.2, 1.5), number)
+        samples, at, number = inject(samples, rate_hz, fault), at + generator.uniform(0.8, 3.0), number + 1
+    return samples
+
+
+@dataclass(frozen=True)
+class Export:
+    """A model's sources in a folder, with stepper that says what they should."""
+
+    name: str
+    precision: str
+    folder: Path
+    bus_rate_hz: float | None = None
+    trusted: bool = True
+
+    def stepper(self) -> GuardedStepper:
+        return GuardedStepper(model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz)
+
+    def write(self) -> Export:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for name, text in program_files(self.stepper(), self.precision, self.name)[0].items():  # type: ignore[arg-type]
+            (self.folder / name).write_text(text)
+        return self
+
+    def vectors(self, *, faults: bool = False) -> None:
+        """Write in.csv and expected.csv: the vectors of every export, or a drive with faults."""
+        stepper = self.stepper()
+        if faults:
+            samples = faulted(stepper.estimator, stepper._rate)
+            times = np.full(len(next(iter(samples.values()))), np.nan)
+        else:
+            times, samples = drive_for(stepper)
+        (self.folder / "in.csv").write_text(table_text(("time", *samples), np.column_stack([times, *samples.values()])))
+        (self.folder / "expected.csv").write_text(table_text(COLUMNS, replayed(stepper, times, samples)))
+
+    @property
+    def sources(self) -> list[str]:
+        return sorted(path.name for path in self.folder.glob("vehest_*.c"))
+
+    def build(self, compiler: str, *options: str, main: str = "main.c", out: str = "main") -> Path:
+        flags = [*STRICT, *(["-Wdouble-promotion"] if self.precision == "float" else [])]
+        command([tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder)
+        return self.folder / out
+
+    def differences(self, program: list[str]) -> tuple[np.ndarray, int]:
+        """Run the vectors; see `compared`."""
+        command([*program, "in.csv", "out.csv"], self.folder)
+        return self.compared()
+
+    def compared(self) -> tuple[np.ndarray, int]:
+        """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
+        own, wanted = (np.genfromtxt(self.folder / name, delimiter=",", skip_header=1) for name in ("out.csv", "expected.csv"))
+        judged = slice(
+            4, None if self.precision == "double" else 5
+        )  # an offset and a scale of one lone channel are the same to the last digits
+        same = (own[:, judged] == wanted[:, judged]).all(1)
+        assert (np.isnan(own[same]) == np.isnan(wanted[same])).all()
+        return np.nanmax(np.abs(own - wanted)[same][:, :4], axis=0, initial=0.0), int((~same).sum())
+
+
+def command(words: list[str], folder: Path, seconds: float = SECONDS) -> str:
+    """Run a program that has to succeed; what it said."""
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False)
+    assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout}{done.stderr}"
+    return done.stdout + done.stderr

@@ -1,0 +1,112 @@
+"""Golden files: the C of models with weights set by hand. `python tests/export/golden.py` writes them anew after a wanted change."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(Path(__file__).parents[1] / part) for part in (".", "estimators", "export")]
+
+import numpy as np
+from exports import FAMILIES, LARGEST, WEIGHTS, model
+
+from vehest.estimators.base import Estimator
+from vehest.export.method import method_source, types_header
+from vehest.export.program import program_files
+from vehest.trust.bands import Bands, Quantity
+from vehest.trust.contract import GuardedStepper
+from vehest.trust.guard import ChannelLimits, GuardLimits
+from vehest.trust.health import HealthModel
+from vehest.trust.record import About, Trust
+from vehest.trust.relations import Relation
+
+FOLDER = Path(__file__).parent / "golden"
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.\d*|\d+)(?:[eE][+-]?\d+)?f?(?![\w.])")
+
+
+def by_hand(name: str) -> Estimator:
+    """Twentieths for weights, so that no training has a say."""
+    shapes = model(name)
+    twin = type(shapes)(shapes.settings)
+    twin.preparation = shapes.preparation
+    weights = {}
+    for key, values in shapes.weights().items():
+        twentieths = (7 * np.arange(values.size) + 3 + len(key)) % 11 + 1
+        weights[key] = (twentieths / 20).reshape(values.shape).astype(values.dtype)
+    twin.load_weights(weights)
+    return twin
+
+
+def trust_by_hand() -> Trust:
+    """Limits, health and bands of three channels: one lag, one relation."""
+    channels = ("vx", "yaw_rate", "ay")
+    health = HealthModel(
+        channels=channels,
+        rate_hz=100.0,
+        relations=(Relation("ay", "yaw_rate", {"1": 0.05, "u r": 1.0}, True),),
+        constant=(0.1, 0.0, 0.01),
+        coefficients=(((0.99, 0.0, 0.0), (0.0, 0.9, 0.0), (0.0, 0.1, 0.8)),),
+        precision=((400.0, 0.0, 0.0), (0.0, 1e4, 10.0), (0.0, 10.0, 25.0)),
+        deviation=(0.05, 0.01, 0.2),
+        usual=(20.0, 0.0, 0.0),
+        largest=(40.0, 0.6, 9.0),
+        longest_gap=(0.0, 0.0, 0.02),
+        standstill=(2.0, 0.05, 0.5),
+        spin=(0.8, 12.0),
+        speeds=(5.0, 10.0, 20.0, 30.0, 40.0),
+        levels=((0.5, 0.5, 0.5), (0.8, 0.8, 0.8), (1.0, 1.0, 1.0), (1.2, 1.2, 1.2), (1.5, 1.5, 1.5)),
+        healthy=((0.01, 0.0, 0.02), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01)),
+        heaviest=((10.0, 20.0, 30.0), (10.0, 20.0, 30.0), (10.0, 20.0, 30.0)),
+        limits=tuple(4.0 + 0.25 * number for number in range(73)),
+    )
+    own = {name: ChannelLimits(-size, size, size / 4.0, 0.5) for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)}
+    v, angle = (Quantity(WEIGHTS, floor, (0.5, 1.0, 1.75, 2.5), (False,) * 4, 10.0) for floor in (0.02, 0.001))
+    bands = Bands(("car",), ("set",), ("a",), ("b",), "range", 10, 100.0, channels, 0, LARGEST, v, angle)
+    return Trust(About("kinematic"), bands, GuardLimits(own, 120.0, 1.0), health)
+
+
+def sources() -> dict[str, str]:
+    """Name of a golden file -> what it should hold today."""
+    found = {}
+    for name in FAMILIES:
+        own = by_hand(name)
+        method = method_source(own, "double")
+        found[f"{name}/vehest_types.h"] = types_header(own, "double")
+        found |= {f"{name}/vehest_method.h": method.header, f"{name}/vehest_method.c": method.source}
+    stepper = GuardedStepper(by_hand("kinematic"), trust_by_hand(), 500.0)
+    files = program_files(stepper, "float", "Kinematic integration, weights set by hand")[0]
+    return found | {f"contract/{name}": text for name, text in files.items() if "method" not in name}
+
+
+def differences(text: str, golden: str) -> list[str]:
+    """Where a text is another than the golden one; numbers may differ in their last digits, as they do between machines."""
+    ours, theirs = text.splitlines(), golden.splitlines()
+    if len(ours) != len(theirs):
+        return [f"{len(ours)} lines instead of {len(theirs)}"]
+    return [
+        f"line {at}: {own} instead of {other}"
+        for at, (own, other) in enumerate(zip(ours, theirs, strict=True), 1)
+        if not _alike(own, other)
+    ]
+
+
+def _alike(own: str, other: str) -> bool:
+    if NUMBER.sub("#", own) != NUMBER.sub("#", other):
+        return False
+    numbers = [[float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)]
+    return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
+
+
+def main() -> None:
+    """Write all golden files anew."""
+    for name, text in sources().items():
+        path = FOLDER / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+/* vehest_method.h: UKF with Dugoff tyres, without tyre forces (dugoff_ukf, dugoff_imu), the method alone.
+ *
+ * It works at 100.0 Hz. An estimate holds at the time of its sample.
+ */
+#ifndef VEHEST_METHOD_H
+#define VEHEST_METHOD_H
+
+#include "vehest_types.h"
+
+/* All that is remembered from one sample to the next. */
+typedef struct {
+    vehest_real mean[2];   /* v [m/s], r [rad/s] */
+    vehest_real cov[2][2]; /* their covariance */
+    vehest_real last[3];   /* inputs of the last sample: u [m/s], delta [rad], a_x [m/s^2] */
+    bool started;
+} vehest_method;
+
+/* What the method says after a sample; NaN where it has no such quantity, or none yet. */
+typedef struct {
+    vehest_real vy;          /* lateral velocity [m/s] */
+    vehest_real vx;          /* forward velocity [m/s] */
+    vehest_real yaw_rate;    /* yaw rate [rad/s] */
+    vehest_real vy_variance; /* variance of the lateral velocity [m^2/s^2] */
+} vehest_method_output;
+
+/* As before the first sample. */
+void vehest_method_start(vehest_method *m);
+
+/* Take a sample: channels in the order of vehest_types.h, SI units, NaN in a skippable channel was not measured.
+ * False: the method is lost, its output means nothing; start it anew. */
+bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNELS], vehest_method_output *output);
+
+#endif

@@ -1,0 +1,34 @@
+/* vehest_method.h: RATTE, extended Kalman filter (rational_ekf, ratte), the method alone.
+ *
+ * It works at 20.0 Hz. An estimate holds at the time of its sample.
+ */
+#ifndef VEHEST_METHOD_H
+#define VEHEST_METHOD_H
+
+#include "vehest_types.h"
+
+/* All that is remembered from one sample to the next. */
+typedef struct {
+    vehest_real mean[8];   /* beta [rad], r [rad/s], beta' [rad/s], r' [rad/s^2], logarithms of tyre parameters [1] */
+    vehest_real root[8][8]; /* L, lower triangular, of their covariance */
+    vehest_real vx;        /* forward velocity of the last sample [m/s] */
+    vehest_real steer;     /* steering angle of the last sample [rad] */
+    bool started;
+} vehest_method;
+
+/* What the method says after a sample; NaN where it has no such quantity, or none yet. */
+typedef struct {
+    vehest_real vy;          /* lateral velocity [m/s] */
+    vehest_real vx;          /* forward velocity [m/s] */
+    vehest_real yaw_rate;    /* yaw rate [rad/s] */
+    vehest_real vy_variance; /* variance of the lateral velocity [m^2/s^2] */
+} vehest_method_output;
+
+/* As before the first sample. */
+void vehest_method_start(vehest_method *m);
+
+/* Take a sample: channels in the order of vehest_types.h, SI units, NaN in a skippable channel was not measured.
+ * False: the method is lost, its output means nothing; start it anew. */
+bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNELS], vehest_method_output *output);
+
+#endif

@@ -1,0 +1,92 @@
+"""Exports on disk and from the command line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from exports import command, model, tool, trust
+
+from every_estimator import fitted
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.model_files import save_model
+from vehest.export.folder import FILES, export_model
+from vehest.trust.record import write_trust
+
+pytestmark = pytest.mark.export
+
+
+def test_an_export_builds_and_passes_its_own_vectors(tmp_path):
+    tool("make")
+    tool("gcc")
+    found = export_model(model("dugoff_ukf"), trust("dugoff_ukf"), tmp_path / "c", "float", 200.0)
+    assert {path.name for path in (tmp_path / "c").iterdir()} <= FILES
+    said = command(["make", "-s", "check"], tmp_path / "c")
+    assert f"bytes of state: {found[0].state}" in said
+    readme = (tmp_path / "c" / "README.md").read_text()
+    assert f"| RAM: `vehest_state` | {found[0].state} |" in readme
+    assert "200.0 times a second" in readme
+    assert "| 2 | CHANNEL is frozen |" in readme
+
+
+def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_path):
+    out = tmp_path / "c"
+    export_model(model("zero"), trust("zero"), out)
+    assert (out / "vehest_health.c").exists()
+    export_model(model("zero"), None, out)
+    assert not (out / "vehest_health.c").exists()
+    (out / "mine.c").write_text("")
+    with pytest.raises(ConfigurationError, match=r"holds 'mine\.c', which is no part of an export"):
+        export_model(model("zero"), None, out)
+    other = tmp_path / "project"
+    other.mkdir()
+    (other / "main.c").write_text("int main(void) { return 0; }")
+    with pytest.raises(ConfigurationError, match=r"holds 'main\.c'"):
+        export_model(model("zero"), None, other)
+    assert [path.name for path in other.iterdir()] == ["main.c"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"precision": "half"}, "double or float"), ({"bus_rate_hz": 10.0}, "too slow"), ({"bus_rate_hz": float("nan")}, "too slow")],
+)
+def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, words):
+    with pytest.raises(ConfigurationError, match=words):
+        export_model(model("zero"), None, tmp_path / "c", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_channel_that_was_computed_from_another_is_not_for_float(tmp_path):
+    own = trust("kalman")
+    health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
+    with pytest.raises(ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"):
+        export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_factor_graph_is_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="cannot be exported"):
+        export_model(fitted("factor_graph"), None, tmp_path / "c")
+
+
+def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    save_model(model("kinematic"), folder)
+    write_trust(trust("kinematic"), folder)
+    words = [sys.executable, "-m", "vehest", "export", str(folder), "-o", str(tmp_path / "c"), "--precision", "float", "--bus-rate", "500"]
+    done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "VEHEST_OUTPUT": str(tmp_path)}, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"out: {tmp_path / 'c'}" in done.stdout
+    again = subprocess.run([*words[:-1], "1"], capture_output=True, text=True, check=False)
+    assert again.returncode == 2
+    assert again.stderr == "error: samples at 1 Hz are too slow for an estimator that works at 100 Hz\n"
+
+
+def test_every_file_of_the_patented_method_says_so(tmp_path):
+    export_model(model("ksnn"), trust("ksnn"), tmp_path / "c")
+    for path in (tmp_path / "c").iterdir():
+        assert path.suffix == ".csv" or "patent" in path.read_text().lower(), path.name

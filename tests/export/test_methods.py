@@ -1,0 +1,341 @@
+"""A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from c_build import COMPILERS, OUTPUTS, Library, built
+
+from dugoff_drive import TYRES, dugoff_track
+from every_estimator import drive_for, fitted
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.transforms import Resample
+from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.filtering.network_ukf import NetworkUkf
+from vehest.estimators.networks.windowed import WindowedEstimator
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.export.method import FAMILIES, method_source
+from vehest.sources.base import open_source
+from vehest.stages.config import compose_config
+from vehest.training.sequences import PhaseSettings
+from vehest.training.through_filter import ThroughFilterSettings
+
+DOUBLE, FLOAT = 1e-9, 1e-4  # m/s
+LEVELS = {"process_vy": 0.01, "process_yaw_rate": 0.003, "ay": 0.06, "yaw_rate": 0.002}
+WITH_FORCES = {**LEVELS, "force_factor": 3.0, "fy_front": 100.0, "fy_rear": 100.0}
+ON_DUGOFF = ("dugoff_ukf", "ensemble_ukf", "cnn_ukf")
+TRACK = {"inputs": "imu", "tyres": TYRES, "noise": LEVELS}
+FULL = {"inputs": "full", "tyres": TYRES, "noise": WITH_FORCES}
+VARIANTS: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in FAMILIES if name not in ON_DUGOFF),
+    ("kalman", {"gate": 1.0}),
+    ("kalman", {"gate": 3.0, "offsets": {"ay": 0.3, "steer": 0.01}}),
+    ("kalman", {"offsets": {"steer": 0.01}}),
+    ("ksnn", {"n_hidden": 0}),
+    ("ksnn", {"n_hidden": 0, "bias": True, "n_local": 1}),
+    ("ksnn", {"n_hidden": 3, "bias": True, "n_local": 5}),
+    ("ksnn", {"n_hidden": 2, "n_local": 1, "window": 7}),
+    ("velocity_gru", {"inputs": ["yaw_rate", "ay"], "outputs": ["vy"]}),
+    ("velocity_lstm", {"outputs": ["vy", "vx"], "inputs": ["ay", "yaw_rate"], "n_dense": 5}),
+    ("rational_ekf", {"tyres": "linear", "curves": {"c2_front": 0.7e5, "c2_rear": 1.2e5}, "gate": 2.0}),
+    ("rational_ekf", {"tyres": "rational"}),
+    ("rational_ekf", {"tyres": "rational_friction", "adapt_above": 2.0, "gate": 3.0}),
+    ("rational_ekf", {"adapt_above": 2.0}),
+    ("dugoff_ukf", TRACK),
+    ("dugoff_ukf", {**FULL, "gate": 3.0, "curve": "smooth"}),
+    ("ensemble_ukf", {**TRACK, "members": 3, "hidden": [8, 4]}),
+    ("ensemble_ukf", {**FULL, "members": 3, "hidden": [8, 4], "variance": "mixture", "gate": 3.0}),
+    ("cnn_ukf", {**TRACK, "hidden": [8, 4]}),
+    ("cnn_ukf", {**FULL, "hidden": [20, 10], "gate": 4.0}),
+    ("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}),
+    ("learned_ukf", {"dynamics": "residual", "start_friction": 0.9}),
+    ("learned_ukf", {"dynamics": "neural", "noise": "constant", "repair": False}),
+    ("learned_ukf", {"dynamics": "tyre_network", "gate": 2.0, "scaled": False}),
+]
+
+pytestmark = [pytest.mark.export, pytest.mark.skipif(not COMPILERS, reason="there is neither gcc nor clang")]
+each_compiler = pytest.mark.parametrize("compiler", COMPILERS)
+each_variant = pytest.mark.parametrize(
+    "variant", VARIANTS, ids=lambda own: "-".join([own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)])
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An estimator as it was trained, the same in float64, and rows of its channels."""
+
+    estimator: Estimator
+    in_float64: Estimator
+    rows: np.ndarray
+
+
+def case_of(name: str, config: dict[str, Any]) -> Case:
+    """Networks are trained in float32, as usual; weights in float64 are the same numbers."""
+    return _case(name, repr(config))
+
+
+@cache
+def _case(name: str, config: str) -> Case:
+    given: dict[str, Any] = next(own for family, own in VARIANTS if family == name and repr(own) == config)
+    estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
+    rows = dugoff_rows(estimator) if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
+    return Case(estimator, widened(estimator), disturbed(estimator, rows))
+
+
+def of_dugoff(name: str, config: dict[str, Any]) -> Estimator:
+    """A filter with known tyres; a network with random weights, as sure of itself as a trained one."""
+    estimator = estimator_class(name).from_config(config)
+    if isinstance(estimator, NetworkUkf):
+        inputs = np.stack([dugoff_channels()[name] for name in estimator.inputs], 1)
+        network = estimator.network
+        network.scale(inputs, dugoff_channels()["sideslip_ref"])
+        network.reset([torch.Generator().manual_seed(seed) for seed in range(network.members)])
+        with torch.no_grad():
+            if name == "cnn_ukf":
+                network.get_parameter("bias_3")[0, 1:] = torch.tensor([-4.0, -6.0, -6.0])
+            else:
+                network.get_parameter("bias_3")[..., 1] = -6.0
+        if name == "ensemble_ukf":
+            estimator.scaling = np.array([-1.0, 0.8])  # type: ignore[attr-defined]
+    return estimator
+
+
+@cache
+def dugoff_channels() -> dict[str, np.ndarray]:
+    """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
+    generator, time = np.random.default_rng(1), np.arange(1200) / 100.0
+    n, track = len(time), dugoff_track()
+    vx = 13.0 - 12.0 * np.cos(2.0 * np.pi * time / 10.0)
+    ax = 2.4 * np.pi * np.sin(2.0 * np.pi * time / 10.0)
+    steer = np.minimum(0.2, 17.0 / np.square(vx)) * np.sin(1.7 * time)  # about 6 m/s² at speed
+    inputs, states = torch.as_tensor(np.stack([vx, steer, ax], 1)), torch.zeros(n, 2, dtype=torch.float64)
+    for k in range(n - 1):
+        states[k + 1] = track.transition(states[k], inputs[k])
+    ay, yaw_rate, front, rear = track.observation(states, inputs).T.numpy()
+    channels = {"vx": vx, "steer": steer, "ax": ax, "sideslip_ref": np.arctan2(states[:, 0].numpy(), vx)}
+    channels |= {"ay": ay + 0.06 * generator.standard_normal(n), "yaw_rate": yaw_rate + 0.002 * generator.standard_normal(n)}
+    for axis, loads in (("x", (0.0, 0.0)), ("y", (0.5 * front, 0.5 * rear)), ("z", (4800.0, 4800.0))):
+        for corner in ("fl", "fr", "rl", "rr"):
+            channels[f"f{axis}_{corner}"] = loads[corner[0] == "r"] + 70.0 * generator.standard_normal(n)
+    return channels
+
+
+def dugoff_rows(estimator: Estimator) -> np.ndarray:
+    return np.stack([dugoff_channels()[name] for name in estimator.channels], axis=1)
+
+
+def widened(estimator: Estimator) -> Estimator:
+    """The same weights, computed in float64."""
+    own = copy.deepcopy(estimator)
+    for part in ("network", "filter"):
+        if isinstance(getattr(own, part, None), torch.nn.Module):
+            setattr(own, part, getattr(own, part).double())
+    return own
+
+
+def disturbed(estimator: Estimator, rows: np.ndarray) -> np.ndarray:
+    """One in twenty samples missing of what may be, and values on which a method without memory of them has to start anew."""
+    rows, generator = rows.copy(), np.random.default_rng(0)
+    for name in estimator.skippable:
+        if name in estimator.channels:
+            rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
+    needed = [column for column, name in enumerate(estimator.channels) if name not in estimator.skippable]
+    at = 2 * len(rows) // 3
+    if needed and starts_anew(estimator):
+        rows[at, needed[0]] = np.nan
+    elif isinstance(estimator, WindowedEstimator):
+        rows[at, 0] = np.nan  # it leaves the window again
+    if starts_anew(estimator) == "infinite":
+        rows[at + 20, -1] = np.inf
+    return rows
+
+
+def starts_anew(estimator: Estimator) -> str:
+    """Which values Python's stepper raises at."""
+    if estimator.name in ("zero", "static_map", "kinematic", "data_sheet"):
+        return "missing"
+    return "infinite" if "kalman" in estimator.name or "ukf" in estimator.name or "ekf" in estimator.name else ""
+
+
+def stepped(estimator: Estimator, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
+    out, fine, stepper = np.full((len(rows), len(OUTPUTS)), np.nan), np.ones(len(rows), bool), estimator.online()
+    for k, row in enumerate(rows):
+        try:
+            found = stepper.step(dict(zip(estimator.channels, row.tolist(), strict=True)))
+        except DataError:
+            fine[k], stepper = False, estimator.online()
+            continue
+        out[k] = [found.get(name, np.nan) for name in OUTPUTS]
+    return out, fine
+
+
+def check(library: Library, estimator: Estimator, rows: np.ndarray, largest: float) -> None:
+    said, fine = library(rows)
+    wanted, stepped_fine = stepped(estimator, rows)
+    np.testing.assert_array_equal(fine, stepped_fine)
+    said[~fine] = np.nan
+    np.testing.assert_array_equal(np.isnan(said), np.isnan(wanted))
+    assert np.isfinite(wanted[:, 0]).sum() > 0.4 * len(rows)
+    np.testing.assert_allclose(said[:, :3], wanted[:, :3], rtol=0.0, atol=largest)
+    np.testing.assert_allclose(said[:, 3], wanted[:, 3], rtol=3e-3 if library.precision == "float" else 1e-7, atol=largest * 1e-2)
+
+
+@each_variant
+def test_double_agrees_with_python_in_float64(variant, tmp_path):
+    case = case_of(*variant)
+    check(built(case.estimator, "double", tmp_path), case.in_float64, case.rows, DOUBLE)
+
+
+@each_variant
+def test_float_agrees_with_python_in_the_precision_of_its_training(variant, tmp_path):
+    """Networks: float32. Filters have no float32 in Python but in networks, so that float in C is held against float64."""
+    case = case_of(*variant)
+    check(built(case.estimator, "float", tmp_path), case.estimator, case.rows, FLOAT)
+
+
+@pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
+@pytest.mark.parametrize("variant", [own for own in VARIANTS if own[0] not in ("zero", "static_map")][::3], ids=lambda own: own[0])
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_clang_takes_it_without_a_warning_and_computes_the_same(variant, precision, tmp_path):
+    case = case_of(*variant)
+    said = [built(case.estimator, precision, tmp_path, compiler)(case.rows)[0] for compiler in ("clang", COMPILERS[0])]
+    np.testing.assert_allclose(*said, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
+
+
+def test_every_family_but_the_factor_graph_can_be_exported():
+    assert set(FAMILIES) == set(estimator_names()) - {"factor_graph"}
+
+
+def test_what_cannot_be_exported_is_said_in_one_line():
+    offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
+    with pytest.raises(ConfigurationError, match="cannot run along with a drive"):
+        method_source(offline, "double")
+    unscented = estimator_class("rational_ekf").from_config(
+        {"filter": "unscented", "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01}, "curves": CURVES}
+    )
+    with pytest.raises(ConfigurationError, match="has no C; train it with filter=extended"):
+        method_source(unscented, "double")
+
+
+CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
+
+
+def test_every_file_of_a_ksnn_names_the_patent():
+    source = method_source(case_of("ksnn", {}).estimator, "double")
+    assert all("PCT/IT2023/050058" in text for text in (source.header, source.source, " ".join(source.notes)))
+
+
+def test_a_value_that_float_cannot_hold_is_refused():
+    kalman = estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 1e36}})
+    with pytest.raises(ConfigurationError, match=r"no float number; fit it anew, or export with precision double"):
+        method_source(kalman, "float")
+    assert "1e+39" in method_source(kalman, "double").source
+
+
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_sources_are_plain_c_and_their_literals_have_the_type(precision):
+    source = method_source(case_of("rational_ekf", {}).estimator, precision)
+    code = "".join(part.split("*/")[-1] for part in source.source.split("/*"))
+    assert code.isascii()
+    assert ("TAU = 0.0500000007f;" in code) == (precision == "float")
+    assert ("TAU = 0.05;" in code) == (precision == "double")
+    assert not any(word in code for word in ("malloc", "goto", "union", "setjmp", "__attribute__"))
+
+
+def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp_path):
+    """Sensors far too trusted, and κ = -2: without the mean point's negative weight, or lifted by their eigenvalues.
+
+    A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more than elsewhere.
+    """
+    hard = copy.deepcopy(case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator)
+    hard.settings = replace(hard.settings, gate=None)  # type: ignore[type-var]
+    with torch.no_grad():
+        hard.filter.observation_noise.factor.mul_(0.002)  # type: ignore[attr-defined]
+    rows = disturbed(hard, drive_for(hard).stack(hard.channels))[:200].copy()
+    rows[:, 1:5] *= 3.0
+    stepper, wanted, repaired, lifted = widened(hard).online(), [], 0, 0
+    for row in rows:
+        wanted.append(list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3])
+        tape = stepper._filter._tape  # type: ignore[attr-defined]
+        repaired, lifted = repaired + bool(tape.repaired[0, 0]), lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
+    assert repaired > 20
+    assert lifted > 0
+    said, _ = built(hard, "double", tmp_path)(rows)
+    np.testing.assert_allclose(said[:, [1, 0, 2]], wanted, rtol=0.0, atol=1e-6)
+
+
+def ferrari_rows(data_root, estimator: Estimator, first: float = 550.0, last: float = 700.0) -> np.ndarray:
+    dataset = compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])["dataset"]
+    recording = open_source(dataset).read("20140222_01_01_03_250lm").cut(first, last)
+    if estimator.settings.rate_hz != recording.rate_hz:
+        recording = Resample(estimator.settings.rate_hz)(recording)
+    return recording.without_references().stack(estimator.channels)
+
+
+REAL = {  # as they were fitted to the rest of the recording
+    "kalman": {"noise": {"yaw_rate": 0.00445, "ay": 0.995, "steer": 7.17e-4}},
+    "rational_ekf": {
+        "noise": {"yaw_rate": 0.01355, "ay": 0.835, "steer": 0.0243, "tyres": 1e-4},
+        "curves": {"c1_front": 0.00865, "c2_front": 65392.0, "c1_rear": 0.00512, "c2_rear": 112033.0},
+    },
+    "dugoff_ukf": {
+        "inputs": "imu",
+        "noise": {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "ay": 1.154, "yaw_rate": 0.00663},
+        "tyres": dict(zip(TYRES, (64008.0, 1.2256, 2e-6, 104676.0, 1.3725, 0.05), strict=True)),
+        "car": {"mass": 982.0, "yaw_inertia": 1605.4145, "cg_to_front_axle": 1.33, "cg_to_rear_axle": 1.07, "cg_height": 0.45},
+    },
+}
+
+
+@pytest.mark.parametrize("name", list(REAL))
+@pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
+def test_filters_agree_over_the_real_ferraris_test_range(name, precision, largest, data_root, tmp_path):
+    estimator = estimator_class(name).from_config(REAL[name])
+    rows = ferrari_rows(data_root, estimator)
+    check(built(estimator, precision, tmp_path), estimator, rows, largest)
+
+
+@pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
+def test_the_observer_agrees_over_the_real_ferraris_test_range(precision, largest, data_root, tmp_path):
+    estimator = estimator_class("luenberger").from_config({})
+    estimator.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
+    check(built(estimator, precision, tmp_path), estimator, ferrari_rows(data_root, estimator), largest)
+
+
+@cache
+def small_car(data_root, dynamics: str) -> Case:
+    """Trained on real drives of the small car, for seconds, and another drive of it."""
+    source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
+    train, validation, test = (source.read(f"{name}") for name in DRIVES)
+    estimator = estimator_class("learned_ukf").from_config({"dynamics": dynamics, "width": 8, "through_filter": False})
+    estimator.seed(0)
+    phases = [PhaseSettings(learning_rate=5e-3, max_epochs=5), *[PhaseSettings(learning_rate=1e-3, max_epochs=1)] * 2]
+    training = ThroughFilterSettings(phases[0], 100, *phases[1:], steps=50, validation_steps=100, validation_drop_steps=20)
+    estimator.fit(FitData([train], [validation]), training)
+    return Case(estimator, widened(estimator), test.without_references().stack(estimator.channels)[:2000])
+
+
+DRIVES = ("iros_hoons_1_with_friction_run_0", "iros_hoons_1_with_friction_run_1", "hoons_all_test_run_4")
+LEARNT = pytest.mark.parametrize("dynamics", ["pacejka", "friction_tyre_network"])
+
+
+@LEARNT
+def test_learned_filters_agree_over_a_real_drive_of_the_small_car(dynamics, data_root, tmp_path):
+    case = small_car(data_root, dynamics)
+    check(built(case.estimator, "double", tmp_path), case.in_float64, case.rows, DOUBLE)
+
+
+@LEARNT
+def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(dynamics, data_root, tmp_path):
+    """A network that learnt for seconds makes a filter that forgets slowly: rounding alone moves Python's by centimetres a second."""
+    case = small_car(data_root, dynamics)
+    exact, rounded = (stepped(estimator, case.rows)[0][:, 0] for estimator in (case.in_float64, case.estimator))
+    said = built(case.estimator, "float", tmp_path)(case.rows)[0][:, 0]
+    assert np.abs(said - exact).max() <= FLOAT + 2.0 * np.abs(rounded - exact).max()
