@@ -1,14 +1,15 @@
-"""Every trained model in C against Python, over real drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
+"""Every trained model in C against Python, over whole drives: digits, time, bytes. Writes results/export/metrics.csv and report.md.
 
-Models are those in the output root's train/ that learnt on the real Ferrari or the F1TENTH, one a variant; drives are the Ferrari's test
-range, 550 to 700 s, and a test run of the F1TENTH. Both run under the contract with limits, health and bands. Python computes the same in
-float64 for the differences; its time is that of the model as it is. One core, the least of some passes over the whole drive in C, one pass
-in Python, both in the same run.
+Models are those in the output root's train/ that learnt on the real Ferrari, the F1TENTH or, if on neither, the SIMULATED BMW, one a
+variant; drives are the Ferrari's test range, 550 to 700 s, a test run of the F1TENTH and a test drive of the BMW. All run under the
+contract with limits, health and bands. Python computes the same in float64 for the differences; its time is that of the model as it is.
+One core, the least of some passes over the whole drive in C, one pass in Python and in onnxruntime, all in the same run.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 import subprocess
@@ -24,7 +25,11 @@ import torch
 
 ROOT = Path(__file__).parents[1]
 PASSES = 3
-DRIVES = {"ferrari_250lm": ("20140222_01_01_03_250lm", 550.0, 700.0), "f1tenth": ("hoons_all_test_run_4", 0.0, 150.0)}
+DRIVES = {
+    "ferrari_250lm": ("20140222_01_01_03_250lm", 550.0, 700.0),
+    "f1tenth": ("hoons_all_test_run_4", 0.0, 150.0),
+    "sim_bmw": ("test_slalom*", 0.0, 150.0),  # the first of them in the store
+}
 GOALS = {"ksnn-linear": 0.5, "ksnn-nonlinear": 4.0, "gru": 7.0, "rational_ekf": 5.0, "learned_ukf": 150.0}
 """Start of family-variant -> microseconds a step of the method in double that were asked for."""
 FLAGS = ["-std=c99", "-O2", "-ffp-contract=off"]
@@ -53,18 +58,52 @@ def models(output: Path) -> list[tuple[str, Path]]:
                     found[key] = folder
         except VehestError:
             continue
-    return [(dataset, folder) for (dataset, _, _), folder in sorted(found.items(), key=lambda entry: entry[0])]
+    real = {key[1:] for key in found if key[0] != "sim_bmw"}
+    kept = {key: folder for key, folder in found.items() if key[0] != "sim_bmw" or key[1:] not in real}
+    return [(dataset, folder) for (dataset, _, _), folder in sorted(kept.items(), key=lambda entry: entry[0])]
 
 
-def rows_of(model: Any, folder: Path, dataset: str, root: str) -> dict[str, np.ndarray]:
+def onnx_time(model: Any, samples: dict[str, np.ndarray]) -> float:
+    """Nanoseconds a step in onnxruntime, on one thread; NaN for what is no network."""
+    from vehest.data.errors import ConfigurationError
+    from vehest.export.onnx_model import write_onnx
+
+    with tempfile.TemporaryDirectory() as temporary:
+        file = Path(temporary) / "model.onnx"
+        try:
+            write_onnx(model, file)
+        except ConfigurationError:
+            return float("nan")
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    kind = np.float64 if session.get_inputs()[0].type == "tensor(double)" else np.float32
+    starts = {name.removeprefix("start_"): text for name, text in session.get_modelmeta().custom_metadata_map.items() if "start_" in name}
+    state = {f"state_{name}": np.array(json.loads(text), kind) for name, text in starts.items()}
+    rows = np.ascontiguousarray(np.stack([samples[name] for name in model.channels], axis=1), kind)
+    names = [output.name for output in session.get_outputs()]
+    begun = time.process_time()
+    for row in rows:
+        said = dict(zip(names, session.run(None, {"sample": row, **state}), strict=True))
+        state = {name: said[f"next_{name.removeprefix('state_')}"] for name in state}
+    return 1e9 * (time.process_time() - begun) / len(rows)
+
+
+def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> dict[str, np.ndarray]:
     """The drive's channels at the model's rate."""
+    from vehest.data.store import read_recording
     from vehest.sources.base import open_source
     from vehest.stages.config import compose_config
     from vehest.stages.estimate import preparation_of, prepared_recording
 
     name, first, last = DRIVES[dataset]
-    source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
-    recording = source.read(name).without_references()
+    if "*" in name:
+        recording = read_recording(sorted((output / "ingest").glob(f"{dataset}-*/{name}.parquet"))[0]).without_references()
+    else:
+        source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
+        recording = source.read(name).without_references()
     cut = recording.cut(max(first, recording.start_time), min(last, recording.start_time + recording.duration))
     return dict(prepared_recording(model, cut, preparation_of(folder)).channels)
 
@@ -81,7 +120,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     from vehest.trust.contract import GuardedStepper
 
     model, trust = load_model(folder), trust_of(folder, output)
-    samples = {name: values for name, values in rows_of(model, folder, dataset, root).items() if name in model.channels}
+    samples = {name: values for name, values in rows_of(model, folder, dataset, root, output).items() if name in model.channels}
     samples = {name: samples[name] for name in model.channels}
     steps = len(next(iter(samples.values())))
     wanted = replayed(GuardedStepper(in_float64(model), trust), np.full(steps, np.nan), samples)
@@ -92,7 +131,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     begun = time.process_time()
     for sample in sampled:
         stepper.step(sample)
-    python = 1e6 * (time.process_time() - begun) / steps
+    python, onnx = 1e6 * (time.process_time() - begun) / steps, onnx_time(model, samples)
     rows = []
     for precision in ("double", "float"):
         try:
@@ -133,6 +172,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
                 "c_method_ns": float(said[1]),
                 "python_ns": 1e3 * python,
                 "python_over_c": 1e3 * python / float(said[0]),
+                "onnxruntime_ns": onnx,
                 **({f"{k}_bytes": getattr(host, k) for k in ("state", "method_code", "code", "tables", "stack")} if host else {}),
                 **({f"m4f_{k}_bytes": getattr(arm, k) for k in ("state", "method_code", "code", "tables", "stack")} if arm else {}),
             }
@@ -153,6 +193,12 @@ def report(table: pd.DataFrame) -> str:
             + (f"; beyond: {beyond}." if beyond else ".")
         )
     lines.append(f"- C is {ratio.min():.3g} to {ratio.max():.3g} times as fast as Python, with guard, health and bands.")
+    known = double[double["onnxruntime_ns"].notna()]
+    if len(known):
+        times = known["onnxruntime_ns"] / known["c_method_ns"]
+        lines.append(
+            f"- Networks: C's method is {times.min():.3g} to {times.max():.3g} times as fast as onnxruntime's step, one thread each."
+        )
     for start, goal in GOALS.items():
         named = (double["family"] + "-" + double["variant"]).str.startswith(start)
         if named.any():
