@@ -1,0 +1,61 @@
+"""From a log to an estimator that runs, by the commands of docs/own_car.md and those that the verdict names."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from conftest import planar_drive
+from place import run_vehest
+
+
+@pytest.fixture
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Four minutes of a simulated car in a logger's dress, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
+        monkeypatch.delenv(name, raising=False)
+    drive = planar_drive(240.0, 50.0, seed=5, noise=0.02)
+    beta = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]))
+    columns = {"Time": drive.time, "Speed": 3.6 * drive["vx"], "GyroZ": np.degrees(drive["yaw_rate"])}
+    columns |= {"AccX": drive["ax"] / 9.80665, "AccY": drive["ay"] / 9.80665, "Beta": beta}
+    pd.DataFrame(columns).to_csv(tmp_path / "lap.csv", index=False)
+    return tmp_path
+
+
+def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(log, capsys):
+    assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
+    file = log / "pipelines" / "my_car.yaml"
+    pipeline = yaml.safe_load(file.read_text(encoding="utf-8"))
+    assert pipeline["report"] == "own_car"
+    sweeps = pipeline["parts"]["all"]["sweeps"]
+    tuned = next(sweep for sweep in sweeps if "training.start_from=pretrained" in sweep)
+    short = {name: part for name, part in pipeline["parts"].items() if name in ("minutes_1", "minutes_1_tuned")}
+    assert set(short) == {"minutes_1", "minutes_1_tuned"}
+    pipeline["parts"] = {"all": {**pipeline["parts"]["all"], "sweeps": [sweeps[0], tuned]}, **short}  # for the sake of time
+    file.write_text(yaml.safe_dump(pipeline), encoding="utf-8")
+
+    code, out, err = run_vehest(capsys, "run", "my_car", "--minutes", "60", "tracking=none", "--jobs", "1", "training.max_epochs=3")
+    assert code == 0, err
+    said = out[out.index("FVU") :]
+    assert re.search(r"Use |can be called best|Nothing beats|cannot rank estimators", said)
+    report = (next((log / "outputs" / "report").iterdir()) / "report.md").read_text(encoding="utf-8")
+    assert report.index("## Verdict") < report.index("## How much reference is needed") < report.index("## Test set `test`")
+    assert "lacks" in report, "families that were not compared are named"
+
+    estimate = re.search(r"vehest estimate (\S+) YOUR_LOG.csv", said)
+    assert estimate is not None, said
+    code, out, err = run_vehest(capsys, "estimate", estimate[1], "lap.csv", "dataset=my_car", "-o", "out.csv", "--json")
+    assert code == 0, err
+    assert json.loads(out)["estimated"] > 4000
+    assert np.isfinite(pd.read_csv(log / "out.csv")["sideslip"].iloc[60:]).all()
+    export = re.search(r"vehest export (\S+) -o (\S+)", said)
+    assert export is not None
+    assert run_vehest(capsys, "export", export[1], "-o", export[2])[0] == 0
+    assert {"main.c", "vehest_estimator.c", "vehest_method.c", "README.md"} <= {path.name for path in (log / export[2]).iterdir()}
