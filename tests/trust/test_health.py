@@ -19,7 +19,10 @@ from vehest.data.recording import Recording
 from vehest.data.schema import validated
 from vehest.sources.base import open_source
 from vehest.stages.config import compose_config
+from vehest.stages.downsample import transforms_of
 from vehest.trust import health_kernel as kernel
+from vehest.trust.front_end import FrontEnd
+from vehest.trust.guard import usual_limits
 from vehest.trust.health import (
     DEGRADED,
     HOLD_SECONDS,
@@ -269,3 +272,23 @@ def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
     half[400:] = 0.2
     frozen = judged(model, at_lock, steer=half)
     assert any(reason_kind(code) == kernel.FROZEN and reason_channel(code) == "steer" for code in frozen.reason[400:])
+
+
+def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged() -> None:
+    slow = RATE / 5.0
+    resampled = [
+        transform(measured_drive(number).select(CHANNELS))
+        for number in (0, 1, 2)
+        for transform in transforms_of({"rate_hz": slow, "method": "polyphase", "transforms": []})
+    ]
+    model = learn_health(resampled[:2], resampled[2:], CHANNELS, slow)
+    drive = measured_drive(3)
+    front = FrontEnd(CHANNELS, (), usual_limits(CHANNELS, slow), RATE, slow)
+    passed = [front(row[None]) for row in drive.stack(CHANNELS)]
+    rows = np.concatenate([row for row in passed if row is not None])
+    found = health_rows(model.packed(behind_front_end=True), rows, np.isfinite(rows), model.start())
+    assert (found.status > VALID).mean() < 0.02
+    frozen = rows.copy()
+    frozen[len(rows) // 2 :, 0] = frozen[len(rows) // 2, 0]
+    flagged = health_rows(model.packed(behind_front_end=True), frozen, np.isfinite(frozen), model.start())
+    assert (flagged.status[len(rows) // 2 + 20 :] > VALID).mean() > 0.9

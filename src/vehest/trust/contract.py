@@ -273,7 +273,8 @@ class GuardedStepper(Stepper):
         self._rate = rate if bus_rate_hz is None else bus_rate_hz
         self._guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
         self._watch = Watch(limits, estimator.warm_up_steps, rate)
-        self._monitor = Monitor(estimator, trust, elsewhere=elsewhere)
+        filtered = bus_rate_hz is not None and bus_rate_hz > rate * (1 + 1e-6)
+        self._monitor = Monitor(estimator, trust, elsewhere=elsewhere, behind_front_end=filtered)
         self._row, self._motion = np.empty((1, len(estimator.channels))), np.full((1, 3), np.nan)
         self._raw, self._vx, self._variance = np.empty(1), np.full(1, np.nan), np.full(1, np.nan)
         self._places = [estimator.channels.index(name) if name in estimator.channels else -1 for name in MOTION]

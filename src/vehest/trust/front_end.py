@@ -15,7 +15,35 @@ from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
 ORDER = 4
 CUTOFF = 0.4  # of the estimator's rate, below its Nyquist frequency
+NOISE_BAND = (0.3, 0.4)  # of the model's rate, where the density of a channel's noise is taken
+USUAL_RATIO = 5  # of a bus's rate over that of a model, as from 100 to 20 Hz
 SLACK = 1e-9
+
+
+def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
+    """What channels at the model's rate would look like behind the filter, had they come from a bus `USUAL_RATIO` times as fast.
+
+    They are brought to that rate without phase, then filtered causally and thinned out again; the filter starts as in a steady signal.
+    What lay above the model's Nyquist frequency is gone in them, and white noise of the density below it takes its place, since some of it
+    comes through the filter.
+
+    Args:
+        samples: (T, C); straight lines bridge NaN.
+        rate_hz: of the model [Hz].
+    """
+    at = np.arange(len(samples))
+    known = [np.isfinite(column) for column in samples.T]
+    full = [np.interp(at, at[own], column[own]) if own.any() else np.zeros(len(at)) for own, column in zip(known, samples.T, strict=True)]
+    together = np.stack(full, axis=1)
+    fast = signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
+    band = signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
+    density = signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (NOISE_BAND[1] - NOISE_BAND[0])
+    noise = np.sqrt(0.5 * USUAL_RATIO * density) * np.random.default_rng(0).standard_normal(fast.shape)
+    fast += signal.sosfilt(signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0)
+    sections = signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
+    start = signal.sosfilt_zi(sections)[:, :, None] * fast[0]
+    found = signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
+    return np.asarray(np.where(np.isnan(samples), np.nan, found), dtype=np.float64)
 
 
 class FrontEnd:

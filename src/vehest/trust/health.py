@@ -22,6 +22,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
+from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, stops_of
 from vehest.trust.health_kernel import N_FEATURES, N_FORMS, N_LEVELS, Layout, health_kernel, memory_sizes
 from vehest.trust.relations import (
@@ -184,6 +185,8 @@ class HealthModel:
         heaviest: weight that one sample may have in them.
         limits: of every statistic, in the order of `statistics`.
         stops: of each channel, between which alone it is expected to move.
+        limits_behind_front_end: the same limits for samples that a filter from a faster bus has passed (`vehest.trust.front_end`), which
+            are of another colour than in training.
     """
 
     channels: tuple[str, ...]
@@ -204,6 +207,7 @@ class HealthModel:
     heaviest: tuple[tuple[float, ...], ...] = ()
     limits: tuple[float, ...] = ()
     stops: tuple[tuple[float, float], ...] = ()
+    limits_behind_front_end: tuple[float, ...] = ()
 
     @property
     def layout(self) -> Layout:
@@ -247,12 +251,14 @@ class HealthModel:
         state[energy : energy + sizes[9]] = 1.0
         return state
 
-    def packed(self, *, forgets: bool = True) -> PackedHealth:
+    def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> PackedHealth:
         """Tables of the kernel.
 
         Args:
             forgets: whether the likelihood ratios do; if not, they are sums over all rows.
+            behind_front_end: whether rows come through the filter from a faster bus.
         """
+        own_limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
         layout, statistics, names = self.layout, self.statistics, list(self.channels)
         C, coefficients = layout.channels, np.array(self.coefficients)
         instant, average, rates = np.zeros((C, N_FEATURES)), np.zeros((layout.relations, N_FEATURES)), np.zeros(layout.relations)
@@ -269,7 +275,7 @@ class HealthModel:
         def forgetting(seconds: Sequence[float]) -> FloatArray:
             return 1.0 - np.exp(-step / np.array(seconds))
 
-        limits = np.array(self.limits or (math.inf,) * len(statistics))
+        limits = np.array(own_limits or (math.inf,) * len(statistics))
         numbers = [
             self.constant,
             coefficients.transpose(0, 2, 1),
@@ -391,7 +397,16 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
     found = _with_healthy(_with_healthy(found, train), train)
-    return replace(found, limits=limits_from(block_maxima(found, [*train, *validation]), found.statistics, 1.0 / rate_hz))
+    plain, statistics = block_maxima(found, [*train, *validation]), found.statistics
+    filtered = np.maximum(plain, block_maxima(found, [_filtered(recording, names) for recording in (*train, *validation)]))
+    limits, behind = (limits_from(maxima, statistics, 1.0 / rate_hz) for maxima in (plain, filtered))
+    return replace(found, limits=limits, limits_behind_front_end=behind)
+
+
+def _filtered(recording: Recording, names: Sequence[str]) -> Recording:
+    """A drive as it comes through the filter from a faster bus."""
+    rows = behind_front_end(recording.stack(names), recording.rate_hz)
+    return replace(recording.select(names), channels=dict(zip(names, rows.T, strict=True)))
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:

@@ -21,11 +21,12 @@ class Monitor:
         estimator: whose samples these are.
         trust: learnt with it; what it does not hold is not judged.
         elsewhere: whether the car or its tyres are others than those that were calibrated on.
+        behind_front_end: whether rows come through the filter from a faster bus.
     """
 
-    def __init__(self, estimator: Estimator, trust: Trust | None, *, elsewhere: bool = False) -> None:
+    def __init__(self, estimator: Estimator, trust: Trust | None, *, elsewhere: bool = False, behind_front_end: bool = False) -> None:
         bands, health = (trust.bands, trust.health) if trust is not None else (None, None)
-        self._health = health.packed() if health is not None else None
+        self._health = health.packed(behind_front_end=behind_front_end) if health is not None else None
         self._state = health.start() if health is not None else np.empty(0)
         self._bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
         self._farthest = bands.largest.get("vy", 0.0) if bands is not None else 0.0
