@@ -41,7 +41,6 @@ app = typer.Typer(
 data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings and channels.")
 app.add_typer(data_app, name="data")
 
-STARTED = time.monotonic()
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
@@ -1126,6 +1125,7 @@ def _run_pipeline(
     only_report: bool,
     minutes: float | None = None,
 ) -> None:
+    begun = time.monotonic()
     from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
 
     asked = Asked(("run", name, *overrides), tuple(overrides), name)
@@ -1150,7 +1150,7 @@ def _run_pipeline(
 
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "calibrate", "evaluate", "report"}
     with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
-        workshop.until = _until(minutes)
+        workshop.until = _until(minutes, begun)
         outcome, made = whole_way(workshop)
         _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})
         if made.failed is not None:
@@ -1159,12 +1159,17 @@ def _run_pipeline(
             remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
 
 
-def _until(minutes: float | None) -> float | None:
-    """When trainings have to end, as ``time.monotonic`` reads, so that the report is drawn in time."""
+def _until(minutes: float | None, begun: float) -> float | None:
+    """When trainings have to end, as ``time.monotonic`` reads, so that the report is drawn in time.
+
+    Args:
+        minutes: for all; none for no limit.
+        begun: when the command did.
+    """
     if minutes is None:
         return None
     seconds = 60.0 * minutes
-    return STARTED + seconds - min(max(30.0, 0.06 * seconds), 0.5 * seconds)
+    return begun + seconds - min(max(30.0, 0.06 * seconds), 0.5 * seconds)
 
 
 def _repeat(finished: Finished, *, dry_run: bool, quiet: bool) -> tuple[Path, Path | None]:
