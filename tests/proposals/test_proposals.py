@@ -294,3 +294,25 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log: st
     outcome = conclude(made, tuple(questions_of(examined)), force=False, dry_run=True)
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
     assert [row for row in rows_of(log, answers, outcome.as_plain()) if row["correct"] != "yes"] == []
+
+
+def test_a_log_that_counts_everything_the_other_way_keeps_its_signs_together(tmp_path) -> None:
+    table = -usual(drive())
+    table["Time [s]"] *= -1.0
+    found = proposed(write(tmp_path / "lap.csv", table))
+    signs = {name: one.sign for name, one in found.items()}
+    assert (signs["vx"], signs["ax"]) == (-1, -1)
+    assert len({signs[name] for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")}) == 1
+
+
+def test_steering_is_no_lateral_acceleration_however_well_it_agrees(tmp_path) -> None:
+    d = drive()
+    table = usual(d).drop(columns="LatAcc").assign(Steer=d["ay"] / 9.80665 + 0.02 * np.sin(d["t"]))
+    assert "ay" not in proposed(write(tmp_path / "lap.csv", table))
+    assert "yaw_rate" not in proposed(write(tmp_path / "no_gyro.csv", usual(d).drop(columns="Gyro")))
+
+
+def test_a_motion_that_contradicts_a_clear_name_is_asked(tmp_path) -> None:
+    table = usual(drive()).drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"})
+    found = proposed(write(tmp_path / "lap.csv", table))
+    assert (found["ay"].column, "name says otherwise" in found["ay"].asked) == ("LongAcc", True)

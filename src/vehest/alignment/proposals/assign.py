@@ -127,14 +127,20 @@ def _may_be_ax(column: Candidate) -> bool:
 
 
 def _search(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Search:
-    units, sign = turning.units, math.copysign(1.0, turning.correlation)
+    units, backwards = turning.units, _backwards(columns[turning.speed])
+    sign = math.copysign(1.0, turning.correlation) * backwards
     known = Known(
         rate_hz,
-        columns[turning.speed].values * factor_to_si(units.speed, "m/s"),
+        columns[turning.speed].values * backwards * factor_to_si(units.speed, "m/s"),
         columns[turning.yaw_rate].values * factor_to_si(units.yaw_rate, "rad/s"),
         np.empty(0) if turning.ay < 0 else sign * columns[turning.ay].values * factor_to_si(units.ay, "m/s²"),
     )
     return Search(columns, turning, known, {turning.speed, turning.yaw_rate, turning.ay} - {-1})
+
+
+def _backwards(speed: Candidate) -> int:
+    """-1 where a speed counts down as the car drives ahead."""
+    return -1 if float(np.median(speed.slow)) < 0.0 else 1
 
 
 def _rate_by_ax(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> float | None:
@@ -178,9 +184,9 @@ def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
     """Speed, yaw rate and lateral acceleration; a speed that is the mean of wheels is none of the file's."""
     turning, columns = search.turning, search.columns
     assert turning is not None
-    units, sign = turning.units, -1 if turning.correlation < 0.0 else 1
     speed, yaw_rate = columns[turning.speed], columns[turning.yaw_rate]
-    backwards = -1 if float(np.median(speed.slow)) < 0.0 else 1
+    units, backwards = turning.units, _backwards(speed)
+    sign = -backwards if turning.correlation < 0.0 else backwards
     if turning.ay < 0:
         asked = "" if units.decided else "unit: no lateral acceleration ties speed and yaw rate together"
         text = "its name and unit" if units.decided else "its name and size"
@@ -192,11 +198,15 @@ def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
     if units.mismatch >= FAR:
         asked = f"ay is {size:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
 
-    def own(column: Candidate, channel: str, unit: str, sign: int) -> Proposal:
-        return Proposal(column.name, channel, unit, sign, (text,), "" if column.unit and units.mismatch < FAR else asked)
+    def own(column: Candidate, role: str, channel: str, unit: str, sign: int) -> Proposal:
+        doubt = "" if column.unit and units.mismatch < FAR else asked
+        if column.hint(role) <= -roles.STRONG:
+            doubt = doubt or "the motion says so, its name says otherwise"
+        return Proposal(column.name, channel, unit, sign, (text,), doubt)
 
-    found = [own(yaw_rate, "yaw_rate", units.yaw_rate, 1), own(columns[turning.ay], "ay", units.ay, sign)]
-    return found if turning.speed in wheels.stand_in else [own(speed, "vx", units.speed, backwards), *found]
+    ay = columns[turning.ay]
+    found = [own(yaw_rate, roles.YAW_RATE, "yaw_rate", units.yaw_rate, 1), own(ay, roles.AY, "ay", units.ay, sign)]
+    return found if turning.speed in wheels.stand_in else [own(speed, roles.SPEED, "vx", units.speed, backwards), *found]
 
 
 def _signed(turning: Turning) -> float:
@@ -215,15 +225,16 @@ def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
         (turning.yaw_rate, roles.YAW_RATE, "yaw_rate", "rad/s", turning.units.yaw_rate),
     ):
         first = search.columns[place]
+        ahead = _backwards(first) if channel == "vx" else 1
         units = {k: _same_unit(search.columns[k], first, unit, si, role, channel) for k in search.free()}
-        same = [(search.columns[k], own, _sign(search.columns[k], first)) for k, own in units.items() if own]
+        same = [(search.columns[k], own, ahead * _sign(search.columns[k], first)) for k, own in units.items() if own]
         search.taken.update(k for k, own in units.items() if own)
         scaled = [k for k in search.free() if channel == "vx" and _is_scaled(search.columns[k], first)]
         if scaled and not same and place not in wheels.stand_in:
             search.taken.add(scaled[0])
             found += _scaled_speed(search.columns[scaled[0]], first, unit)
         if same:
-            found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, 1)]), *same], channel)
+            found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, ahead)]), *same], channel)
     if turning.ay >= 0:
         first = search.columns[turning.ay]
         search.taken.update(
@@ -243,7 +254,8 @@ def _is_scaled(column: Candidate, first: Candidate) -> bool:
 
 def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Proposal]:
     """The car's own speed in counts, and the reference's by which it is scaled."""
-    speed = first.slow * factor_to_si(unit, "m/s")
+    ahead = _backwards(first)
+    speed = first.slow * ahead * factor_to_si(unit, "m/s")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)
     asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{first.name}' is then the reference's"
     text = f"follows '{first.name}' ({correlation(column.slow, first.slow):.2f}), no unit of speed explains its scale"
@@ -253,7 +265,7 @@ def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Propos
             first.name,
             "vx_ref",
             unit,
-            1,
+            ahead,
             (f"'{column.name}' follows it",),
             f"the reference's speed, or the car's own ('{column.name}' in counts)",
         ),
@@ -335,7 +347,7 @@ def _one_sideslip(search: Search, found: dict[str, Proposal], fitting: list[Prop
         return fitting, ()
     by_name = {column.name: column for column in search.columns}
     speed = found.get("vx_ref", found["vx"])
-    velocity, forward = (by_name[one.column].slow * factor_to_si(one.unit, "m/s") for one in (own["vy_ref"], speed))
+    velocity, forward = (one.sign * by_name[one.column].slow * factor_to_si(one.unit, "m/s") for one in (own["vy_ref"], speed))
     moving = forward > 0.2 * forward.max()
     agreeing = correlation(np.arctan2(velocity, forward)[moving], by_name[own["sideslip_ref"].column].slow[moving])
     if abs(agreeing) >= SAME_ANGLE:
