@@ -316,3 +316,56 @@ def test_a_motion_that_contradicts_a_clear_name_is_asked(tmp_path) -> None:
     table = usual(drive()).drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"})
     found = proposed(write(tmp_path / "lap.csv", table))
     assert (found["ay"].column, "name says otherwise" in found["ay"].asked) == ("LongAcc", True)
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["10:59:30", "23:59:30", "2024-05-03T10:59:30", "2024-05-03 23:59:30", "3.5.2024 23:59:30"],
+    ids=lambda text: text.replace(":", "-"),
+)
+@pytest.mark.parametrize("zone", ["", "Z"])
+def test_times_of_a_clock_are_read(tmp_path, first: str, zone: str) -> None:
+    d = drive()
+    date, _, time = first.replace("T", " ").rpartition(" ")
+    begin = pd.Timestamp(f"2024-05-03 {time}")
+    stamps = begin + pd.to_timedelta(d["t"], unit="s")
+    how = {"": "%H:%M:%S.%f", "3.5.2024": "%d.%m.%Y %H:%M:%S.%f"}.get(
+        date, "%Y-%m-%dT%H:%M:%S.%f" if "T" in first else "%Y-%m-%d %H:%M:%S.%f"
+    )
+    table = usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=[stamp.strftime(how)[:-3] + zone for stamp in stamps])
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.rate_hz is None
+    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    assert recording.rate_hz == pytest.approx(50.0)
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
+
+
+@pytest.mark.parametrize("mark", ["-", "---", "n.a.", "#N/A", "?"])
+def test_marks_of_missing_samples_are_bridged(tmp_path, mark: str) -> None:
+    d = drive()
+    table = usual(d)
+    table.loc[1000:1010, "LatAcc"] = np.nan
+    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table, na_rep=mark)])
+    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    assert np.isfinite(recording["ay"]).all()
+    np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
+
+
+def test_whole_nanoseconds_since_1970_are_read(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"Time [s]": "stamp"})
+    table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
+    clock = survey(write(tmp_path / "lap.csv", table)).clock
+    assert clock is not None
+    assert (clock.column, clock.unit) == ("stamp", "ns")
+
+
+def test_a_time_that_is_no_clock_is_said(tmp_path) -> None:
+    table = usual(drive()).sample(frac=1.0, random_state=0)
+    said = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert any("'Time [s]' as the time: it goes backwards" in note and "sort the rows" in note for note in said)
+
+
+def test_a_column_without_a_name_is_said(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"Beta": ""})
+    assert "not read: column 7 has no name" in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
