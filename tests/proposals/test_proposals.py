@@ -369,3 +369,48 @@ def test_a_time_that_is_no_clock_is_said(tmp_path) -> None:
 def test_a_column_without_a_name_is_said(tmp_path) -> None:
     table = usual(drive()).rename(columns={"Beta": ""})
     assert "not read: column 7 has no name" in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+
+
+def test_without_lateral_acceleration_the_longitudinal_one_tells_the_unit_of_the_speed(tmp_path) -> None:
+    found = proposed(write(tmp_path / "lap.csv", usual(drive()).drop(columns="LatAcc")))
+    assert (found["vx"].column, found["vx"].unit) == ("Speed", "km/h")
+    assert (found["ax"].column, found["ax"].unit) == ("LongAcc", "g")
+
+
+def test_an_angle_beyond_what_a_car_can_do_is_left_out_and_said(tmp_path) -> None:
+    table = usual(drive()).assign(**{"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6})
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    assert "roll" not in examined.proposals.by_channel
+    assert any("'roll (rad)' is named as roll" in note and "left out" in note for note in examined.proposals.notes)
+
+
+def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
+    first, second = usual(drive(seed=1)), usual(drive(100.0, seed=2))
+    second["Speed"] /= 3.6
+    examined = examine("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
+    remarks = draft(examined, examined.proposals, Vehicle()).remarks
+    assert any(one.check == "unit" and one.message.startswith("in 'lap_2', ay is 3.6") for one in remarks)
+
+
+@pytest.mark.parametrize(
+    ("options", "columns", "said"),
+    [
+        ({"sep": ";"}, {}, "has delimiter ';'"),
+        ({}, {"Time [s]": "Time [ms]"}, r"the times 'Time \[ms\]' in ms"),
+        ({}, {"LongAcc": "Acc"}, "has no column 'LongAcc'"),
+    ],
+)
+def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, options: dict[str, str], columns: dict[str, str], said: str) -> None:
+    files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1)))]
+    table = usual(drive(100.0, seed=2))
+    table["Time [s]"] *= 1000.0 if "Time [s]" in columns else 1.0
+    with pytest.raises(DataError, match=said):
+        examine("my_car", [*files, write(tmp_path / "lap_2.csv", table.rename(columns=columns), **options)])
+
+
+def test_a_mark_in_the_second_file_alone_is_read(tmp_path) -> None:
+    second = usual(drive(100.0, seed=2))
+    second.loc[10:12, "LatAcc"] = np.nan
+    files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", second, na_rep="-")]
+    examined = examine("my_car", files)
+    assert len(draft(examined, examined.proposals, Vehicle()).contents) == 2

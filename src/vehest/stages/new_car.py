@@ -46,6 +46,10 @@ CLOCKWISE = {"vbo": "heading"}
 """Source -> column that counts a heading clockwise by its format."""
 WEST_POSITIVE = ("vbo",)
 TABLES = ("tabular", "text_log")
+LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
+"""Options that say how a table is laid out, with what holds where they are not said."""
+CONTRADICTIONS = ("sign", "unit", "impossible")
+"""Checks that say that a file's columns are others than those of the longest."""
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 
@@ -119,10 +123,12 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
     if not files:
         raise ConfigurationError("name the files: vehest new my_car lap*.csv")
     logs = tuple(survey(file) for file in files)
-    formats = {log.source for log in logs}
+    formats = {"text" if log.source in TABLES and not _is_parquet(log.file) else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
     longest = max(logs, key=_length)
+    _refuse_other_layouts(longest, logs)
+    longest = replace(longest, **_in_common(longest, logs))
     columns, rate, seconds = evidence_of(longest)
     proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
     if longest.source not in TABLES:  # other sources make no reference of positions
@@ -137,8 +143,36 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
         names = ", ".join(column.name for column in longest.columns[:8])
         raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
     constant = not longest.has_clock
-    first = (longest, *(log for log in logs if log is not longest))
+    first = (longest, *(log for log in logs if log.file != longest.file))
     return Examined(name, first, proposals, located(files, longest.source), proposals.rate_hz if constant else None, seconds)
+
+
+def _refuse_other_layouts(longest: Log, logs: Sequence[Log]) -> None:
+    """See that one description fits all files.
+
+    Raises:
+        DataError: one is written otherwise, or has other times.
+    """
+    for log in logs:
+        for key, default in LAYOUT.items():
+            own, other = log.options.get(key, default), longest.options.get(key, default)
+            if own != other:
+                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {other!r}; write both alike, or make a data set of each")
+        clocks = [None if one.clock is None else (one.clock.column, one.clock.unit) for one in (log, longest)]
+        if clocks[0] != clocks[1]:
+            told = ["no column of times" if clock is None else f"the times '{clock[0]}' in {clock[1]}" for clock in clocks]
+            raise DataError(f"'{log.file}' has {told[0]}, '{longest.file}' {told[1]}; write both alike, or make a data set of each")
+
+
+def _in_common(longest: Log, logs: Sequence[Log]) -> dict[str, Any]:
+    """Source and options that read all files: marks of missing samples of any, times that restart in any."""
+    options = dict(longest.options)
+    marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
+    options |= {"missing": marks} if marks else {}
+    if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
+        options["time_restarts"] = True
+    source = "text_log" if any(log.source == "text_log" for log in logs) else longest.source
+    return {"options": options, "source": source}
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
@@ -308,11 +342,27 @@ def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle) -> Draft:
         dataset,
         late,
         tuple(contents_of(own) for own in recordings),
-        tuple(findings),
+        (*findings, *_of_other_files(recordings, longest)),
         ratio,
         tuple(notes),
         sum(own.duration for own in recordings),
     )
+
+
+def _of_other_files(recordings: Sequence[Recording], longest: Recording) -> list[Finding]:
+    """What contradicts the proposals in the longest recording of each file that they were not made of."""
+    by_file: dict[str, Recording] = {}
+    for own in recordings:
+        file = str(own.provenance.get("file", ""))
+        if file not in by_file or own.duration > by_file[file].duration:
+            by_file[file] = own
+    others = [own for file, own in by_file.items() if file != str(longest.provenance.get("file", ""))]
+    return [
+        replace(one, message=f"in '{own.id}', {one.message}")
+        for own in others
+        for one in checks_of_recording(own)
+        if one.check in CONTRADICTIONS
+    ]
 
 
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
@@ -468,9 +518,9 @@ def _transforms(
     if offsets and not any(one.column.startswith("/") for one in proposals.channels if one.offset):
         made.append({"name": "offset_correction", "offsets": offsets})
     made += _speed(proposals)
-    if "sideslip_ref" in channels and "vy_ref" not in channels:
+    if "sideslip_ref" in channels and "vy_ref" not in channels and {"vx", "vx_ref"} & channels:
         made.append({"name": "velocity_from_sideslip"})
-    if "ax" not in channels:
+    if "ax" not in channels and "vx" in channels:
         usual = rate_hz > 10.0
         made.append({"name": "acceleration_from_speed"} | ({} if usual else {"cutoff_hz": 0.2 * rate_hz}))
     told = vehicle.steering_ratio or (ratio[0] if ratio else None)

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from vehest.alignment.proposals import names as roles
 from vehest.alignment.proposals.agreement import (
     HAND_WHEEL,
+    LARGEST,
     ROAD_WHEEL,
     Agreement,
     Known,
@@ -21,13 +22,14 @@ from vehest.alignment.proposals.agreement import (
     slope_of_steering,
     steering,
 )
-from vehest.alignment.proposals.by_name import named_channels
+from vehest.alignment.proposals.by_name import TOLD, named_channels
 from vehest.alignment.proposals.columns import Candidate, candidates, correlation, slow_of
 from vehest.alignment.proposals.poses import find_pose
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.turning import FAR, Turning, find_turning, turning_by_names
+from vehest.alignment.proposals.turning import CLOSE, FAR, RARE, UNITS, Turning, find_turning, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, wheel_proposals, with_wheels_for_speed
 from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
 from vehest.data.units import factor_to_si
 
 SAME = {"vx": 0.97, "yaw_rate": 0.97}  # correlation of one quantity measured twice
@@ -43,6 +45,7 @@ RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 40
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 FEWEST = 50  # samples of a course
+MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 ACCELERATIONS, ANGLES = ("m/s²", "g"), ("rad", "deg")
 
 
@@ -93,6 +96,7 @@ def propose(
     if not {"vy_ref", "sideslip_ref"} & set(proposals.by_channel):
         proposals = replace(proposals, pose=find_pose(search.columns, search.known))
     proposals = _left_and_right(proposals, search, wheels, _compasses(search, compass, west_positive))
+    proposals = _possible(proposals, search.columns)
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, _, _ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -111,9 +115,24 @@ def _best(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: flo
         return Search(columns, None, None)
     if not turning:
         named = turning_by_names(columns)
-        return Search(columns, None, None) if named is None else _search(columns, named, rate_hz)
+        return Search(columns, None, None) if named is None else _search(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
     near = [one for one in turning if one.score > turning[0].score - 4.0]
     return _search(columns, max(near, key=support) if len(near) > 1 else near[0], rate_hz)
+
+
+def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
+    """The same with the speed's unit by d(vx)/dt, where a column that is named as longitudinal acceleration tells it."""
+    if columns[named.speed].unit:
+        return named
+    told: list[tuple[float, str]] = []
+    for unit in UNITS[roles.SPEED]:
+        search = _search(columns, replace(named, units=replace(named.units, speed=unit)), rate_hz)
+        assert search.known is not None
+        for column in (columns[k] for k in search.free() if roles.AX in columns[k].hints and _may_be_ax(columns[k])):
+            found = longitudinal(search.known, column, [column.unit] if column.unit else ACCELERATIONS)
+            told += [(one.mismatch + RARE.get(unit, 0.0), unit) for one in found if one.strength >= CLEAR]
+    best = min(told, default=(math.inf, ""))
+    return replace(named, units=replace(named.units, speed=best[1])) if best[0] < CLOSE else named
 
 
 def _stands(columns: Sequence[Candidate]) -> bool:
@@ -178,6 +197,23 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     gappy = {column.name for column in search.columns if column.missing > 0.0}
     channels = tuple(replace(one, gappy=one.column in gappy) for one in found.values())
     return Proposals(channels, wheel_radius=radius, notes=notes)
+
+
+def _possible(proposals: Proposals, columns: Sequence[Candidate]) -> Proposals:
+    """Without what names alone tell and no vehicle can do; what the motion tells is asked there."""
+    by_name = {column.name: column for column in columns}
+    kept, notes = [], list(proposals.notes)
+    for one in proposals.channels:
+        told, column = CHANNELS[one.channel], by_name[one.column]
+        samples = one.sign * one.factor * factor_to_si(one.unit, told.unit) * (column.values - one.offset)
+        beyond = float(np.mean((samples < told.low) | (samples > told.high)))
+        if beyond > MOST_BEYOND and one.channel in TOLD:
+            size = f"up to {float(np.abs(samples).max()):.3g} {told.unit} where {told.low:.3g} to {told.high:.3g} are possible"
+            notes.append(f"'{one.column}' is named as {one.channel}, but shows {size}; it is left out")
+            continue
+        doubt = one.asked or f"{100.0 * beyond:.2g} % of its samples are beyond what a vehicle can do in {one.unit}"
+        kept.append(replace(one, asked=doubt) if beyond > MOST_BEYOND else one)
+    return replace(proposals, channels=tuple(kept), notes=tuple(notes))
 
 
 def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
@@ -463,7 +499,8 @@ def _as_steering(search: Search, column: Candidate) -> tuple[float, Proposal] | 
         largest = "no angle of the road wheels or of a steering wheel by its range and slow corners; its scale is to be given"
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         offset = straight if abs(straight) > CENTRED * spread else 0.0
-        proposal = Proposal(column.name, ROAD_WHEEL, "rad", sign, text, largest, offset=offset)
+        steered = [unit for unit in ([column.unit] if column.unit else ANGLES) if spread * factor_to_si(unit, "rad") <= LARGEST[ROAD_WHEEL]]
+        proposal = Proposal(column.name, ROAD_WHEEL, (steered or ["rad"])[0], sign, text, largest, offset=offset)
         return score, proposal
     best = min(found, key=lambda one: _oddness(one.length, one.channel))
     unclear = {(one.channel, one.unit) for one in found} - {(best.channel, best.unit)}
