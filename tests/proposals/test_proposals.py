@@ -414,3 +414,33 @@ def test_a_mark_in_the_second_file_alone_is_read(tmp_path) -> None:
     files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", second, na_rep="-")]
     examined = examine("my_car", files)
     assert len(draft(examined, examined.proposals, Vehicle()).contents) == 2
+
+
+def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path) -> None:
+    table = usual(drive()).assign(rate_from_yaw=np.degrees(drive()["r"]) + 0.01)
+    found = proposed(write(tmp_path / "lap.csv", table.rename(columns={"rate_from_yaw": "yaw_rate_from_yaw"})))
+    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
+    assert not found["yaw_rate"].asked
+
+
+def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
+    table = usual(drive())
+    table["Gyro"] = np.repeat(table["Gyro"].to_numpy()[::10], 10)
+    notes = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert any(note.startswith("'Gyro': a new value in one of 10 rows") and "held" in note for note in notes)
+    assert not examine("my_car", [write(tmp_path / "plain.csv", usual(drive()))]).proposals.notes
+
+
+def test_a_pose_that_does_not_follow_the_motion_is_told_of(tmp_path) -> None:
+    random = np.random.default_rng(0)
+    walk = {name: random.standard_normal(6000).cumsum() for name in ("pose_x", "pose_y", "pose_yaw")}
+    proposals = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta").assign(**walk))]).proposals
+    assert not proposals.pose
+    assert any("no reference is made of 'pose_x', 'pose_y', 'pose_yaw'" in note for note in proposals.notes)
+
+
+def test_a_car_that_stands_all_the_time_is_told_of(tmp_path) -> None:
+    random = np.random.default_rng(0)
+    names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
+    table = pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
+    assert any("stands all the time" in note for note in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)

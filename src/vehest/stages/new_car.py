@@ -7,7 +7,7 @@ out is read again as `vehest ingest` would read it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,8 @@ CLOCKWISE = {"vbo": "heading"}
 """Source -> column that counts a heading clockwise by its format."""
 WEST_POSITIVE = ("vbo",)
 TABLES = ("tabular", "text_log")
+FEWEST_CHANGES = 50
+LEAST_REPEATED = 3.0  # rows with the same sample
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
 """Options that say how a table is laid out, with what holds where they are not said."""
 CONTRADICTIONS = ("sign", "unit", "impossible")
@@ -138,7 +140,7 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
         missing = sorted(used - {column.name for column in log.columns})
         if missing:
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *_held_notes(longest, used)))
     if not proposals.channels:
         names = ", ".join(column.name for column in longest.columns[:8])
         raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
@@ -189,6 +191,27 @@ def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
                 )
                 break
     return tuple(notes)
+
+
+def _held_notes(log: Log, used: Collection[str]) -> list[str]:
+    """Columns whose samples rows repeat, beside others that change in every row."""
+    if log.seconds is None or len(log.seconds) < 2:
+        return []
+    run = log.runs[0]
+    repeats = {}
+    for column in log.columns:
+        values = column.values[run]
+        changes = int(np.count_nonzero(np.diff(values[np.isfinite(values)])))
+        repeats[column.name] = len(values) / changes if changes > FEWEST_CHANGES else math.inf
+    held = [name for name in repeats if name in used and LEAST_REPEATED <= repeats[name] < math.inf]
+    if not held or min(repeats.values()) > 1.5:
+        return []
+    rate, often = _rate(log.seconds[run]), min(repeats[name] for name in held)
+    listed = ", ".join(f"'{name}'" for name in held)
+    return [
+        f"{listed}: a new value in one of {often:.2g} rows or fewer, {rate / often:.2g} Hz of {rate:.4g}; if rows repeat old samples "
+        "there, declare them under held"
+    ]
 
 
 def _length(log: Log) -> float:

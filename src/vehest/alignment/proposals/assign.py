@@ -12,7 +12,6 @@ from scipy.optimize import linear_sum_assignment
 from vehest.alignment.proposals import names as roles
 from vehest.alignment.proposals.agreement import (
     HAND_WHEEL,
-    LARGEST,
     ROAD_WHEEL,
     Agreement,
     Known,
@@ -24,7 +23,7 @@ from vehest.alignment.proposals.agreement import (
 )
 from vehest.alignment.proposals.by_name import TOLD, named_channels
 from vehest.alignment.proposals.columns import Candidate, candidates, correlation, slow_of
-from vehest.alignment.proposals.poses import find_pose
+from vehest.alignment.proposals.poses import find_pose, named_pose
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.alignment.proposals.turning import CLOSE, FAR, RARE, UNITS, Turning, find_turning, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, wheel_proposals, with_wheels_for_speed
@@ -95,6 +94,12 @@ def propose(
     proposals = _assigned(search, wheels, rate)
     if not {"vy_ref", "sideslip_ref"} & set(proposals.by_channel):
         proposals = replace(proposals, pose=find_pose(search.columns, search.known))
+        named = [one.name for one in named_pose(search.columns) if one is not None]
+        if len(named) == 3 and not proposals.pose:
+            text = f"no reference is made of '{', '.join(named)}'".replace(", ", "', '")
+            proposals = replace(proposals, notes=(*proposals.notes, f"{text}: their derivatives are not the speed and the yaw rate"))
+    if _stands(search.columns):
+        proposals = replace(proposals, notes=(*proposals.notes, "the car stands all the time, by its speed; names alone tell its columns"))
     proposals = _left_and_right(proposals, search, wheels, _compasses(search, compass, west_positive))
     proposals = _possible(proposals, search.columns)
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
@@ -499,7 +504,9 @@ def _as_steering(search: Search, column: Candidate) -> tuple[float, Proposal] | 
         largest = "no angle of the road wheels or of a steering wheel by its range and slow corners; its scale is to be given"
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         offset = straight if abs(straight) > CENTRED * spread else 0.0
-        steered = [unit for unit in ([column.unit] if column.unit else ANGLES) if spread * factor_to_si(unit, "rad") <= LARGEST[ROAD_WHEEL]]
+        steered = [
+            unit for unit in ([column.unit] if column.unit else ANGLES) if spread * factor_to_si(unit, "rad") <= CHANNELS[ROAD_WHEEL].high
+        ]
         proposal = Proposal(column.name, ROAD_WHEEL, (steered or ["rad"])[0], sign, text, largest, offset=offset)
         return score, proposal
     best = min(found, key=lambda one: _oddness(one.length, one.channel))
