@@ -444,3 +444,24 @@ def test_a_car_that_stands_all_the_time_is_told_of(tmp_path) -> None:
     names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
     table = pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
     assert any("stands all the time" in note for note in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)
+
+
+def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> None:
+    d = drive()
+    table = usual(d)
+    table.loc[[2000, 2001], "Speed"] = 9999.0
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    made = draft(examined, examined.proposals, Vehicle())
+    assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
+    assert any("data rows 2001, 2002" in note for note in made.notes)
+    recording = open_source(made.dataset).read("lap")
+    assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
+
+
+def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path) -> None:
+    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
+    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
+    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
+    assert "roll" in proposed(first)
+    assert "roll" not in examine("my_car", [first, second]).proposals.by_channel

@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.alignment.align import align
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.findings import Finding
-from vehest.alignment.proposals.assign import propose
+from vehest.alignment.proposals.assign import possible, propose
 from vehest.alignment.proposals.lateness import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.alignment.settings import AlignmentSettings
@@ -46,6 +47,7 @@ CLOCKWISE = {"vbo": "heading"}
 """Source -> column that counts a heading clockwise by its format."""
 WEST_POSITIVE = ("vbo",)
 TABLES = ("tabular", "text_log")
+MOST_STRAY = 0.002  # of the rows
 FEWEST_CHANGES = 50
 LEAST_REPEATED = 3.0  # rows with the same sample
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
@@ -140,6 +142,10 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
         missing = sorted(used - {column.name for column in log.columns})
         if missing:
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
+    for log in logs:
+        if log.file != longest.file:
+            proposals = possible(proposals, {column.name: column.values for column in log.columns})
+    used = {one.column for one in proposals.channels}
     proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *_held_notes(longest, used)))
     if not proposals.channels:
         names = ", ".join(column.name for column in longest.columns[:8])
@@ -345,6 +351,9 @@ def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle) -> Draft:
     longest = max(_recordings(plain), key=lambda own: own.duration)
     late, findings = late_channels(longest), checks_of_recording(longest)
     ratio, notes = None, list(proposals.notes)
+    for stem, rows in dict(dataset.get("drop_rows") or {}).items():
+        listed = ", ".join(map(str, rows[:MOST_SKIPPED])) + (", …" if len(rows) > MOST_SKIPPED else "")
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data row{'s' * (len(rows) > 1)} {listed}")
     if vehicle.wheelbase and vehicle.steering_ratio is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle.wheelbase))["steering_ratio"]
@@ -418,7 +427,9 @@ def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
         common["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         if log.clock is None:
             common["rate_hz"] = examined.rate_hz
-    common["clock"] = _policy(examined, len(channels))
+    stray = _stray_rows(examined, proposals) if log.source in TABLES and log.clock is not None else {}
+    common |= {"drop_rows": {stem: rows.tolist() for stem, rows in stray.items()}} if stray else {}
+    common["clock"] = _policy(examined, len(channels), stray)
     gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
     short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
     if short and log.source in TABLES and not _is_parquet(log.file):
@@ -431,6 +442,19 @@ def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
         made = [name for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref") if name not in channels]
         common["pose"] = {**parts, "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5), "order": 2, "channels": made}
     return common
+
+
+def _stray_rows(examined: Examined, proposals: Proposals) -> dict[str, NDArray[np.int64]]:
+    """File's stem -> rows, from 1, in which a channel is beyond what a vehicle can do, where they are few, as spikes are."""
+    found = {}
+    for log in examined.logs:
+        columns = {column.name: column.values for column in log.columns}
+        beyond = np.zeros(len(next(iter(columns.values()))), dtype=bool)
+        for one in proposals.channels:
+            beyond |= one.beyond(columns[one.column])
+        if 0.0 < beyond.mean() <= MOST_STRAY:
+            found[log.file.stem] = np.flatnonzero(beyond) + 1
+    return found
 
 
 def _is_parquet(file: Path) -> bool:
@@ -459,15 +483,17 @@ def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
     return entry | ({"factor": one.factor} if one.factor != 1.0 else {})
 
 
-def _policy(examined: Examined, n_channels: int) -> ClockPolicy:
-    """The strictest clock that all runs of all files keep."""
+def _policy(examined: Examined, n_channels: int, stray: Mapping[str, NDArray[np.int64]]) -> ClockPolicy:
+    """The strictest clock that all runs of all files keep, without the rows that are left out."""
     for policy in POLICIES if examined.log.source != "vbo" else POLICIES[:2]:
         try:
             for log in examined.logs:
                 for run in log.runs if log.seconds is not None else ():
                     assert log.seconds is not None
-                    if run.stop - run.start > 1:
-                        uniform_clock(log.seconds[run], f"'{log.file}'", policy, n_channels=n_channels)
+                    left_out = stray.get(log.file.stem, np.empty(0, dtype=np.int64)) - 1
+                    rows = np.setdiff1d(np.arange(run.start, run.stop), left_out)
+                    if len(rows) > 1:
+                        uniform_clock(log.seconds[rows], f"'{log.file}'", policy, n_channels=n_channels)
             return policy
         except DataError:
             continue

@@ -219,6 +219,7 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
         "files": "which files in path; the file's stem names the recording",
         "time": "its unit: s, ms, us or ns" if made.examined.log.clock else "no column of times",
         "rate_hz": "sampling rate [Hz]",
+        "drop_rows": "beyond what a vehicle can do",
         "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
         "gappy": "channels in which samples are missing",
         "channels": "sign: -1 where a column counts the other way than ISO 8855 (x forward, y left)",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -101,7 +101,7 @@ def propose(
     if _stands(search.columns):
         proposals = replace(proposals, notes=(*proposals.notes, "the car stands all the time, by its speed; names alone tell its columns"))
     proposals = _left_and_right(proposals, search, wheels, _compasses(search, compass, west_positive))
-    proposals = _possible(proposals, search.columns)
+    proposals = possible(proposals, {column.name: column.values for column in search.columns})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, _, _ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -204,20 +204,24 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     return Proposals(channels, wheel_radius=radius, notes=notes)
 
 
-def _possible(proposals: Proposals, columns: Sequence[Candidate]) -> Proposals:
-    """Without what names alone tell and no vehicle can do; what the motion tells is asked there."""
-    by_name = {column.name: column for column in columns}
+def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
+    """Without what names alone tell and no vehicle can do; what the motion tells is asked there.
+
+    Args:
+        proposals: for a log.
+        columns: of that log, or of another one of the same car: name -> values, (T,).
+    """
     kept, notes = [], list(proposals.notes)
     for one in proposals.channels:
-        told, column = CHANNELS[one.channel], by_name[one.column]
-        samples = one.sign * one.factor * factor_to_si(one.unit, told.unit) * (column.values - one.offset)
-        beyond = float(np.mean((samples < told.low) | (samples > told.high)))
-        if beyond > MOST_BEYOND and one.channel in TOLD:
-            size = f"up to {float(np.abs(samples).max()):.3g} {told.unit} where {told.low:.3g} to {told.high:.3g} are possible"
-            notes.append(f"'{one.column}' is named as {one.channel}, but shows {size}; it is left out")
+        told, beyond = CHANNELS[one.channel], one.beyond(columns[one.column])
+        share = float(beyond.mean())
+        if share > MOST_BEYOND and one.channel in TOLD:
+            shown = f"{float(columns[one.column][int(np.argmax(beyond))]):.3g} {one.unit}"
+            text = f"'{one.column}' is named as {one.channel}, but shows {shown} (possible: {told.low:.3g} to {told.high:.3g} {told.unit})"
+            notes.append(f"{text}; it is left out")
             continue
-        doubt = one.asked or f"{100.0 * beyond:.2g} % of its samples are beyond what a vehicle can do in {one.unit}"
-        kept.append(replace(one, asked=doubt) if beyond > MOST_BEYOND else one)
+        doubt = one.asked or f"{100.0 * share:.2g} % of its samples are beyond what a vehicle can do in {one.unit}"
+        kept.append(replace(one, asked=doubt) if share > MOST_BEYOND else one)
     return replace(proposals, channels=tuple(kept), notes=tuple(notes))
 
 
