@@ -465,3 +465,10 @@ def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path) -
     second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
     assert "roll" in proposed(first)
     assert "roll" not in examine("my_car", [first, second]).proposals.by_channel
+
+
+def test_steering_and_yaw_rate_without_names_are_not_taken_for_yaw_rate_and_acceleration_unasked(tmp_path) -> None:
+    d = drive()
+    rate, wheelbase = 4.0 * d["r"], 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
+    table = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
+    assert {"a", "b", "c"} <= set(asked(write(tmp_path / "lap.csv", table)))

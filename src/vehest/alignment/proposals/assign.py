@@ -192,7 +192,7 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
             found[own.channel] = replace(found[own.channel], asked=own.asked or found[own.channel].asked, others=own.others)
         fitting, notes = _one_sideslip(search, found, _fitting(search))
         found |= {one.channel: one for one in fitting}
-        found = _paired(search, found, wheels)
+        found = _unconfirmed(search, _paired(search, found, wheels))
     if wheels:
         made, radius = wheel_proposals(search.columns, wheels, search.known, made_speed="vx" not in found)
         found |= {one.channel: one for one in made}
@@ -202,6 +202,25 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     gappy = {column.name for column in search.columns if column.missing > 0.0}
     channels = tuple(replace(one, gappy=one.column in gappy) for one in found.values())
     return Proposals(channels, wheel_radius=radius, notes=notes)
+
+
+def _unconfirmed(search: Search, found: dict[str, Proposal]) -> dict[str, Proposal]:
+    """The three of turning asked where no name or unit speaks for two of them, and nothing else agrees with them.
+
+    yaw_rate ≈ steer·vx / wheelbase looks like ay ≈ vx·yaw_rate in other units.
+    """
+    turning = search.turning
+    assert turning is not None
+    if turning.ay < 0:
+        return found
+    lateral = {roles.YAW_RATE: search.columns[turning.yaw_rate], roles.AY: search.columns[turning.ay]}
+    if any(column.unit or role in column.hints for role, column in lateral.items()):
+        return found
+    if any(name in found and not found[name].asked for name in ("ax", "vy_ref", "sideslip_ref")):
+        return found
+    doubt = "no name and no other column speaks for it: yaw rate and acceleration could be steering and yaw rate"
+    three = {search.columns[k].name for k in (turning.speed, turning.yaw_rate, turning.ay)}
+    return {name: replace(one, asked=one.asked or doubt) if one.column in three else one for name, one in found.items()}
 
 
 def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
