@@ -294,3 +294,181 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log: st
     outcome = conclude(made, tuple(questions_of(examined)), force=False, dry_run=True)
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
     assert [row for row in rows_of(log, answers, outcome.as_plain()) if row["correct"] != "yes"] == []
+
+
+def test_a_log_that_counts_everything_the_other_way_keeps_its_signs_together(tmp_path) -> None:
+    table = -usual(drive())
+    table["Time [s]"] *= -1.0
+    found = proposed(write(tmp_path / "lap.csv", table))
+    signs = {name: one.sign for name, one in found.items()}
+    assert (signs["vx"], signs["ax"]) == (-1, -1)
+    assert len({signs[name] for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")}) == 1
+
+
+def test_steering_is_no_lateral_acceleration_however_well_it_agrees(tmp_path) -> None:
+    d = drive()
+    table = usual(d).drop(columns="LatAcc").assign(Steer=d["ay"] / 9.80665 + 0.02 * np.sin(d["t"]))
+    assert "ay" not in proposed(write(tmp_path / "lap.csv", table))
+    assert "yaw_rate" not in proposed(write(tmp_path / "no_gyro.csv", usual(d).drop(columns="Gyro")))
+
+
+def test_a_motion_that_contradicts_a_clear_name_is_asked(tmp_path) -> None:
+    table = usual(drive()).drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"})
+    found = proposed(write(tmp_path / "lap.csv", table))
+    assert (found["ay"].column, "name says otherwise" in found["ay"].asked) == ("LongAcc", True)
+
+
+@pytest.mark.parametrize(
+    "first",
+    ["10:59:30", "23:59:30", "2024-05-03T10:59:30", "2024-05-03 23:59:30", "3.5.2024 23:59:30"],
+    ids=lambda text: text.replace(":", "-"),
+)
+@pytest.mark.parametrize("zone", ["", "Z"])
+def test_times_of_a_clock_are_read(tmp_path, first: str, zone: str) -> None:
+    d = drive()
+    date, _, time = first.replace("T", " ").rpartition(" ")
+    begin = pd.Timestamp(f"2024-05-03 {time}")
+    stamps = begin + pd.to_timedelta(d["t"], unit="s")
+    how = {"": "%H:%M:%S.%f", "3.5.2024": "%d.%m.%Y %H:%M:%S.%f"}.get(
+        date, "%Y-%m-%dT%H:%M:%S.%f" if "T" in first else "%Y-%m-%d %H:%M:%S.%f"
+    )
+    table = usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=[stamp.strftime(how)[:-3] + zone for stamp in stamps])
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.rate_hz is None
+    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    assert recording.rate_hz == pytest.approx(50.0)
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
+
+
+@pytest.mark.parametrize("mark", ["-", "---", "n.a.", "#N/A", "?"])
+def test_marks_of_missing_samples_are_bridged(tmp_path, mark: str) -> None:
+    d = drive()
+    table = usual(d)
+    table.loc[1000:1010, "LatAcc"] = np.nan
+    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table, na_rep=mark)])
+    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    assert np.isfinite(recording["ay"]).all()
+    np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
+
+
+def test_whole_nanoseconds_since_1970_are_read(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"Time [s]": "stamp"})
+    table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
+    clock = survey(write(tmp_path / "lap.csv", table)).clock
+    assert clock is not None
+    assert (clock.column, clock.unit) == ("stamp", "ns")
+
+
+def test_a_time_that_is_no_clock_is_said(tmp_path) -> None:
+    table = usual(drive()).sample(frac=1.0, random_state=0)
+    said = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert any("'Time [s]' as the time: it goes backwards" in note and "sort the rows" in note for note in said)
+
+
+def test_a_column_without_a_name_is_said(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"Beta": ""})
+    assert "not read: column 7 has no name" in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+
+
+def test_without_lateral_acceleration_the_longitudinal_one_tells_the_unit_of_the_speed(tmp_path) -> None:
+    found = proposed(write(tmp_path / "lap.csv", usual(drive()).drop(columns="LatAcc")))
+    assert (found["vx"].column, found["vx"].unit) == ("Speed", "km/h")
+    assert (found["ax"].column, found["ax"].unit) == ("LongAcc", "g")
+
+
+def test_an_angle_beyond_what_a_car_can_do_is_left_out_and_said(tmp_path) -> None:
+    table = usual(drive()).assign(**{"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6})
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    assert "roll" not in examined.proposals.by_channel
+    assert any("'roll (rad)' is named as roll" in note and "left out" in note for note in examined.proposals.notes)
+
+
+def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
+    first, second = usual(drive(seed=1)), usual(drive(100.0, seed=2))
+    second["Speed"] /= 3.6
+    examined = examine("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
+    remarks = draft(examined, examined.proposals, Vehicle()).remarks
+    assert any(one.check == "unit" and one.message.startswith("in 'lap_2', ay is 3.6") for one in remarks)
+
+
+@pytest.mark.parametrize(
+    ("options", "columns", "said"),
+    [
+        ({"sep": ";"}, {}, "has delimiter ';'"),
+        ({}, {"Time [s]": "Time [ms]"}, r"the times 'Time \[ms\]' in ms"),
+        ({}, {"LongAcc": "Acc"}, "has no column 'LongAcc'"),
+    ],
+)
+def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, options: dict[str, str], columns: dict[str, str], said: str) -> None:
+    files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1)))]
+    table = usual(drive(100.0, seed=2))
+    table["Time [s]"] *= 1000.0 if "Time [s]" in columns else 1.0
+    with pytest.raises(DataError, match=said):
+        examine("my_car", [*files, write(tmp_path / "lap_2.csv", table.rename(columns=columns), **options)])
+
+
+def test_a_mark_in_the_second_file_alone_is_read(tmp_path) -> None:
+    second = usual(drive(100.0, seed=2))
+    second.loc[10:12, "LatAcc"] = np.nan
+    files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", second, na_rep="-")]
+    examined = examine("my_car", files)
+    assert len(draft(examined, examined.proposals, Vehicle()).contents) == 2
+
+
+def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path) -> None:
+    table = usual(drive()).assign(rate_from_yaw=np.degrees(drive()["r"]) + 0.01)
+    found = proposed(write(tmp_path / "lap.csv", table.rename(columns={"rate_from_yaw": "yaw_rate_from_yaw"})))
+    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
+    assert not found["yaw_rate"].asked
+
+
+def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
+    table = usual(drive())
+    table["Gyro"] = np.repeat(table["Gyro"].to_numpy()[::10], 10)
+    notes = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert any(note.startswith("'Gyro': a new value in one of 10 rows") and "held" in note for note in notes)
+    assert not examine("my_car", [write(tmp_path / "plain.csv", usual(drive()))]).proposals.notes
+
+
+def test_a_pose_that_does_not_follow_the_motion_is_told_of(tmp_path) -> None:
+    random = np.random.default_rng(0)
+    walk = {name: random.standard_normal(6000).cumsum() for name in ("pose_x", "pose_y", "pose_yaw")}
+    proposals = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta").assign(**walk))]).proposals
+    assert not proposals.pose
+    assert any("no reference is made of 'pose_x', 'pose_y', 'pose_yaw'" in note for note in proposals.notes)
+
+
+def test_a_car_that_stands_all_the_time_is_told_of(tmp_path) -> None:
+    random = np.random.default_rng(0)
+    names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
+    table = pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
+    assert any("stands all the time" in note for note in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)
+
+
+def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> None:
+    d = drive()
+    table = usual(d)
+    table.loc[[2000, 2001], "Speed"] = 9999.0
+    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    made = draft(examined, examined.proposals, Vehicle())
+    assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
+    assert any("data rows 2001, 2002" in note for note in made.notes)
+    recording = open_source(made.dataset).read("lap")
+    assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
+
+
+def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path) -> None:
+    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
+    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
+    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
+    assert "roll" in proposed(first)
+    assert "roll" not in examine("my_car", [first, second]).proposals.by_channel
+
+
+def test_steering_and_yaw_rate_without_names_are_not_taken_for_yaw_rate_and_acceleration_unasked(tmp_path) -> None:
+    d = drive()
+    rate, wheelbase = 4.0 * d["r"], 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
+    table = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
+    assert {"a", "b", "c"} <= set(asked(write(tmp_path / "lap.csv", table)))

@@ -162,3 +162,20 @@ def test_files_beside_those_that_are_named_stay_out_of_the_data_set(tmp_path, ca
     code, out, _ = run_vehest(capsys, "data", "show", "my_car", "--json")
     assert code == 0
     assert [one["id"] for one in json.loads(out)["recordings"]] == ["run_1", "run_2"]
+
+
+def test_without_a_speed_no_pipeline_is_written_that_could_not_run(tmp_path, capsys, log) -> None:
+    write(tmp_path / "slow.csv", usual(drive()).drop(columns="Speed"))
+    code, out, _ = run_vehest(capsys, "new", "my_car", "slow.csv", "--yes")
+    assert code == 0
+    assert "vx is missing" in out
+    assert "vehest run" not in out
+    assert not Path(FILES[2]).exists()
+    assert run_vehest(capsys, "data", "check", "my_car")[0] == 0
+
+
+def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path, capsys, log) -> None:
+    write(tmp_path / "gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
+    code, out, err = run_vehest(capsys, "new", "my_car", "gyro.csv", "--yes")
+    assert (code, err) == (0, "")
+    assert "which lacks vx, ax, ay" in out

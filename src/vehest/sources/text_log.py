@@ -1,4 +1,5 @@
-"""Tables of text as loggers write them: a row of units below the names, cells that are empty where a slow signal has no sample.
+"""Tables of text as loggers write them: a row of units below the names, cells that are empty where a slow signal has no sample, marks for
+such cells, and times that are written as a clock's.
 
 All else is as in `vehest.sources.tabular`.
 """
@@ -18,11 +19,14 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.parquet import DAMAGE
 from vehest.data.text_files import first_line
+from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.table_rows import kept_rows
 from vehest.sources.tabular import TabularOptions, TabularSource
 from vehest.sources.text_tables import check_size, table_stream
 
 BLOCK = 1 << 22
+CLOCK = "clock"
+"""Unit of times that are written as a clock's."""
 LONGEST_BRIDGE = 10.0  # s
 
 
@@ -32,20 +36,27 @@ class TextLogOptions(TabularOptions):
 
     rows_below_names: int = 0
     bridge: float | None = None
+    missing: tuple[str, ...] = ()
 
 
 class TextLogSource(TabularSource):
     """Tables of text, a recording each.
 
-    Options: those of ``tabular``, ``rows_below_names``, lines between the names and the numbers, and ``bridge``, the longest time without a
-    sample that a straight line bridges [s]; at either end the nearest sample stands for it.
+    Options: those of ``tabular``, ``rows_below_names``, lines between the names and the numbers, ``bridge``, the longest time without a
+    sample that a straight line bridges [s]; at either end the nearest sample stands for it; and ``missing``, marks of cells without a
+    sample. The unit of ``time`` may be ``clock``: a time of day or a date with it.
     """
 
     options_type = TextLogOptions
-    keys = TabularSource.keys | {"rows_below_names", "bridge"}
+    keys = TabularSource.keys | {"rows_below_names", "bridge", "missing"}
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
-        super().__init__(dataset)
+        time = dataset.get("time")
+        written = isinstance(time, Mapping) and time.get("unit") == CLOCK
+        super().__init__({**dataset, "time": {**time, "unit": "s"}} if written and isinstance(time, Mapping) else dataset)
+        self.dataset = dict(dataset)
+        self.written_clock = self.time.column if written and self.time is not None else ""
+        self.missing = [str(mark) for mark in dataset.get("missing") or ()]
         self.below = int(dataset.get("rows_below_names", TextLogOptions.rows_below_names))
         if not 0 <= self.below <= 100:
             raise ConfigurationError(f"data set '{self.name}': rows_below_names must be a number of lines up to 100, not {self.below}")
@@ -63,19 +74,31 @@ class TextLogSource(TabularSource):
             encoding=str(self.dataset.get("encoding", "utf8")),
         )
         kinds = pc.ConvertOptions(
-            column_types=dict.fromkeys(wanted, pa.float64()), include_columns=wanted, decimal_point=str(self.dataset.get("decimal", "."))
+            column_types={name: pa.string() if name == self.written_clock else pa.float64() for name in wanted},
+            include_columns=wanted,
+            decimal_point=str(self.dataset.get("decimal", ".")),
+            null_values=[*pc.ConvertOptions().null_values, *self.missing],
         )
         try:
             with table_stream(file) as stream:
                 table = pc.read_csv(stream, options, pc.ParseOptions(delimiter=str(self.dataset.get("delimiter", ","))), kinds)
         except DAMAGE as error:
             raise DataError(f"'{file}' cannot be read as a table of numbers ({printable(first_line(error))})") from None
-        values = {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in wanted}
+        values = {name: self._numbers(table, name, file) for name in wanted}
         dropped = self.dropped.get(file.stem)
         if dropped is not None:
             kept = kept_rows(len(next(iter(values.values()))), dropped, file)
             values = {name: samples[kept] for name, samples in values.items()}
         return values if self.bridge is None else self._bridged(values, self.bridge)
+
+    def _numbers(self, table: pa.Table, name: str, file: Path) -> FloatArray:
+        column = table.column(name)
+        if name != self.written_clock:
+            return np.asarray(column.to_numpy(), dtype=np.float64)
+        seconds = seconds_of_text(column)
+        if seconds is None:
+            raise DataError(f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or 2024-05-03T10:59:30.25")
+        return seconds
 
     def _bridged(self, values: dict[str, FloatArray], longest: float) -> dict[str, FloatArray]:
         """Without gaps that are short enough."""

@@ -7,17 +7,18 @@ out is read again as `vehest ingest` would read it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.alignment.align import align
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.findings import Finding
-from vehest.alignment.proposals.assign import propose
+from vehest.alignment.proposals.assign import possible, propose
 from vehest.alignment.proposals.lateness import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.alignment.settings import AlignmentSettings
@@ -46,6 +47,13 @@ CLOCKWISE = {"vbo": "heading"}
 """Source -> column that counts a heading clockwise by its format."""
 WEST_POSITIVE = ("vbo",)
 TABLES = ("tabular", "text_log")
+MOST_STRAY = 0.002  # of the rows
+FEWEST_CHANGES = 50
+LEAST_REPEATED = 3.0  # rows with the same sample
+LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
+"""Options that say how a table is laid out, with what holds where they are not said."""
+CONTRADICTIONS = ("sign", "unit", "impossible")
+"""Checks that say that a file's columns are others than those of the longest."""
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 
@@ -119,10 +127,12 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
     if not files:
         raise ConfigurationError("name the files: vehest new my_car lap*.csv")
     logs = tuple(survey(file) for file in files)
-    formats = {log.source for log in logs}
+    formats = {"text" if log.source in TABLES and not _is_parquet(log.file) else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
     longest = max(logs, key=_length)
+    _refuse_other_layouts(longest, logs)
+    longest = replace(longest, **_in_common(longest, logs))
     columns, rate, seconds = evidence_of(longest)
     proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
     if longest.source not in TABLES:  # other sources make no reference of positions
@@ -132,13 +142,45 @@ def examine(name: str, files: Sequence[Path]) -> Examined:
         missing = sorted(used - {column.name for column in log.columns})
         if missing:
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    for log in logs:
+        if log.file != longest.file:
+            proposals = possible(proposals, {column.name: column.values for column in log.columns})
+    used = {one.column for one in proposals.channels}
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *_held_notes(longest, used)))
     if not proposals.channels:
         names = ", ".join(column.name for column in longest.columns[:8])
         raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
     constant = not longest.has_clock
-    first = (longest, *(log for log in logs if log is not longest))
+    first = (longest, *(log for log in logs if log.file != longest.file))
     return Examined(name, first, proposals, located(files, longest.source), proposals.rate_hz if constant else None, seconds)
+
+
+def _refuse_other_layouts(longest: Log, logs: Sequence[Log]) -> None:
+    """See that one description fits all files.
+
+    Raises:
+        DataError: one is written otherwise, or has other times.
+    """
+    for log in logs:
+        for key, default in LAYOUT.items():
+            own, other = log.options.get(key, default), longest.options.get(key, default)
+            if own != other:
+                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {other!r}; write both alike, or make a data set of each")
+        clocks = [None if one.clock is None else (one.clock.column, one.clock.unit) for one in (log, longest)]
+        if clocks[0] != clocks[1]:
+            told = ["no column of times" if clock is None else f"the times '{clock[0]}' in {clock[1]}" for clock in clocks]
+            raise DataError(f"'{log.file}' has {told[0]}, '{longest.file}' {told[1]}; write both alike, or make a data set of each")
+
+
+def _in_common(longest: Log, logs: Sequence[Log]) -> dict[str, Any]:
+    """Source and options that read all files: marks of missing samples of any, times that restart in any."""
+    options = dict(longest.options)
+    marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
+    options |= {"missing": marks} if marks else {}
+    if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
+        options["time_restarts"] = True
+    source = "text_log" if any(log.source == "text_log" for log in logs) else longest.source
+    return {"options": options, "source": source}
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
@@ -155,6 +197,27 @@ def _notes(longest: Log, logs: Sequence[Log]) -> tuple[str, ...]:
                 )
                 break
     return tuple(notes)
+
+
+def _held_notes(log: Log, used: Collection[str]) -> list[str]:
+    """Columns whose samples rows repeat, beside others that change in every row."""
+    if log.seconds is None or len(log.seconds) < 2:
+        return []
+    run = log.runs[0]
+    repeats = {}
+    for column in log.columns:
+        values = column.values[run]
+        changes = int(np.count_nonzero(np.diff(values[np.isfinite(values)])))
+        repeats[column.name] = len(values) / changes if changes > FEWEST_CHANGES else math.inf
+    held = [name for name in repeats if name in used and LEAST_REPEATED <= repeats[name] < math.inf]
+    if not held or min(repeats.values()) > 1.5:
+        return []
+    rate, often = _rate(log.seconds[run]), min(repeats[name] for name in held)
+    listed = ", ".join(f"'{name}'" for name in held)
+    return [
+        f"{listed}: a new value in one of {often:.2g} rows or fewer, {rate / often:.2g} Hz of {rate:.4g}; if rows repeat old samples "
+        "there, declare them under held"
+    ]
 
 
 def _length(log: Log) -> float:
@@ -288,6 +351,9 @@ def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle) -> Draft:
     longest = max(_recordings(plain), key=lambda own: own.duration)
     late, findings = late_channels(longest), checks_of_recording(longest)
     ratio, notes = None, list(proposals.notes)
+    for stem, rows in dict(dataset.get("drop_rows") or {}).items():
+        listed = ", ".join(map(str, rows[:MOST_SKIPPED])) + (", …" if len(rows) > MOST_SKIPPED else "")
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data row{'s' * (len(rows) > 1)} {listed}")
     if vehicle.wheelbase and vehicle.steering_ratio is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle.wheelbase))["steering_ratio"]
@@ -308,11 +374,27 @@ def draft(examined: Examined, proposals: Proposals, vehicle: Vehicle) -> Draft:
         dataset,
         late,
         tuple(contents_of(own) for own in recordings),
-        tuple(findings),
+        (*findings, *_of_other_files(recordings, longest)),
         ratio,
         tuple(notes),
         sum(own.duration for own in recordings),
     )
+
+
+def _of_other_files(recordings: Sequence[Recording], longest: Recording) -> list[Finding]:
+    """What contradicts the proposals in the longest recording of each file that they were not made of."""
+    by_file: dict[str, Recording] = {}
+    for own in recordings:
+        file = str(own.provenance.get("file", ""))
+        if file not in by_file or own.duration > by_file[file].duration:
+            by_file[file] = own
+    others = [own for file, own in by_file.items() if file != str(longest.provenance.get("file", ""))]
+    return [
+        replace(one, message=f"in '{own.id}', {one.message}")
+        for own in others
+        for one in checks_of_recording(own)
+        if one.check in CONTRADICTIONS
+    ]
 
 
 def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
@@ -345,7 +427,9 @@ def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
         common["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         if log.clock is None:
             common["rate_hz"] = examined.rate_hz
-    common["clock"] = _policy(examined, len(channels))
+    stray = _stray_rows(examined, proposals) if log.source in TABLES and log.clock is not None else {}
+    common |= {"drop_rows": {stem: rows.tolist() for stem, rows in stray.items()}} if stray else {}
+    common["clock"] = _policy(examined, len(channels), stray)
     gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
     short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
     if short and log.source in TABLES and not _is_parquet(log.file):
@@ -358,6 +442,19 @@ def _dataset(examined: Examined, proposals: Proposals) -> dict[str, Any]:
         made = [name for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref") if name not in channels]
         common["pose"] = {**parts, "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5), "order": 2, "channels": made}
     return common
+
+
+def _stray_rows(examined: Examined, proposals: Proposals) -> dict[str, NDArray[np.int64]]:
+    """File's stem -> rows, from 1, in which a channel is beyond what a vehicle can do, where they are few, as spikes are."""
+    found = {}
+    for log in examined.logs:
+        columns = {column.name: column.values for column in log.columns}
+        beyond = np.zeros(len(next(iter(columns.values()))), dtype=bool)
+        for one in proposals.channels:
+            beyond |= one.beyond(columns[one.column])
+        if 0.0 < beyond.mean() <= MOST_STRAY:
+            found[log.file.stem] = np.flatnonzero(beyond) + 1
+    return found
 
 
 def _is_parquet(file: Path) -> bool:
@@ -386,15 +483,17 @@ def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
     return entry | ({"factor": one.factor} if one.factor != 1.0 else {})
 
 
-def _policy(examined: Examined, n_channels: int) -> ClockPolicy:
-    """The strictest clock that all runs of all files keep."""
+def _policy(examined: Examined, n_channels: int, stray: Mapping[str, NDArray[np.int64]]) -> ClockPolicy:
+    """The strictest clock that all runs of all files keep, without the rows that are left out."""
     for policy in POLICIES if examined.log.source != "vbo" else POLICIES[:2]:
         try:
             for log in examined.logs:
                 for run in log.runs if log.seconds is not None else ():
                     assert log.seconds is not None
-                    if run.stop - run.start > 1:
-                        uniform_clock(log.seconds[run], f"'{log.file}'", policy, n_channels=n_channels)
+                    left_out = stray.get(log.file.stem, np.empty(0, dtype=np.int64)) - 1
+                    rows = np.setdiff1d(np.arange(run.start, run.stop), left_out)
+                    if len(rows) > 1:
+                        uniform_clock(log.seconds[rows], f"'{log.file}'", policy, n_channels=n_channels)
             return policy
         except DataError:
             continue
@@ -468,9 +567,9 @@ def _transforms(
     if offsets and not any(one.column.startswith("/") for one in proposals.channels if one.offset):
         made.append({"name": "offset_correction", "offsets": offsets})
     made += _speed(proposals)
-    if "sideslip_ref" in channels and "vy_ref" not in channels:
+    if "sideslip_ref" in channels and "vy_ref" not in channels and {"vx", "vx_ref"} & channels:
         made.append({"name": "velocity_from_sideslip"})
-    if "ax" not in channels:
+    if "ax" not in channels and "vx" in channels:
         usual = rate_hz > 10.0
         made.append({"name": "acceleration_from_speed"} | ({} if usual else {"cutoff_hz": 0.2 * rate_hz}))
     told = vehicle.steering_ratio or (ratio[0] if ratio else None)

@@ -175,6 +175,7 @@ def conclude(made: Draft, left: tuple[Question, ...], *, force: bool, dry_run: b
     """
     name = made.examined.name
     plan = plan_of(made.contents, made.vehicle) if made.has_reference else None
+    plan = None if plan is not None and not plan.sweeps else plan  # a pipeline of nothing could not be run
     dataset, split, pipeline = files_of(name)
     files = [Written(dataset, _dataset_file(made, left), "what the columns are: channel, unit, sign; and what is made of them")]
     if plan is not None:
@@ -218,6 +219,7 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
         "files": "which files in path; the file's stem names the recording",
         "time": "its unit: s, ms, us or ns" if made.examined.log.clock else "no column of times",
         "rate_hz": "sampling rate [Hz]",
+        "drop_rows": "beyond what a vehicle can do",
         "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
         "gappy": "channels in which samples are missing",
         "channels": "sign: -1 where a column counts the other way than ISO 8855 (x forward, y left)",
@@ -265,7 +267,11 @@ def in_words(outcome: Outcome) -> list[str]:
     if outcome.open:
         lines.append("open, taken as proposed:")
         lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in outcome.open]
-    if not own.has_reference:
+    if not own.has_reference and "sideslip_ref" in own.contents[0].channels:
+        lines.append(
+            "there is a sideslip angle, and no speed that makes a lateral velocity of it, by which every estimate is scored: vx is missing"
+        )
+    elif not own.has_reference:
         lines.append(
             "there is no reference of lateral velocity or sideslip in these recordings: nothing can be trained on them and no estimator "
             "can be ranked; what can be done is an estimate by the model that comes with vehest, vehest estimate pretrained"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,13 +21,14 @@ from vehest.alignment.proposals.agreement import (
     slope_of_steering,
     steering,
 )
-from vehest.alignment.proposals.by_name import named_channels
+from vehest.alignment.proposals.by_name import TOLD, named_channels
 from vehest.alignment.proposals.columns import Candidate, candidates, correlation, slow_of
-from vehest.alignment.proposals.poses import find_pose
+from vehest.alignment.proposals.poses import find_pose, named_pose
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.turning import FAR, Turning, find_turning, turning_by_names
+from vehest.alignment.proposals.turning import CLOSE, FAR, RARE, UNITS, Turning, find_turning, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, wheel_proposals, with_wheels_for_speed
 from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
 from vehest.data.units import factor_to_si
 
 SAME = {"vx": 0.97, "yaw_rate": 0.97}  # correlation of one quantity measured twice
@@ -43,6 +44,7 @@ RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 40
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 FEWEST = 50  # samples of a course
+MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 ACCELERATIONS, ANGLES = ("m/s²", "g"), ("rad", "deg")
 
 
@@ -92,7 +94,14 @@ def propose(
     proposals = _assigned(search, wheels, rate)
     if not {"vy_ref", "sideslip_ref"} & set(proposals.by_channel):
         proposals = replace(proposals, pose=find_pose(search.columns, search.known))
+        named = [one.name for one in named_pose(search.columns) if one is not None]
+        if len(named) == 3 and not proposals.pose:
+            text = f"no reference is made of '{', '.join(named)}'".replace(", ", "', '")
+            proposals = replace(proposals, notes=(*proposals.notes, f"{text}: their derivatives are not the speed and the yaw rate"))
+    if _stands(search.columns):
+        proposals = replace(proposals, notes=(*proposals.notes, "the car stands all the time, by its speed; names alone tell its columns"))
     proposals = _left_and_right(proposals, search, wheels, _compasses(search, compass, west_positive))
+    proposals = possible(proposals, {column.name: column.values for column in search.columns})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, _, _ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -111,9 +120,24 @@ def _best(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: flo
         return Search(columns, None, None)
     if not turning:
         named = turning_by_names(columns)
-        return Search(columns, None, None) if named is None else _search(columns, named, rate_hz)
+        return Search(columns, None, None) if named is None else _search(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
     near = [one for one in turning if one.score > turning[0].score - 4.0]
     return _search(columns, max(near, key=support) if len(near) > 1 else near[0], rate_hz)
+
+
+def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
+    """The same with the speed's unit by d(vx)/dt, where a column that is named as longitudinal acceleration tells it."""
+    if columns[named.speed].unit:
+        return named
+    told: list[tuple[float, str]] = []
+    for unit in UNITS[roles.SPEED]:
+        search = _search(columns, replace(named, units=replace(named.units, speed=unit)), rate_hz)
+        assert search.known is not None
+        for column in (columns[k] for k in search.free() if roles.AX in columns[k].hints and _may_be_ax(columns[k])):
+            found = longitudinal(search.known, column, [column.unit] if column.unit else ACCELERATIONS)
+            told += [(one.mismatch + RARE.get(unit, 0.0), unit) for one in found if one.strength >= CLEAR]
+    best = min(told, default=(math.inf, ""))
+    return replace(named, units=replace(named.units, speed=best[1])) if best[0] < CLOSE else named
 
 
 def _stands(columns: Sequence[Candidate]) -> bool:
@@ -127,14 +151,20 @@ def _may_be_ax(column: Candidate) -> bool:
 
 
 def _search(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Search:
-    units, sign = turning.units, math.copysign(1.0, turning.correlation)
+    units, backwards = turning.units, _backwards(columns[turning.speed])
+    sign = math.copysign(1.0, turning.correlation) * backwards
     known = Known(
         rate_hz,
-        columns[turning.speed].values * factor_to_si(units.speed, "m/s"),
+        columns[turning.speed].values * backwards * factor_to_si(units.speed, "m/s"),
         columns[turning.yaw_rate].values * factor_to_si(units.yaw_rate, "rad/s"),
         np.empty(0) if turning.ay < 0 else sign * columns[turning.ay].values * factor_to_si(units.ay, "m/s²"),
     )
     return Search(columns, turning, known, {turning.speed, turning.yaw_rate, turning.ay} - {-1})
+
+
+def _backwards(speed: Candidate) -> int:
+    """-1 where a speed counts down as the car drives ahead."""
+    return -1 if float(np.median(speed.slow)) < 0.0 else 1
 
 
 def _rate_by_ax(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> float | None:
@@ -162,7 +192,7 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
             found[own.channel] = replace(found[own.channel], asked=own.asked or found[own.channel].asked, others=own.others)
         fitting, notes = _one_sideslip(search, found, _fitting(search))
         found |= {one.channel: one for one in fitting}
-        found = _paired(search, found, wheels)
+        found = _unconfirmed(search, _paired(search, found, wheels))
     if wheels:
         made, radius = wheel_proposals(search.columns, wheels, search.known, made_speed="vx" not in found)
         found |= {one.channel: one for one in made}
@@ -174,13 +204,53 @@ def _assigned(search: Search, wheels: Wheels, rate_hz: float) -> Proposals:
     return Proposals(channels, wheel_radius=radius, notes=notes)
 
 
+def _unconfirmed(search: Search, found: dict[str, Proposal]) -> dict[str, Proposal]:
+    """The three of turning asked where no name or unit speaks for two of them, and nothing else agrees with them.
+
+    yaw_rate ≈ steer·vx / wheelbase looks like ay ≈ vx·yaw_rate in other units.
+    """
+    turning = search.turning
+    assert turning is not None
+    if turning.ay < 0:
+        return found
+    lateral = {roles.YAW_RATE: search.columns[turning.yaw_rate], roles.AY: search.columns[turning.ay]}
+    if any(column.unit or role in column.hints for role, column in lateral.items()):
+        return found
+    if any(name in found and not found[name].asked for name in ("ax", "vy_ref", "sideslip_ref")):
+        return found
+    doubt = "no name and no other column speaks for it: yaw rate and acceleration could be steering and yaw rate"
+    three = {search.columns[k].name for k in (turning.speed, turning.yaw_rate, turning.ay)}
+    return {name: replace(one, asked=one.asked or doubt) if one.column in three else one for name, one in found.items()}
+
+
+def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
+    """Without what names alone tell and no vehicle can do; what the motion tells is asked there.
+
+    Args:
+        proposals: for a log.
+        columns: of that log, or of another one of the same car: name -> values, (T,).
+    """
+    kept, notes = [], list(proposals.notes)
+    for one in proposals.channels:
+        told, beyond = CHANNELS[one.channel], one.beyond(columns[one.column])
+        share = float(beyond.mean())
+        if share > MOST_BEYOND and one.channel in TOLD:
+            shown = f"{float(columns[one.column][int(np.argmax(beyond))]):.3g} {one.unit}"
+            text = f"'{one.column}' is named as {one.channel}, but shows {shown} (possible: {told.low:.3g} to {told.high:.3g} {told.unit})"
+            notes.append(f"{text}; it is left out")
+            continue
+        doubt = one.asked or f"{100.0 * share:.2g} % of its samples are beyond what a vehicle can do in {one.unit}"
+        kept.append(replace(one, asked=doubt) if share > MOST_BEYOND else one)
+    return replace(proposals, channels=tuple(kept), notes=tuple(notes))
+
+
 def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
     """Speed, yaw rate and lateral acceleration; a speed that is the mean of wheels is none of the file's."""
     turning, columns = search.turning, search.columns
     assert turning is not None
-    units, sign = turning.units, -1 if turning.correlation < 0.0 else 1
     speed, yaw_rate = columns[turning.speed], columns[turning.yaw_rate]
-    backwards = -1 if float(np.median(speed.slow)) < 0.0 else 1
+    units, backwards = turning.units, _backwards(speed)
+    sign = -backwards if turning.correlation < 0.0 else backwards
     if turning.ay < 0:
         asked = "" if units.decided else "unit: no lateral acceleration ties speed and yaw rate together"
         text = "its name and unit" if units.decided else "its name and size"
@@ -192,11 +262,15 @@ def _turning_proposals(search: Search, wheels: Wheels) -> list[Proposal]:
     if units.mismatch >= FAR:
         asked = f"ay is {size:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
 
-    def own(column: Candidate, channel: str, unit: str, sign: int) -> Proposal:
-        return Proposal(column.name, channel, unit, sign, (text,), "" if column.unit and units.mismatch < FAR else asked)
+    def own(column: Candidate, role: str, channel: str, unit: str, sign: int) -> Proposal:
+        doubt = "" if column.unit and units.mismatch < FAR else asked
+        if column.hint(role) <= -roles.STRONG:
+            doubt = doubt or "the motion says so, its name says otherwise"
+        return Proposal(column.name, channel, unit, sign, (text,), doubt)
 
-    found = [own(yaw_rate, "yaw_rate", units.yaw_rate, 1), own(columns[turning.ay], "ay", units.ay, sign)]
-    return found if turning.speed in wheels.stand_in else [own(speed, "vx", units.speed, backwards), *found]
+    ay = columns[turning.ay]
+    found = [own(yaw_rate, roles.YAW_RATE, "yaw_rate", units.yaw_rate, 1), own(ay, roles.AY, "ay", units.ay, sign)]
+    return found if turning.speed in wheels.stand_in else [own(speed, roles.SPEED, "vx", units.speed, backwards), *found]
 
 
 def _signed(turning: Turning) -> float:
@@ -215,15 +289,16 @@ def _repeated(search: Search, wheels: Wheels) -> list[Proposal]:
         (turning.yaw_rate, roles.YAW_RATE, "yaw_rate", "rad/s", turning.units.yaw_rate),
     ):
         first = search.columns[place]
+        ahead = _backwards(first) if channel == "vx" else 1
         units = {k: _same_unit(search.columns[k], first, unit, si, role, channel) for k in search.free()}
-        same = [(search.columns[k], own, _sign(search.columns[k], first)) for k, own in units.items() if own]
+        same = [(search.columns[k], own, ahead * _sign(search.columns[k], first)) for k, own in units.items() if own]
         search.taken.update(k for k, own in units.items() if own)
         scaled = [k for k in search.free() if channel == "vx" and _is_scaled(search.columns[k], first)]
         if scaled and not same and place not in wheels.stand_in:
             search.taken.add(scaled[0])
             found += _scaled_speed(search.columns[scaled[0]], first, unit)
         if same:
-            found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, 1)]), *same], channel)
+            found += _told_apart([*(() if place in wheels.stand_in else [(first, unit, ahead)]), *same], channel)
     if turning.ay >= 0:
         first = search.columns[turning.ay]
         search.taken.update(
@@ -243,7 +318,8 @@ def _is_scaled(column: Candidate, first: Candidate) -> bool:
 
 def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Proposal]:
     """The car's own speed in counts, and the reference's by which it is scaled."""
-    speed = first.slow * factor_to_si(unit, "m/s")
+    ahead = _backwards(first)
+    speed = first.slow * ahead * factor_to_si(unit, "m/s")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)
     asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{first.name}' is then the reference's"
     text = f"follows '{first.name}' ({correlation(column.slow, first.slow):.2f}), no unit of speed explains its scale"
@@ -253,7 +329,7 @@ def _scaled_speed(column: Candidate, first: Candidate, unit: str) -> list[Propos
             first.name,
             "vx_ref",
             unit,
-            1,
+            ahead,
             (f"'{column.name}' follows it",),
             f"the reference's speed, or the car's own ('{column.name}' in counts)",
         ),
@@ -335,7 +411,7 @@ def _one_sideslip(search: Search, found: dict[str, Proposal], fitting: list[Prop
         return fitting, ()
     by_name = {column.name: column for column in search.columns}
     speed = found.get("vx_ref", found["vx"])
-    velocity, forward = (by_name[one.column].slow * factor_to_si(one.unit, "m/s") for one in (own["vy_ref"], speed))
+    velocity, forward = (one.sign * by_name[one.column].slow * factor_to_si(one.unit, "m/s") for one in (own["vy_ref"], speed))
     moving = forward > 0.2 * forward.max()
     agreeing = correlation(np.arctan2(velocity, forward)[moving], by_name[own["sideslip_ref"].column].slow[moving])
     if abs(agreeing) >= SAME_ANGLE:
@@ -451,7 +527,10 @@ def _as_steering(search: Search, column: Candidate) -> tuple[float, Proposal] | 
         largest = "no angle of the road wheels or of a steering wheel by its range and slow corners; its scale is to be given"
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         offset = straight if abs(straight) > CENTRED * spread else 0.0
-        proposal = Proposal(column.name, ROAD_WHEEL, "rad", sign, text, largest, offset=offset)
+        steered = [
+            unit for unit in ([column.unit] if column.unit else ANGLES) if spread * factor_to_si(unit, "rad") <= CHANNELS[ROAD_WHEEL].high
+        ]
+        proposal = Proposal(column.name, ROAD_WHEEL, (steered or ["rad"])[0], sign, text, largest, offset=offset)
         return score, proposal
     best = min(found, key=lambda one: _oddness(one.length, one.channel))
     unclear = {(one.channel, one.unit) for one in found} - {(best.channel, best.unit)}

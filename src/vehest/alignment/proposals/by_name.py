@@ -72,10 +72,11 @@ def named_channels(columns: Sequence[Candidate], free: Sequence[int], held: Coll
 
 
 def _by_name(column: Candidate, channel: str, units: Sequence[str]) -> Proposal:
-    """The unit of the header, or the first in which the column is of a usual size."""
+    """The unit of the header, or the first in which the column is of a usual size, or at least of a possible one."""
     si, (low, high) = CHANNELS[channel].unit, USUAL[channel]
     size = float(np.quantile(np.abs(column.values), 0.99))
     fitting = [unit for unit in units if low <= size * factor_to_si(unit, si) <= high]
+    fitting = fitting or [unit for unit in units if size * factor_to_si(unit, si) <= CHANNELS[channel].high]
     unit = column.unit or (fitting[0] if fitting else units[0])
     told = "its name and unit" if column.unit else f"its name, and {size:.3g} for its 99th percentile"
     return Proposal(

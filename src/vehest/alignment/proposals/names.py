@@ -57,7 +57,8 @@ _WEAK = {
 }
 _REFERENCE = re.compile(
     r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|optitrack|true|truth|\bgt\b|datron|s350|"
-    r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys"
+    r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys|"
+    r"from (yaw|pose|positions?)\b"
 )
 _STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
 _FILTERED = re.compile(r"filt|smooth|\blp\b|avg|mittel|gemittelt")

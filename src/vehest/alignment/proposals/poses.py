@@ -27,8 +27,7 @@ def find_pose(columns: Sequence[Candidate], known: Known | None) -> tuple[tuple[
     """
     if known is None:
         return ()
-    found = {part: _named(columns, role) for part, role in PARTS.items()}
-    x, y, yaw = (found[part] for part in PARTS)
+    x, y, yaw = named_pose(columns)
     if x is None or y is None or yaw is None:
         return ()
     for unit in [x.unit] if x.unit else ["m", "mm"]:
@@ -46,6 +45,11 @@ def find_pose(columns: Sequence[Candidate], known: Known | None) -> tuple[tuple[
             if abs(correlation(turned[usual], known.yaw_rate[usual])) > AGREEING:
                 return (("x", x.name, unit), ("y", y.name, unit), ("yaw", yaw.name, of_yaw))
     return ()
+
+
+def named_pose(columns: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None, Candidate | None]:
+    """The columns that are named as positions and yaw."""
+    return _named(columns, PARTS["x"]), _named(columns, PARTS["y"]), _named(columns, PARTS["yaw"])
 
 
 def _named(columns: Sequence[Candidate], role: str) -> Candidate | None:

@@ -4,6 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.units import factor_to_si
+
 
 @dataclass(frozen=True)
 class Proposal:
@@ -43,6 +50,12 @@ class Proposal:
         parts += [f"factor {self.factor:.5g}"] if self.factor != 1.0 else []
         parts += [f"less {self.offset:.4g}"] if self.offset else []
         return f"{self.channel}: {', '.join(parts)}: {'; '.join(self.evidence) or 'nothing but the order of columns'}"
+
+    def beyond(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Which values of the column no vehicle can have, (T,)."""
+        told = CHANNELS[self.channel]
+        samples = self.sign * self.factor * factor_to_si(self.unit, told.unit) * (values - self.offset)
+        return np.asarray((samples < told.low) | (samples > told.high))
 
     def with_evidence(self, *more: str) -> Proposal:
         """The same with more of it."""

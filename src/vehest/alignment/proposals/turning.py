@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from vehest.alignment.proposals.columns import Candidate
-from vehest.alignment.proposals.names import AY, OTHER, SPEED, YAW_RATE
+from vehest.alignment.proposals.names import AY, HANDWHEEL, LATERAL_VELOCITY, OTHER, SIDESLIP, SPEED, STEER, STRONG, YAW_RATE
 from vehest.constants import FloatArray
 from vehest.data.units import factor_to_si
 
@@ -23,6 +23,8 @@ RANGES = {SPEED: (0.5, 110.0), YAW_RATE: (0.02, 8.0), AY: (0.3, 60.0)}  # of the
 MOST_COLUMNS = 60
 MOST_KEPT = 8
 LEAST_SCORE = 6.0
+FOLLOWING = frozenset({STEER, HANDWHEEL, LATERAL_VELOCITY, SIDESLIP})
+"""What follows a turn at an even speed as an acceleration does, but for its scale; so a name that is clear decides."""
 UNNAMED = 3.0  # of score, for a column that no name speaks for where one speaks for another
 NAMELESS = 0.5  # rank of a column whose name says nothing
 
@@ -115,6 +117,7 @@ def _pool(columns: Sequence[Candidate], role: str) -> list[int]:
     """Columns that could have a role, those that are named for it first."""
     si = factor_unit(role)
     own = [k for k, one in enumerate(columns) if one.measures(si) and OTHER not in one.hints and not _is_wheel(one)]
+    own = [k for k in own if role in columns[k].hints or not _follows(columns[k])]
     if role == SPEED:
         own = [k for k in own if _forward(columns[k].slow)]
     own.sort(key=lambda k: -(columns[k].hints.get(role) or (-1.0 if columns[k].hints else NAMELESS)))
@@ -128,6 +131,11 @@ def factor_unit(role: str) -> str:
 
 def _is_wheel(one: Candidate) -> bool:
     return any(role.startswith("wheel_speed") for role in one.hints)
+
+
+def _follows(one: Candidate) -> bool:
+    """Whether a column's name says clearly that it follows the turning, and is none of the three."""
+    return any(role in FOLLOWING and strength == STRONG for role, strength in one.hints.items())
 
 
 def _forward(slow: FloatArray) -> bool:

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,8 +20,10 @@ from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
 from vehest.data.text_files import first_line
-from vehest.sources.surveys.clocks import SPELLINGS, find_clock
-from vehest.sources.surveys.log import Log, RawColumn
+from vehest.sources.clock_times import seconds_of_text
+from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
+from vehest.sources.surveys.log import Log, RawColumn, Stamps
+from vehest.sources.text_log import CLOCK
 from vehest.sources.text_tables import check_size, table_stream
 from vehest.sources.unit_spellings import plain_unit
 
@@ -32,6 +34,8 @@ DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 MOST_CONTROLS = 0.01
 BLOCK = 1 << 24
+MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
+"""What loggers and spreadsheets write where there is no sample, in lower case."""
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 
 
@@ -68,36 +72,75 @@ def survey_table(file: Path) -> Log:
             names = [name for name in schema.names if pa.types.is_integer(kind := schema.field(name).type) or pa.types.is_floating(kind)]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             values = read_numbers(file, table, names)
-        return _log(file, values, {}, {}, [])
+        return _log(file, Read(values), {}, {})
     shape = shape_of(file)
     check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
     check_size(file, len(shape.names))
-    values, skipped = _values(file, shape)
+    read = _values(file, shape)
     units = {name: unit for name, unit in zip(shape.names, shape.units, strict=True) if unit} if shape.units else {}
     options: dict[str, object] = {"delimiter": shape.delimiter, "decimal": shape.decimal}
     options |= {"encoding": shape.encoding} if shape.encoding != "utf8" else {}
     options |= {"skip_rows": shape.skip_rows} if shape.skip_rows else {}
     options |= {"rows_below_names": 1} if shape.units else {}
-    return _log(file, values, units, options, skipped)
+    options |= {"missing": list(read.marks)} if read.marks else {}
+    return _log(file, read, units, options)
 
 
-def _log(file: Path, values: dict[str, FloatArray], units: dict[str, str], options: dict[str, object], skipped: Sequence[str]) -> Log:
+@dataclass(frozen=True)
+class Read:
+    """What a table's columns hold.
+
+    Args:
+        values: name -> numbers, (N,).
+        clocks: name -> times that are written as a clock's [s], (N,).
+        marks: cells of columns of numbers that stand for a missing sample.
+        skipped: what was not read, and why.
+    """
+
+    values: dict[str, FloatArray]
+    clocks: dict[str, FloatArray] = field(default_factory=dict)
+    marks: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
+
+
+def _log(file: Path, read: Read, units: dict[str, str], options: dict[str, object]) -> Log:
+    values, skipped = read.values, read.skipped
     if not values:
         raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     n_rows = len(next(iter(values.values())))
     if n_rows < 2:
         raise DataError(f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names")
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    found = find_clock(values, written)
+    found = find_clock({**read.clocks, **values}, {**written, **dict.fromkeys(read.clocks, "s")})
+    stamps = found.stamps
+    if stamps is not None and stamps.column in read.clocks:
+        stamps = replace(stamps, unit=CLOCK, evidence=stamps.evidence.replace("unit in the header", "times of a clock"), asked=False)
+    skipped = (*skipped, *_no_clocks(values, read.clocks, stamps))
     if len(found.runs) > 1:
         options = {**options, "runs": found.counted_by} if found.counted_by else {**options, "time_restarts": True}
     columns = [
         RawColumn(name, written[name], samples, {"column": name})
         for name, samples in values.items()
-        if (found.stamps is None or name != found.stamps.column) and name != found.counted_by
+        if (stamps is None or name != stamps.column) and (name != found.counted_by or not name)
     ]
-    source = "text_log" if "rows_below_names" in options else "tabular"
-    return Log(file, source, tuple(columns), options, found.stamps, found.seconds, found.runs, tuple(skipped))
+    plain = not {"rows_below_names", "missing"} & set(options) and (stamps is None or stamps.unit != CLOCK)
+    return Log(file, "tabular" if plain else "text_log", tuple(columns), options, stamps, found.seconds, found.runs, skipped)
+
+
+def _no_clocks(values: dict[str, FloatArray], clocks: dict[str, FloatArray], stamps: Stamps | None) -> list[str]:
+    """Columns of times, or named so, that no clock can be made of."""
+    why = []
+    for name, times in {
+        **clocks,
+        **{name: own for name, own in values.items() if stamps is None and NAMED.match(plain_name(name))},
+    }.items():
+        if stamps is not None and stamps.column == name:
+            continue
+        steps = np.diff(times)
+        back, same = int((steps < 0).sum()), int((steps == 0).sum())
+        what = f"goes backwards {back} times" if back else f"repeats {same} times" if same else "does not grow evenly"
+        why.append(f"column '{printable(name)}' as the time: it {what}" + ("; sort the rows" if back > 1 else ""))
+    return why
 
 
 def unit_in_name(name: str) -> str:
@@ -190,7 +233,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 def _share(row: Sequence[str], decimal: str) -> float:
     """Share of cells that are numbers, empty ones left out; 0 where there is none."""
-    filled = [cell for cell in row if cell.strip()]
+    filled = [cell for cell in row if cell.strip() and cell.strip().lower() not in MARKS]
     return sum(_is_number(cell, decimal) for cell in filled) / len(filled) if filled else 0.0
 
 
@@ -240,8 +283,7 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     return ("cp1252", head.decode("cp1252", errors="replace")) if western else ("latin-1", head.decode("latin-1"))
 
 
-def _values(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], list[str]]:
-    """Columns of numbers, (N,) each, and what was not read."""
+def _values(file: Path, shape: Shape) -> Read:
     read = pc.ReadOptions(
         block_size=BLOCK, encoding=shape.encoding, skip_rows=shape.skip_rows, skip_rows_after_names=1 if shape.units else 0
     )
@@ -252,15 +294,33 @@ def _values(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], list[str]]
             table = pc.read_csv(stream, read, parse, convert)
     except DAMAGE:
         table = _as_text(file, shape, read, parse)
-    values, skipped = {}, []
-    for name in shape.names:
+    values, clocks, skipped = {}, {}, []
+    marks: set[str] = set()
+    for place, name in enumerate(shape.names):
         column = table.column(name) if name in table.column_names else None
-        samples = None if column is None else _numbers(column, shape.decimal)
-        if samples is None:
-            skipped.append(f"column '{printable(name)}' holds text")
-        else:
+        if column is None or column.null_count == len(column):
+            skipped += [f"column '{printable(name)}' is empty"] if name else []
+            continue
+        samples, own = _numbers(column, shape.decimal)
+        seconds = _clock_of(column) if samples is None else None
+        if not name:
+            skipped.append(f"column {place + 1} has no name")
+        elif samples is not None:
             values[name] = samples
-    return values, skipped
+            marks |= own
+        elif seconds is not None:
+            clocks[name] = seconds
+        else:
+            skipped.append(f"column '{printable(name)}' holds text")
+    return Read(values, clocks, tuple(sorted(marks)), tuple(skipped))
+
+
+def _clock_of(column: pa.ChunkedArray) -> FloatArray | None:
+    """Times that are written as a clock's [s], (N,); None of other text."""
+    kind = column.type
+    if not (pa.types.is_string(kind) or pa.types.is_timestamp(kind) or pa.types.is_time(kind)):
+        return None
+    return seconds_of_text(column if pa.types.is_string(kind) else column.cast(pa.string()))
 
 
 def _as_text(file: Path, shape: Shape, read: pc.ReadOptions, parse: pc.ParseOptions) -> pa.Table:
@@ -270,20 +330,26 @@ def _as_text(file: Path, shape: Shape, read: pc.ReadOptions, parse: pc.ParseOpti
         with table_stream(file) as stream:
             return pc.read_csv(stream, read, parse, kinds)
     except DAMAGE as error:
-        raise DataError(f"'{file}' cannot be read as a table ({first_line(error)}); is it truncated?") from None
+        remedy = (
+            "its columns are aligned by blanks; write one delimiter between cells"
+            if shape.delimiter == " "
+            else "remove that row, or what lies behind it if the file is truncated"
+        )
+        raise DataError(f"'{file}' cannot be read as a table ({printable(first_line(error))}); {remedy}") from None
 
 
-def _numbers(column: pa.ChunkedArray, decimal: str) -> FloatArray | None:
-    """A column as numbers; None where it holds anything else."""
+def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray | None, set[str]]:
+    """A column as numbers, None where it holds anything else, and the marks in it that stand for a missing sample."""
     kind = column.type
-    if pa.types.is_null(kind):
-        return None
     if pa.types.is_integer(kind) or pa.types.is_floating(kind):
-        return np.asarray(column.cast(pa.float64()).to_numpy(), dtype=np.float64)
+        return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64), set()
     if not pa.types.is_string(kind):
-        return None
+        return None, set()
+    marks = {cell for cell in compute.unique(column).to_pylist() if cell is not None and cell.strip().lower() in MARKS}
     try:
+        if marks:
+            column = compute.if_else(compute.is_in(column, pa.array(sorted(marks))), pa.scalar(None, pa.string()), column)
         plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
-        return np.asarray(compute.cast(plain, pa.float64()).to_numpy(), dtype=np.float64)
+        return np.asarray(compute.cast(plain, pa.float64()).to_numpy(), dtype=np.float64), marks
     except pa.ArrowException:
-        return None
+        return None, set()
