@@ -24,7 +24,7 @@ def total(spans) -> float:
 
 
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
-@pytest.mark.parametrize("seconds", [5.0, 45.0, 89.0])
+@pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
 def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
     kept = shortened(SPANS, seconds, at, bounds)
     assert total(kept) == pytest.approx(seconds)
@@ -35,6 +35,10 @@ def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
 
 def test_the_stretch_begins_where_it_is_said_and_goes_on_at_the_start():
     assert shortened(SPANS, 60.0, 0.5, bounds) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
+
+
+def test_an_end_of_a_second_is_left_out():
+    assert shortened(SPANS, 31.0, 0.0, bounds) == (Span("d", "one", 10.0, 40.0),)
 
 
 def test_ranges_without_ends_end_with_their_recordings():

@@ -10,8 +10,11 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span
 
 
+LEAST_SECONDS = 3.0  # of a piece; what is shorter holds no window after the start that is not scored
+
+
 def shortened(spans: Sequence[Span], seconds: float, at: float, bounds_of: Callable[[Span], tuple[float, float]]) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end; it goes on at their start where it reaches their end.
+    """A stretch of ranges laid end to end; it goes on at their start where it reaches their end. Ends of a few seconds are left out.
 
     Args:
         spans: ranges.
@@ -32,7 +35,8 @@ def shortened(spans: Sequence[Span], seconds: float, at: float, bounds_of: Calla
         return tuple(spans)
     begin = at * total
     kept = _between(bounded, begin, min(begin + seconds, total))
-    return (*_between(bounded, 0.0, begin + seconds - total), *kept)
+    pieces = (*_between(bounded, 0.0, begin + seconds - total), *kept)
+    return tuple(piece for piece in pieces if piece.stop - piece.start >= LEAST_SECONDS) or pieces
 
 
 def _bounded(span: Span, bounds_of: Callable[[Span], tuple[float, float]]) -> Span:
