@@ -7,6 +7,7 @@ start from another model (``training.start_from``). Minutes count training and v
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
 SCRATCH = "from scratch"
+NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Point:
         variant: its variant.
         title: for people.
         start: what its training starts from; `SCRATCH` for nothing.
-        minutes: with reference that it learnt and stopped on, rounded to hundredths.
+        minutes: with reference that it learnt and stopped on, as they were asked for.
         n_trainings: stretches of the drive times seeds.
     """
 
@@ -89,7 +91,7 @@ def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
 def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
-        minutes = round(minutes_of(part), 2)
+        minutes = _asked_for(part, minutes_of(part))
         for model in part.models:
             models.setdefault((model.estimator, model.variant, start_of(model), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
@@ -111,6 +113,13 @@ def _same(plain: Point, tuned: Point) -> bool:
     """Whether two points differ in what their trainings start from alone."""
     same = (plain.estimator, plain.variant, plain.minutes) == (tuned.estimator, tuned.variant, tuned.minutes)
     return same and plain.start == SCRATCH != tuned.start
+
+
+def _asked_for(part: PartArtefacts, minutes: float) -> float:
+    """The minutes that ``split.minutes`` asked for, which the split's name ends in, where there are about as many; else those there are."""
+    named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
+    asked = float(named[1]) if named is not None else math.nan
+    return asked if abs(minutes - asked) <= NEARLY * asked else round(minutes, 2)
 
 
 def start_of(model: EvaluatedModel) -> str:
