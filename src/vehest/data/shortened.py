@@ -9,7 +9,6 @@ from dataclasses import replace
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span
 
-
 LEAST_SECONDS = 3.0  # of a piece; what is shorter holds no window after the start that is not scored
 
 
