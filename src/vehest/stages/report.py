@@ -171,7 +171,10 @@ def write_report(job: ReportJob, folder: Path) -> None:
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
         raise ConfigurationError(f"the study module '{job.module}' gives no table 'overview', which the terminal shows")
     if job.compares:
-        write_metrics(artefacts.metrics, folder / METRICS)
+        table, kept = artefacts.metrics, getattr(module, "METRICS", None)
+        if kept is not None:
+            table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
+        write_metrics(table, folder / METRICS)
         write_metrics(of_parts(timings), folder / TIMINGS)
     about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
     about |= {"study": job.study, "command": job.command} | _made_from(job)

@@ -10,9 +10,10 @@ import pandas as pd
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
-from vehest.studies.kit.reference_minutes import blocks_of_curve, curves_of, rows_of_curve
+from vehest.studies.kit.reference_minutes import COLUMNS, blocks_of_curve, curves_of, rows_of_curve
 
 TAKES = "parts"
+METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -23,16 +24,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         "overview",
         "RMSE(β) by minutes of reference, all curves.",
         pd.DataFrame(rows),
-        {
-            "curve": Column("test set"),
-            "title": Column("estimator"),
-            "start": Column("training"),
-            "minutes": Column("reference [min]", decimals=2),
-            "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
-            "interval": Column("95 % interval [deg]"),
-            "n_trainings": Column("trainings", decimals=0),
-            "against_scratch": Column("than from scratch"),
-        },
+        {"curve": Column("test set"), **COLUMNS},
     )
     data = list(dict.fromkeys(data_sentence(part) for part in artefacts.parts.values()))
     blocks: list[Block] = [artefacts.about, "\n\n".join(data)]

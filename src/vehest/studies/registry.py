@@ -6,6 +6,7 @@ those that re-create papers come so, from ``vehest_papers``. Such a module has
 - ``TAKES``: what its pipelines name, ``split``, ``parts`` or ``datasets``, or ``folds`` for a split that is cross-validated;
 - ``documents(artefacts: StudyArtefacts) -> {name: Document}``, of which one starts with ``report``;
 - ``SHOWS_FAILED = True``, if its report can leave out what failed and say so;
+- ``METRICS``, if its metrics.csv is to hold these alone, over all samples;
 - ``verdict(artefacts: StudyArtefacts) -> list[str]``, if it says in words at the end what came of it;
 - ``leaderboard(artefacts: PartArtefacts) -> DataFrame``, if it takes a split, or a table ``overview`` in its report, for the terminal.
 """

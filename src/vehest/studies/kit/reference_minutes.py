@@ -28,6 +28,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
 SCRATCH = "from scratch"
+COLUMNS = {
+    "title": Column("estimator"),
+    "start": Column("training"),
+    "minutes": Column("reference [min]", decimals=2),
+    "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
+    "interval": Column("95 % interval [deg]"),
+    "n_trainings": Column("trainings", decimals=0),
+    "against_scratch": Column("than from scratch"),
+}
+"""Of a table of `rows_of_curve`."""
 NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
@@ -160,15 +170,7 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
             f"{curve.title}: RMSE(β) by minutes of reference. Trainings: stretches of the drive times seeds. The last column: against the "
             f"same estimator from scratch on as much, corrected by Holm.",
             pd.DataFrame(rows_of_curve(curve)),
-            {
-                "title": Column("estimator"),
-                "start": Column("training"),
-                "minutes": Column("reference [min]", decimals=2),
-                "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
-                "interval": Column("95 % interval [deg]"),
-                "n_trainings": Column("trainings", decimals=0),
-                "against_scratch": Column("than from scratch"),
-            },
+            COLUMNS,
         ),
     ]
 
