@@ -23,6 +23,7 @@ from vehest.simulation.plant.parameters import Vehicle
 from vehest.simulation.plant.regimes import STEER, VX, VY, YAW, YAW_RATE, X, Y
 from vehest.simulation.plant.stability import StabilityControl, StabilityState
 from vehest.simulation.plant.stability import stability_control as make_stability_control
+from vehest.simulation.plant.wear import Stint
 from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.recording import SensorLevels, described, measure
 
@@ -88,6 +89,7 @@ def simulate_drive(
     sensors: SensorLevels | None = None,
     stability_control: bool = False,
     surface: Surface | None = None,
+    stint: Stint | None = None,
     step: float = 1e-3,
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
@@ -103,6 +105,7 @@ def simulate_drive(
         sensors: levels of the sensors' errors; by default SensorLevels().
         stability_control: whether the car has it switched on.
         surface: of the road; by default dry.
+        stint: what the tyres lose over the drive, of which the driver knows nothing; by default nothing.
         step: of the plant [s].
 
     Raises:
@@ -114,7 +117,7 @@ def simulate_drive(
     sensors, surface = sensors or SensorLevels(), surface or SURFACES["dry"]
     plant = MultiBodyPlant(vehicle, step)
     try:
-        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control)
+        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control, stint=stint)
     except SimulationError as error:
         raise SimulationError(f"drive '{id}' with seed {seed}: {error}") from error
     return Recording(
@@ -134,6 +137,8 @@ def simulate_drive(
                 "manoeuvre": manoeuvre.description(),
                 "drawn": trip.drawn,
                 "surface": asdict(surface),
+                **({"tyres": asdict(stint)} if stint is not None else {}),
+                **({"relaxation": vehicle.relaxation} if any(vehicle.relaxation) else {}),
                 "stability_control": stability_control,
                 "seed": seed,
                 "sensors": described(sensors, trip.motion),
@@ -151,6 +156,7 @@ def drive(
     rate_hz: float = 100.0,
     surface: Surface | None = None,
     stability_control: bool = False,
+    stint: Stint | None = None,
 ) -> Trip:
     """Drive a car through a manoeuvre and keep its true motion.
 
@@ -165,7 +171,7 @@ def drive(
     half_width = float(getattr(manoeuvre, "half_width", math.inf))
     log = _Log(rate_hz)
     control = make_stability_control(plant) if stability_control else None
-    ride = _Ride(plant, car, controller, control, half_width, manoeuvre.longest)
+    ride = _Ride(plant, car, controller, control, half_width, manoeuvre.longest, stint)
 
     stride = math.gcd(per_command, per_sample)
     first_sample = math.ceil(SETTLING_TIME / (plant.step * per_command)) * per_command
@@ -197,7 +203,9 @@ class _Ride:
         stability_control: StabilityControl | None,
         half_width: float,
         longest: float,
+        stint: Stint | None = None,
     ) -> None:
+        self._stint = stint
         self._car, self._controller, self._half_width, self._longest = car, controller, half_width, longest
         self.stability_control, self.stability = stability_control, StabilityState()
         self.state = plant.initial_state(*controller.start)
@@ -211,7 +219,10 @@ class _Ride:
     def decide(self, time: float) -> bool:
         """The driver's next command [s]; false if the drive is over."""
         seen = _observe(self.state)
-        self.decision = decision = self._controller.command(time, seen)
+        decision = self._controller.command(time, seen)
+        if self._stint is not None:
+            decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
+        self.decision = decision
         self._judge(time, decision)
         if self._is_over(time, decision):
             return False

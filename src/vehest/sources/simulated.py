@@ -30,6 +30,9 @@ class Drive:
         manoeuvre: its configuration.
         surface: name or configuration.
         stability_control: whether it is switched on.
+        sensors: levels of its sensors, or a preset's name; none: the data set's.
+        payload: mass [kg] and its place forward and up of the centre of gravity [m]; none: empty.
+        tyres: what they lose over the drive; none: nothing.
     """
 
     seed: int
@@ -37,6 +40,9 @@ class Drive:
     manoeuvre: Mapping[str, Any]
     surface: Any
     stability_control: bool
+    sensors: Any = None
+    payload: Mapping[str, float] | None = None
+    tyres: Mapping[str, float] | None = None
 
 
 Seed = Annotated[int, "a whole number, zero or positive"]
@@ -54,6 +60,9 @@ class DriveFile:
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None
     stability_control: bool | None = None
+    sensors: Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None = None
+    payload: Annotated[dict[str, float], "a mapping such as {mass: 60, forward: -0.4, up: 0.1}"] | None = None
+    tyres: Annotated[dict[str, float], "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
 
 
 @dataclass(frozen=True)
@@ -75,7 +84,8 @@ class SimulatedSource(Source):
     """Simulated drives, a recording each.
 
     Options: ``vehicle`` (from conf/vehicle) or ``vehicles`` (several, by name), ``drives`` (a list of id, manoeuvre and, if need be, count,
-    seed, vehicle, surface, stability_control), ``seed``, ``rate_hz``, ``sensors``, ``surface``, ``stability_control``, ``vary`` and
+    seed, vehicle, surface, stability_control, sensors, payload, tyres), ``seed``, ``rate_hz``, ``sensors``, ``surface``,
+    ``stability_control``, ``vary`` and
     ``vary_sensors``.
     """
 
@@ -103,6 +113,8 @@ class SimulatedSource(Source):
             self.sensors = sensor_levels_from_config(dataset.get("sensors"))
             self.sensor_variation = SensorVariation.from_config(dataset.get("vary_sensors") or {})
             for drive_id, drive in self.drives.items():
+                sensor_levels_from_config(drive.sensors)
+                _simulator_of(drive.vehicle, (), drive.seed, drive.payload, drive.tyres)
                 longest = _manoeuvre_of(drive).longest
                 n_samples = longest * self.rate_hz
                 what = f"drive '{drive_id}' may last {longest:g} s, {n_samples:.6g} samples at {self.rate_hz:g} Hz"
@@ -124,16 +136,18 @@ class SimulatedSource(Source):
     def read_raw(self, recording_id: str) -> Recording:
         """Simulate one drive."""
         from vehest.simulation.road.surface import surface_from_config
+        from vehest.simulation.sensors.recording import sensor_levels_from_config
 
         if recording_id not in self.drives:
             raise MissingError(f"data set '{self.name}' has no drive '{recording_id}' (it has {', '.join(list(self.drives)[:12])}, …)")
         drive = self.drives[recording_id]
-        return _simulator_of(drive.vehicle, self.variations, drive.seed)(
+        own = self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
+        return _simulator_of(drive.vehicle, self.variations, drive.seed, drive.payload, drive.tyres)(
             id=recording_id,
             manoeuvre=_manoeuvre_of(drive),
             seed=drive.seed,
             rate_hz=self.rate_hz,
-            sensors=self.sensor_variation.applied(self.sensors, drive.seed),
+            sensors=self.sensor_variation.applied(own, drive.seed),
             stability_control=drive.stability_control,
             surface=surface_from_config(drive.surface),
         )
@@ -171,6 +185,9 @@ class SimulatedSource(Source):
                     manoeuvre=entry.manoeuvre,
                     surface=options.surface if entry.surface is None else entry.surface,
                     stability_control=options.stability_control if entry.stability_control is None else entry.stability_control,
+                    sensors=entry.sensors,
+                    payload=entry.payload,
+                    tyres=entry.tyres,
                 )
         return drives
 
@@ -197,17 +214,33 @@ def _is_planar(vehicle: Mapping[str, Any]) -> bool:
     return vehicle.get("plant") == PLANAR
 
 
-def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int) -> Callable[..., Recording]:
-    """What simulates drives of a vehicle, varied as the seed of a drive draws it."""
+def _simulator_of(
+    vehicle: Mapping[str, Any],
+    variations: Sequence[Any],
+    seed: int,
+    payload: Mapping[str, float] | None = None,
+    tyres: Mapping[str, float] | None = None,
+) -> Callable[..., Recording]:
+    """What simulates drives of a vehicle, varied as the seed of a drive draws it, with a payload and with tyres that age."""
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
     from vehest.simulation.planar_drive import simulate_planar_drive
-    from vehest.simulation.plant.parameters import vehicle_from_configuration
+    from vehest.simulation.plant.parameters import loaded, vehicle_from_configuration
     from vehest.simulation.plant.planar_car import planar_car_from_configuration
+    from vehest.simulation.plant.wear import stint_from_config
 
     if _is_planar(vehicle):
+        if payload or tyres:
+            raise ConfigurationError(f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out")
         return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
-    return partial(simulate_drive, vehicle=varied(vehicle_from_configuration(vehicle), variations, seed))
+    own = varied(vehicle_from_configuration(vehicle), variations, seed)
+    if payload:
+        unknown = set(payload) - {"mass", "forward", "up"}
+        if unknown or "mass" not in payload:
+            raise ConfigurationError(f"payload is a mapping {{mass, forward, up}}, not {dict(payload)}")
+        own = loaded(own, **payload)
+    stint = stint_from_config(tyres) if tyres else None
+    return partial(simulate_drive, vehicle=own, stint=stint)
 
 
 def _manoeuvre_of(drive: Drive) -> Any:

@@ -23,6 +23,9 @@ from vehest.simulation.road.course import Course
 DRIVER_RATE_HZ = 100.0
 """How often a driver decides what to do [Hz]."""
 
+LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0
+"""Frequencies between which a driver corrects [Hz]; assumed."""
+
 WAVELENGTHS = (310.0, 470.0, 1130.0)
 """Of the variations along a drive [m]; assumed, and none divides a lap."""
 
@@ -255,6 +258,25 @@ def speed_profile(
     return np.array(speed)
 
 
+class Hands:
+    """What a driver's hands do beside following a line: corrections between 0.5 and 2 Hz, as a driver at the limit makes them all the time.
+
+    Args:
+        size: root mean square of the lateral acceleration that is asked for, in a corner at the limit [m/s²]; a third of it on a straight.
+        generator: draws 24 frequencies, evenly spread over the logarithm, and their phases.
+    """
+
+    def __init__(self, size: float, generator: np.random.Generator) -> None:
+        frequencies = LOWEST_CORRECTION * (HIGHEST_CORRECTION / LOWEST_CORRECTION) ** generator.uniform(size=24)
+        self.size = size
+        self._waves = list(zip((2.0 * math.pi * frequencies).tolist(), generator.uniform(0.0, 2.0 * math.pi, 24).tolist(), strict=True))
+
+    def at(self, time: float, load: float) -> float:
+        """Lateral acceleration that is asked for at a time [s] under a load of so much of the grip [m/s²]."""
+        unit = math.sqrt(2.0 / len(self._waves)) * sum(math.sin(rate * time + phase) for rate, phase in self._waves)
+        return self.size * unit * (1.0 + 2.0 * min(load, 1.0)) / 3.0
+
+
 class Follower:
     """Drives a car along a plan.
 
@@ -264,11 +286,19 @@ class Follower:
         driver: who drives.
         progress: where on the plan the car starts [m].
         speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
+        hands: corrections beside the line; by default none.
     """
 
     def __init__(
-        self, plan: Plan, car: Car, driver: Driver, progress: float = 0.0, speed_at: Callable[[float], tuple[float, float]] | None = None
+        self,
+        plan: Plan,
+        car: Car,
+        driver: Driver,
+        progress: float = 0.0,
+        speed_at: Callable[[float], tuple[float, float]] | None = None,
+        hands: Hands | None = None,
     ) -> None:
+        self._hands = hands
         self.plan, self.car, self.driver, self.progress = plan, car, driver, progress
         self._speed_at = speed_at
         self._per_metre = 1.0 / float(plan.distance[1])
@@ -308,6 +338,9 @@ class Follower:
         sliding = sideslip - car.sideslip_for(curvature, lateral, friction)
         beyond = max(abs(sliding) - driver.slide, 0.0)
         steer += driver.countersteer * math.copysign(beyond, sliding)
+        if self._hands is not None:
+            asked = self._hands.at(time, abs(lateral) / grip)
+            steer += self._per_curvature(speed, friction) * asked / max(speed, 5.0) ** 2
 
         target, feedforward = (
             self._speed_at(time)
@@ -338,9 +371,12 @@ class Follower:
         """
         car = self.car
         held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
-        moderate = 0.5 * car.grip * friction
-        per_curvature = car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
-        return held + per_curvature * more
+        return held + self._per_curvature(speed, friction) * more
+
+    def _per_curvature(self, speed: float, friction: float) -> float:
+        """Steering angle per curvature [rad m] at half of the grip."""
+        car, moderate = self.car, 0.5 * self.car.grip * friction
+        return car.wheelbase + abs(car.steer_for(0.0, moderate, friction)) / moderate * speed**2
 
     def _locate(self, seen: Observation, sideslip: float) -> tuple[float, float, int, float]:
         """Lateral error [m], heading error [rad] and cell of the plan, by two Newton steps from the last progress."""

@@ -11,7 +11,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
-from vehest.simulation.driving.driver import Command, Driver, Follower, Observation, Plan, draw_style, plan_laps
+from vehest.simulation.driving.driver import Command, Driver, Follower, Hands, Observation, Plan, draw_style, plan_laps
 from vehest.simulation.driving.manoeuvre import (
     SETTLING_TIME,
     Controller,
@@ -25,6 +25,10 @@ from vehest.simulation.driving.manoeuvre import (
 )
 from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
+
+_TRAFFIC_STREAM = 5  # of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the fleet's
+TRAFFIC_LENGTH = (50.0, 400.0)
+"""Of a stretch behind somebody slower [m]; assumed."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,9 @@ class Laps(Manoeuvre):
         top_speed: that the driver does not exceed [m/s]; by default the car's.
         flat: leaves out the course's bank and grade.
         half_width: of the road, beyond which the car has left it [m].
+        corrections: of the driver's hands, see `Hands` [m/s²].
+        traffic: stretches per lap, on average, on which somebody slower is ahead.
+        traffic_speed: of those, drawn for each [m/s].
     """
 
     name: ClassVar[str] = "laps"
@@ -53,9 +60,13 @@ class Laps(Manoeuvre):
     top_speed: float | None = None
     flat: bool = False
     half_width: float = 5.0
+    corrections: Range = 0.0
+    traffic: float = 0.0
+    traffic_speed: tuple[float, float] = (8.0, 30.0)
 
     def __post_init__(self) -> None:
         require(self, severity=(0.05, 1.0), ripple=(0.0, 0.5), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
+        require(self, corrections=(0.0, 5.0), traffic=(0.0, 20.0), traffic_speed=(3.0, 100.0))
         course_by_name(self.course)
         if (self.duration is None) == (self.laps is None):
             raise ConfigurationError("manoeuvre 'laps' needs either a duration [s] or a number of laps")
@@ -71,6 +82,15 @@ class Laps(Manoeuvre):
         """The duration, or long enough for the laps."""
         return self.duration if self.duration is not None else 1000.0 * (self.laps or 1)
 
+    def description(self) -> dict[str, Any]:
+        """Name and parameters; of corrections and traffic only where there are any."""
+        words = super().description()
+        if self.corrections == 0.0:
+            del words["corrections"]
+        if self.traffic == 0.0:
+            del words["traffic"], words["traffic_speed"]
+        return words
+
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the style and the habits of this seed."""
         course, driver = _course(self.course, self.flat), draw_driver(seed)
@@ -79,15 +99,35 @@ class Laps(Manoeuvre):
         style = draw_style(seed, (min(low, room), min(high, room)), self.ripple, self.line_offset)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
         highest = self.top_speed if self.top_speed is not None else math.inf
+        hands = None
+        if self.corrections != 0.0:
+            generator = generator_of(seed)
+            hands = Hands(draw(self.corrections, generator), generator)
 
         def plan(n_laps: int) -> Plan:
-            return plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=highest)
+            speeds = self._held_up(course, n_laps, highest, seed) if self.traffic else highest
+            return plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=speeds)
 
         laps = self.laps if self.laps is not None else math.ceil((self.duration or 0.0) / _lap_time(plan(2), course.length)) + 1
         end = (1 + self.laps) * course.length if self.laps is not None else math.inf
         drawn = {"style": asdict(style), "driver": asdict(driver)}
         end_time = self.duration if self.duration is not None else math.inf
-        return LapDriver(plan(laps + 2), car, driver, course.length, end, drawn, end_time=end_time)
+        if hands is not None:
+            drawn["corrections"] = hands.size
+        return LapDriver(plan(laps + 2), car, driver, course.length, end, drawn, end_time=end_time, hands=hands)
+
+    def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
+        """Highest speeds along the way [m/s]: those of whoever is ahead, on stretches that are drawn lap by lap."""
+        cells, spacing = len(course.arc_length) - 1, float(course.arc_length[1])
+        speeds = np.full(n_laps * cells + 1, highest)
+        for lap in range(n_laps):
+            generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_TRAFFIC_STREAM, lap)))
+            for _ in range(int(generator.poisson(self.traffic))):
+                begin = lap * cells + int(generator.uniform(0.0, cells))
+                length = int(generator.uniform(*TRAFFIC_LENGTH) / spacing)
+                held = speeds[begin : begin + length]
+                held[:] = np.minimum(held, generator.uniform(*self.traffic_speed))
+        return speeds
 
 
 @dataclass(frozen=True)
@@ -218,6 +258,7 @@ class LapDriver(Follower):
         drawn: what the seed decided.
         stop_time: time from the end to the stand [s]; by default the drive is over at the end.
         end_time: at which the drive is over wherever the car is [s].
+        hands: corrections beside the line; by default none.
     """
 
     def __init__(
@@ -230,10 +271,11 @@ class LapDriver(Follower):
         drawn: dict[str, Any],
         stop_time: float | None = None,
         end_time: float = math.inf,
+        hands: Hands | None = None,
     ) -> None:
         times = np.concatenate([[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))])
         on_line = np.interp(lap, plan.distance, times)
-        super().__init__(plan, car, driver, progress=float(np.interp(on_line - SETTLING_TIME, times, plan.distance)))
+        super().__init__(plan, car, driver, progress=float(np.interp(on_line - SETTLING_TIME, times, plan.distance)), hands=hands)
         self.drawn, self._end, self._stop_time, self._end_time = drawn, end, stop_time, end_time
         self._stop: tuple[float, float] | None = None  # when it began, and at which speed
 

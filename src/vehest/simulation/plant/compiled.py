@@ -225,8 +225,27 @@ def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
     return math.ceil(step / (per_velocity * max(slowest, SMALLEST_WHEEL_VELOCITY)))
 
 
-def _advance(state, regime, inputs, vector, friction, step, n_steps):  # type: ignore[no-untyped-def]
+@_compile
+def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
+    """Lateral forces over load after a part of a step: while rolling they follow what the slip asks for over a length of the way.
+
+    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7), of the force over the load, exact for what was asked
+    for at the part's beginning; at the tyres of a slow or sliding car, which other equations hold, there is no lag.
+    """
+    for i in range(4):
+        if regime == ROLLING:
+            length = vector[len(vector) - (2 if i < 2 else 1)]
+            held[i] += (held[4 + i] - held[i]) * (1.0 - math.exp(-abs(x[VX]) * part / length) if length > 0.0 else 1.0)
+        else:
+            held[i] = forces[4 + i] / forces[8 + i]
+
+
+def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before):  # type: ignore[no-untyped-def]
     p = _unpack(vector, friction)
+    lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
+    held = np.empty(8)
+    for i in range(4):
+        held[i] = held[4 + i] = held_before[i]
     friction_front, friction_rear = _sliding_friction(p.tire), _sliding_friction(p.tire_rear)
     x = state.copy()
     stage = np.empty(N_STATES)
@@ -235,12 +254,14 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps):  # type: i
     for _ in range(n_steps):
         regime = next_regime(regime, x, p)
         slid = slid or regime == SLIDING
-        contact = (regime, inputs, friction_front, friction_rear)
+        contact = (regime, inputs, friction_front, friction_rear, lags, held)
         n_parts = _n_substeps(regime, x, p, step)
         part = step / n_parts
         for _ in range(n_parts):
             # The library sets a negative wheel speed to zero in the state it is given; that must reach x itself.
-            _right_hand_side(x, contact, p, k1)
+            forces = _right_hand_side(x, contact, p, k1)
+            if lags:
+                _relax(held, regime, forces, x, vector, 0.5 * part)
             for i in range(N_STATES):
                 stage[i] = x[i] + 0.5 * part * k1[i]
             _right_hand_side(stage, contact, p, k2)
@@ -249,7 +270,9 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps):  # type: i
             _right_hand_side(stage, contact, p, k3)
             for i in range(N_STATES):
                 stage[i] = x[i] + part * k3[i]
-            _right_hand_side(stage, contact, p, k4)
+            forces = _right_hand_side(stage, contact, p, k4)
+            if lags:
+                _relax(held, regime, forces, stage, vector, 0.5 * part)
             for i in range(N_STATES):
                 x[i] += part / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
             for i in range(FIRST_WHEEL, FIRST_WHEEL + 4):
@@ -262,15 +285,18 @@ def _advance(state, regime, inputs, vector, friction, step, n_steps):  # type: i
         if not abs(x[ROLL]) < ROLLED_OVER:
             break
     regime = next_regime(regime, x, p)
-    return x, regime, slid or regime == SLIDING
+    return x, regime, slid or regime == SLIDING, held[:4].copy()
 
 
-def _evaluate(states, regimes, inputs, vector, frictions):  # type: ignore[no-untyped-def]
+def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignore[no-untyped-def]
+    lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
+    held = np.empty(8)
     n_samples = len(states)
     derivatives, forces = np.empty((n_samples, N_STATES)), np.empty((n_samples, N_FORCES))
     for k in range(n_samples):
         p = _unpack(vector, frictions[k])
-        contact = (regimes[k], inputs[k], _sliding_friction(p.tire), _sliding_friction(p.tire_rear))
+        held[:4] = helds[k]
+        contact = (regimes[k], inputs[k], _sliding_friction(p.tire), _sliding_friction(p.tire_rear), lags, held)
         wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
         sine, cosine = math.sin(states[k, STEER]), math.cos(states[k, STEER])
         for i in range(N_FORCES):
@@ -328,11 +354,13 @@ def _digest() -> str:
 
 
 advance = _Kept(_advance)
-"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps) -> state (29,), regime, whether it slid.
+"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, held (4,)) -> state (29,), regime, whether it slid, held (4,).
+
+``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``held`` are lateral forces over load, where these lag.
 
 Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a rollover or NaN."""
 
 evaluate = _Kept(_evaluate)
-"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,)) -> derivatives (T, 29), forces (T, 12).
+"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,), held (T, 4)) -> derivatives (T, 29), forces (T, 12).
 
 Forces: along and across in the level body's axes, then vertical, each for the library's four wheels [N]."""

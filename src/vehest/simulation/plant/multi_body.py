@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -69,11 +69,13 @@ class PlantState:
         values: the library's states, (29,).
         regime: which equations hold.
         spun: whether the car has been in a spin since its start.
+        held: lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag.
     """
 
     values: FloatArray
     regime: Regime
     spun: bool = False
+    held: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @property
     def x(self) -> float:
@@ -149,7 +151,7 @@ class MultiBodyPlant:
 
     @cached_property
     def _vector(self) -> FloatArray:
-        return parameter_vector(self.parameters)
+        return np.append(parameter_vector(self.parameters), self.vehicle.relaxation)
 
     @property
     def wheelbase(self) -> float:
@@ -189,15 +191,15 @@ class MultiBodyPlant:
             SimulationError: the car rolled over, or a state is not finite.
         """
         inputs = _writable(inputs)
-        values, regime, slid = compiled.advance(
-            state.values, int(state.regime), inputs, self._vector, float(friction), self.step, int(n_steps)
+        values, regime, slid, held = compiled.advance(
+            state.values, int(state.regime), inputs, self._vector, float(friction), self.step, int(n_steps), state.held
         )
         if not abs(values[ROLL]) < compiled.ROLLED_OVER or not np.isfinite(values).all():
             raise SimulationError(
                 f"vehicle '{self.vehicle.name}' rolled over or left the range of its equations at {_describe(values)}; lower "
                 f"the grip that is asked of it or the centre of gravity (h_s), or stiffen roll (K_tsf, K_tsr)"
             )
-        return PlantState(values, Regime(regime), state.spun or slid)
+        return PlantState(values, Regime(regime), state.spun or slid, held)
 
     def evaluate(self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
@@ -210,7 +212,9 @@ class MultiBodyPlant:
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
         inputs = _writable(inputs).reshape(-1, N_INPUTS)
-        derivatives, forces = compiled.evaluate(values, regimes, inputs, self._vector, _writable(np.broadcast_to(friction, len(states))))
+        held = np.array([state.held for state in states]).reshape(-1, 4)
+        frictions = _writable(np.broadcast_to(friction, len(states)))
+        derivatives, forces = compiled.evaluate(values, regimes, inputs, self._vector, frictions, held)
         return derivatives, forces.reshape(-1, 3, 4)[:, :, MIRRORED]
 
     def motion(

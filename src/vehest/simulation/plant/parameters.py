@@ -10,7 +10,7 @@ import math
 from collections import namedtuple
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from types import MappingProxyType
 from typing import Any
@@ -62,6 +62,7 @@ class Vehicle:
         overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
             values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
         driver: values of a driver who knows this car, by the driver's names; the plant does not read them.
+        relaxation: way over which a tyre's lateral force follows its slip, front and rear [m]; zero for at once.
 
     Raises:
         ConfigurationError: no such set, no such parameter, or a value that is not a finite number.
@@ -71,6 +72,7 @@ class Vehicle:
     parameter_set: int
     overrides: Mapping[str, Any] = field(default_factory=dict)
     driver: Mapping[str, float] = field(default_factory=dict)
+    relaxation: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
@@ -83,21 +85,68 @@ class Vehicle:
         rear_tyre(self)
         for name, value in self.driver.items():
             _require_number(f"vehicle '{self.name}': driver's value '{name}'", value)
+        for place, length in zip(("front", "rear"), self.relaxation, strict=True):
+            _require_number(f"vehicle '{self.name}': relaxation {place}", length)
+            if length < 0.0:
+                raise ConfigurationError(f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m")
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides`` and ``driver``.
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
 
     Raises:
         ConfigurationError: a key is missing or unknown, or see Vehicle.
     """
-    known = {"name", "parameter_set", "overrides", "driver"}
+    known = {"name", "parameter_set", "overrides", "driver", "relaxation"}
     unknown = sorted(set(configuration) - known)
     missing = sorted({"name", "parameter_set"} - set(configuration))
     if unknown or missing:
         raise ConfigurationError(f"vehicle configuration: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
     overrides, driver = configuration.get("overrides") or {}, configuration.get("driver") or {}
-    return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver))
+    lengths = configuration.get("relaxation") or {}
+    if not isinstance(lengths, Mapping) or set(lengths) - {"front", "rear"}:
+        raise ConfigurationError(f"vehicle '{configuration['name']}': relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}")
+    relaxation = (lengths.get("front", 0.0), lengths.get("rear", 0.0))
+    return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver), relaxation)
+
+
+def loaded(vehicle: Vehicle, mass: float, forward: float = 0.0, up: float = 0.0) -> Vehicle:
+    """The vehicle with a payload, a point mass that its springs carry; the same one without.
+
+    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
+
+    Args:
+        vehicle: without it.
+        mass: of the payload [kg].
+        forward, up: its place from the centre of gravity [m].
+
+    Raises:
+        ConfigurationError: the mass is negative, or an axle would carry nothing.
+    """
+    if mass == 0.0:
+        return vehicle
+    p = library_parameters(vehicle)
+    total, wheelbase = p.m + mass, p.a + p.b
+    shift = forward * mass / total
+    if mass < 0.0 or not (p.a - shift > 0.0 and p.b + shift > 0.0):
+        raise ConfigurationError(
+            f"vehicle '{vehicle.name}': a payload of {mass:g} kg at {forward:g} m puts the centre of gravity off the axles"
+        )
+    unsprung = p.m_uf + p.m_ur
+    changed = {
+        "m": total,
+        "m_s": p.m_s + mass,
+        "a": p.a - shift,
+        "b": p.b + shift,
+        "m_uf": unsprung * (p.b + shift) / wheelbase,
+        "m_ur": unsprung * (p.a - shift) / wheelbase,
+        "I_z": p.I_z + mass * p.m / total * forward**2,
+        "I_y_s": p.I_y_s + mass * p.m_s / (p.m_s + mass) * (forward**2 + up**2),
+        "I_Phi_s": p.I_Phi_s + mass * p.m_s / (p.m_s + mass) * up**2,
+        "h_cg": p.h_cg + up * mass / total,
+        "h_s": p.h_s + up * mass / (p.m_s + mass),
+    }
+    return replace(vehicle, overrides={**vehicle.overrides, **changed})
 
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:

@@ -113,13 +113,17 @@ def forces_of_contact(contact, x, u, p, fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, 
     """Longitudinal and lateral forces of the four tyres in the wheels' axes, where the tyre formulas gave fx and fy.
 
     Args:
-        contact: regime, inputs of the plant, friction of sliding front and rear tyres.
+        contact: regime, inputs of the plant, friction of sliding front and rear tyres, whether lateral forces lag, and eight lateral forces
+            over load: the four that the tyres hold now, which are taken, and room for those they tend to.
         x: state.
         u: steering velocity and acceleration within the vehicle's limits.
         p: parameters.
         fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, fz0, fz1, fz2, fz3: forces, in the library's order of wheels.
     """
-    regime, inputs, friction_front, friction_rear = contact
+    regime, inputs, friction_front, friction_rear, lags, held = contact
+    if regime == ROLLING and lags:
+        held[4], held[5], held[6], held[7] = fy0 / fz0, fy1 / fz1, fy2 / fz2, fy3 / fz3
+        return fx0, fx1, fx2, fx3, held[0] * fz0, held[1] * fz1, held[2] * fz2, held[3] * fz3
     if regime == ROLLING:
         return fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3
     sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])

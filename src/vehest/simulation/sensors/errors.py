@@ -26,8 +26,12 @@ def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name:
         name: of the sensor; with the kind of error it chooses the random stream.
     """
     value = delayed(true, level.delay * rate_hz)
+    if level.gain:
+        value = value * (1.0 + level.gain)
     if level.scale:
         value = value * (1.0 + level.scale * stream(seed, f"{name}.scale").standard_normal())
+    if level.bias:
+        value = value + level.bias
     if level.offset:
         value = value + level.offset * stream(seed, f"{name}.offset").standard_normal()
     if level.drift:

@@ -13,7 +13,9 @@ from vehest.data.errors import ConfigurationError
 class SensorLevel:
     """How large the errors of one sensor are; ``unit`` is its channel's unit.
 
-    shown = quantise((1 + scale) true(t - delay) + offset + drift(t) + noise(t))
+    shown = quantise((1 + gain + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
+
+    Gain and bias belong to the car, the same in each of its drives; scale, offset, drift and noise are drawn.
 
     Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
     samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
@@ -26,9 +28,11 @@ class SensorLevel:
         quantisation: step of the values shown [unit].
         delay: age of what is shown; the first value is held before the start [s].
         scale: standard deviation of a relative error that is drawn for each drive [1].
+        gain: relative error of every drive [1].
+        bias: constant of every drive [unit].
 
     Raises:
-        ConfigurationError: a value is negative or not finite, or the correlation time is zero.
+        ConfigurationError: a value is not finite or, but for gain and bias, negative, or the correlation time is zero.
     """
 
     noise: float = 0.0
@@ -38,11 +42,15 @@ class SensorLevel:
     quantisation: float = 0.0
     delay: float = 0.0
     scale: float = 0.0
+    gain: float = 0.0
+    bias: float = 0.0
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if not (math.isfinite(value) and value >= 0.0):
+            if entry.name in ("gain", "bias") and not math.isfinite(value):
+                raise ConfigurationError(f"{entry.name} must be finite, not {value}")
+            if entry.name not in ("gain", "bias") and not (math.isfinite(value) and value >= 0.0):
                 raise ConfigurationError(f"{entry.name} must be zero or positive, not {value}")
         if self.drift_time == 0.0:
             raise ConfigurationError("drift_time must be positive, not 0")
@@ -89,12 +97,22 @@ class Tilt:
     Args:
         roll, pitch: of the body against the road. They also make the gyros measure about the body's axes instead of the road's.
         bank, grade: of the road.
+        roll_share: of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much
+            a negative share.
+
+    Raises:
+        ConfigurationError: the share is not finite.
     """
 
     roll: bool = True
     pitch: bool = True
     bank: bool = True
     grade: bool = True
+    roll_share: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.roll_share):
+            raise ConfigurationError(f"roll_share must be finite, not {self.roll_share}")
 
 
 @dataclass(frozen=True)
@@ -222,6 +240,8 @@ class SensorLevels:
             a motor show it.
         motor_current: the same; assumed.
         vibration: of the inertial unit with the wheels' speed; none.
+        speed_of_wheels: the forward speed is what the front wheels' mean speed gives with a radius that fits on the straight, instead of
+            the body's: it errs with steering angle and slip.
     """
 
     vx: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.0028, delay=0.02, scale=0.005)
@@ -242,6 +262,7 @@ class SensorLevels:
     motor_speed: SensorLevel = SensorLevel(noise=0.01, delay=0.01, scale=0.002)
     motor_current: SensorLevel = SensorLevel(noise=0.1, offset=0.5, delay=0.01, scale=0.02)
     vibration: Vibration = Vibration()
+    speed_of_wheels: bool = False
 
 
 NO_ERRORS = ("kind", "drift_time")

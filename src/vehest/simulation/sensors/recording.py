@@ -43,7 +43,8 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
         levels: of the sensors' errors.
         seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
     """
-    true = {"vx": motion.vx, "steer": motion.steer, **_inertial(motion, levels, seed)}
+    speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
+    true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
     sensor_of = {name: name for name in true}
     for sensor, values in (
         ("wheel_speed", motion.wheel_speed),
@@ -66,7 +67,28 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
     absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
     if levels.vibration == Vibration():
         absent.add("vibration")
-    return {name: value for name, value in asdict(levels).items() if name not in absent}
+    if not levels.speed_of_wheels:
+        absent.add("speed_of_wheels")
+    return {name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent}
+
+
+_IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}
+"""Values that do nothing, and are not said."""
+
+
+def _without_idle(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {name: _without_idle(inner) for name, inner in value.items() if name not in _IDLE or inner != _IDLE[name]}
+
+
+def _speed_of_wheels(motion: Motion) -> FloatArray:
+    """Mean speed of the front wheels times the radius that fits where the car goes straight [m/s], (T,)."""
+    turning = motion.wheel_speed[:, :2].mean(axis=1)
+    straight = np.abs(motion.steer) <= np.quantile(np.abs(motion.steer), 0.3)
+    rolling = float(np.dot(turning[straight], turning[straight]))
+    radius = float(np.dot(motion.vx[straight], turning[straight])) / rolling if rolling > 0.0 else 0.0
+    return turning * radius
 
 
 def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
@@ -88,7 +110,7 @@ def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
             GRAVITY * np.cos(grade) * np.cos(bank),
         ]
     )
-    return _turned(road, motion.roll * tilt.roll, motion.pitch * tilt.pitch)
+    return _turned(road, motion.roll * (tilt.roll * tilt.roll_share), motion.pitch * tilt.pitch)
 
 
 def body_rates(motion: Motion, tilt: Tilt | None = None) -> FloatArray:

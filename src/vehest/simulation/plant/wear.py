@@ -1,0 +1,58 @@
+"""What tyres lose over a stint: grip while they are cold, and grip that is worn away."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from vehest.data.errors import ConfigurationError
+from vehest.simulation.plant.parameters import is_number
+
+
+@dataclass(frozen=True)
+class Stint:
+    """Friction of the tyres over the time of a drive, as a factor of what it is when they are warm and new; all values are assumed.
+
+    factor(t) = (1 - cold exp(-t/warm_time)) (1 - wear min(t/wear_time, 1))
+
+    Args:
+        cold: share that cold tyres lack at the first sample.
+        warm_time: time constant of warming up [s].
+        wear: share that is lost over ``wear_time``.
+        wear_time: [s].
+
+    Raises:
+        ConfigurationError: a share is not between 0 and 0.5, or a time not positive.
+    """
+
+    cold: float = 0.0
+    warm_time: float = 120.0
+    wear: float = 0.0
+    wear_time: float = 1200.0
+
+    def __post_init__(self) -> None:
+        for name in ("cold", "wear"):
+            if not 0.0 <= getattr(self, name) <= 0.5:
+                raise ConfigurationError(f"tyres: {name} is a share between 0 and 0.5, not {getattr(self, name)}")
+        for name in ("warm_time", "wear_time"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ConfigurationError(f"tyres: {name} must be positive, not {getattr(self, name)} s")
+
+    def friction_at(self, time: float) -> float:
+        """The factor at a time after the first sample [s]; before it, that of the first."""
+        since = max(time, 0.0)
+        return (1.0 - self.cold * math.exp(-since / self.warm_time)) * (1.0 - self.wear * min(since / self.wear_time, 1.0))
+
+
+def stint_from_config(values: Any) -> Stint:
+    """A stint as a drive's ``tyres`` spells it: ``{cold: 0.06, wear: 0.04}``.
+
+    Raises:
+        ConfigurationError: an unknown name, or see Stint.
+    """
+    known = [entry.name for entry in fields(Stint)]
+    if not isinstance(values, Mapping) or set(values) - set(known) or not all(is_number(value) for value in values.values()):
+        raise ConfigurationError(f"tyres is a mapping of numbers from {', '.join(known)}, not {values}")
+    return Stint(**{str(name): float(value) for name, value in values.items()})
