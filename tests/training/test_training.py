@@ -18,7 +18,7 @@ from vehest.estimators.registry import estimator_class
 from vehest.training.checkpoints import resume_epoch
 from vehest.training.context import FitContext
 from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
-from vehest.training.supervised import SupervisedSettings
+from vehest.training.supervised import SupervisedSettings, _shuffle_seed
 
 DATA = FitData([planar_drive(30.0, seed=1, noise=0.05)], [planar_drive(15.0, seed=2, noise=0.05)])
 SHAPES = [("ksnn", {"n_hidden": 1, "bias": True}), ("gru", {"n_states": 2}), ("lstm", {"n_states": 2})]
@@ -186,6 +186,8 @@ def test_direct_search_stays_in_its_box():
         ({"batch_size": 0}, "batch_size must be at least 1"),
         ({"patience": "soon"}, "patience must be a whole number"),
         ({"dtype": "float16"}, "dtype 'float16' is not one of"),
+        ({"averaging": 1.0}, "averaging must be at least 0 and below 1"),
+        ({"averaging": -0.1}, "averaging must be at least 0 and below 1"),
         ({"momentum": 0.9}, "momentum is not an option"),
         ({"compiled": "yes"}, "compiled must be true or false"),
     ],
@@ -200,3 +202,84 @@ def test_training_leaves_the_global_random_state_alone():
     before = torch.random.get_rng_state()
     _fit("gru", {"n_states": 2}, [3], SupervisedSettings(max_epochs=1))
     assert torch.equal(before, torch.random.get_rng_state())
+
+
+def _loop_with_all_its_weights(averaging):
+    """A plain loop over the same batches that keeps the weights of every step, and averages them by the closed form at each epoch's end."""
+    member = estimator_class("ksnn").from_config({"n_hidden": 1, "bias": True})
+    member.seed(3)
+    network = member._seeded_network(list(DATA.train), torch.float64)
+    sets = [windows_of(part, member.channels, "vy_ref", member.settings.window) for part in (DATA.train, DATA.validation)]
+    (x, y), (x_validation, y_validation) = (
+        (torch.as_tensor(w.series, dtype=torch.float64).unfold(0, w.n_window, 1).transpose(1, 2)[w.starts], torch.as_tensor(w.targets))
+        for w in sets
+    )
+    adam = torch.optim.Adam(network.parameters(), lr=1e-2)
+    generator = torch.Generator().manual_seed(_shuffle_seed(3))
+    steps, averages, losses = [], [], []
+    for _ in range(4):
+        for batch in torch.randperm(len(y), generator=generator).split(64):
+            adam.zero_grad()
+            (network(x[batch]) - y[batch]).square().mean().backward()
+            adam.step()
+            with torch.no_grad():
+                network.constrain({name: values.unsqueeze(0) for name, values in network.named_parameters()})
+            steps.append(torch.cat([p.detach().reshape(-1).clone() for p in network.parameters()]))
+        weights = averaging ** torch.arange(len(steps) - 1, -1, -1, dtype=torch.float64)
+        averages.append((weights[:, None] * torch.stack(steps)).sum(0) / weights.sum())
+        kept = [p.detach().clone() for p in network.parameters()]
+        with torch.no_grad():
+            torch.nn.utils.vector_to_parameters(averages[-1].clone(), network.parameters())
+            losses.append(float((network(x_validation) - y_validation).square().mean()))
+            for parameter, values in zip(network.parameters(), kept, strict=True):
+                parameter.copy_(values)
+    torch.nn.utils.vector_to_parameters(averages[int(np.argmin(losses))], network.parameters())
+    return network, losses
+
+
+def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step():
+    settings = SupervisedSettings(dtype="float64", max_epochs=4, learning_rate=1e-2, averaging=0.9)
+    (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
+    network, losses = _loop_with_all_its_weights(0.9)
+    assert np.allclose(record.history["validation_loss"], losses, rtol=1e-9)
+    for own, other in zip(member.network.parameters(), network.parameters(), strict=True):
+        assert torch.allclose(own, other, rtol=0, atol=1e-10)
+
+
+def test_averaging_never_reaches_the_optimiser():
+    (_,), (plain,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5))
+    (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
+    assert averaged.history["train_loss"] == plain.history["train_loss"]
+    assert averaged.history["validation_loss"] != plain.history["validation_loss"]
+
+
+def test_validation_loss_of_averaged_weights_jumps_less():
+    def jumps(averaging):
+        settings = SupervisedSettings(max_epochs=30, patience=30, learning_rate=1e-2, averaging=averaging)
+        _, (record,) = _fit("gru", {"n_states": 3}, [1], settings)
+        return np.abs(np.diff(record.history["validation_loss"][10:], n=2)).mean()
+
+    assert jumps(0.98) < 0.5 * jumps(0.0)
+
+
+@pytest.mark.parametrize(("name", "config"), SHAPES)
+def test_members_with_averaged_weights_equal_training_each_alone(name, config):
+    settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2, averaging=0.9)
+    together, records = _fit(name, config, [0, 1, 2, 3], settings)
+    assert len({record.metrics["epochs"] for record in records}) > 1, "members must stop at different times for this to mean anything"
+    for seed, member, record in zip(range(4), together, records, strict=True):
+        (alone,), (own,) = _fit(name, config, [seed], settings)
+        assert own.metrics["epochs"] == record.metrics["epochs"]
+        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("batches", [2, 25])
+def test_interrupted_training_with_averaged_weights_goes_on_to_the_same_result(tmp_path: Path, batches):
+    settings = SupervisedSettings(max_epochs=12, patience=4, averaging=0.95)
+    whole, whole_records = _fit("lstm", {"n_states": 2}, [0, 1, 2], settings)
+    folders = [tmp_path / str(seed) for seed in range(3)]
+    _fit("lstm", {"n_states": 2}, [0, 1, 2], settings, FitContext(folders, should_stop=_StopAfter(batches)))
+    resumed, records = _fit("lstm", {"n_states": 2}, [0, 1, 2], settings, FitContext(folders))
+    for one, other, record, resumed_record in zip(whole, resumed, whole_records, records, strict=True):
+        assert np.array_equal(_weights(one), _weights(other))
+        assert record.history == resumed_record.history

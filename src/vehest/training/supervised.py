@@ -28,6 +28,8 @@ class SupervisedSettings:
         batch_size: windows in a batch.
         max_epochs: epochs after which training ends in any case.
         patience: epochs without a better validation loss after which a member stops.
+        averaging: decay a step of an exponential moving average of the weights, corrected for its start; it is the average that is
+            validated and kept. 0: none, the weights themselves are.
         dtype: ``float32`` or ``float64``.
         compiled: use the compiled recursion where the network has one; plain PyTorch otherwise.
         start_from: a model, by its folder or the start of its name, or ``pretrained``: its weights are where training starts.
@@ -38,6 +40,7 @@ class SupervisedSettings:
     batch_size: int = 64
     max_epochs: int = 1000
     patience: int = 25
+    averaging: float = 0.0
     dtype: Literal["float32", "float64"] = "float32"
     compiled: bool = True
     start_from: str | None = None
@@ -49,6 +52,8 @@ class SupervisedSettings:
         for name in ("batch_size", "max_epochs", "patience"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.averaging < 1:
+            raise ConfigurationError(f"training.averaging must be at least 0 and below 1, not {self.averaging}")
         if self.dtype not in ("float32", "float64"):
             raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
 
@@ -110,7 +115,7 @@ def train_members(
         ConfigurationError: a network does not return one number a window.
 
     Source:
-        Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015.
+        Da Lio et al. 2023, Section VI-B; Kingma & Ba, Adam, 2015, Section 7.2 for the averaging of the weights.
     """
     run = _Run(networks, seeds, train, validation, settings, context)
     run.resume()
@@ -120,7 +125,7 @@ def train_members(
 
 
 class _Run:
-    """State of one training; rows of ``flat`` and of Adam's moments belong to the members in ``active``."""
+    """State of one training; rows of ``flat``, of its average and of Adam's moments belong to the members in ``active``."""
 
     def __init__(
         self,
@@ -146,6 +151,7 @@ class _Run:
         self.epoch = 0  # of the members still active
         self.interrupted = False
         self.started = self.saved = time.monotonic()
+        self.average: Tensor | None = None  # of ``flat`` over the steps so far; none before the first, and without averaging
         self._set_parameters(flat, None)
 
     def _set_parameters(self, flat: Tensor, moments: tuple[Tensor, Tensor, Tensor] | None) -> None:
@@ -178,9 +184,26 @@ class _Run:
             self.adam.step()
             with torch.no_grad():
                 constrain(self.network, self.layout.views(self.flat.detach()))
+            if self.settings.averaging:
+                self._average()
             total += losses.detach().double() * batch.shape[1]
         self.epoch += 1
         self._judge(total / len(self.train))
+
+    def _average(self) -> None:
+        """Take the weights after this step into their average, θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t.
+
+        The factor in front, with which the weights add up to one from the first step on, is in the step's share of the recursion.
+        """
+        if self.average is None:
+            self.average = self.flat.detach().clone()
+            return
+        decay, step = self.settings.averaging, float(self.adam.state[self.flat]["step"])
+        self.average.lerp_(self.flat.detach(), (1.0 - decay) / (1.0 - decay**step))
+
+    def _judged(self) -> Tensor:
+        """The weights that are validated and kept: the average where there is one."""
+        return self.flat.detach() if self.average is None else self.average
 
     def _batch_seeds(self) -> list[int]:
         """What plain networks draw from for one batch (dropout), one seed an active member; compiled ones draw nothing."""
@@ -197,7 +220,7 @@ class _Run:
         self.network.eval()
         with torch.no_grad():
             starts = self.validation.starts.expand(len(self.active), -1)
-            prediction = self._predict(self.layout.views(self.flat.detach()), self.validation, starts)
+            prediction = self._predict(self.layout.views(self._judged()), self.validation, starts)
             loss = (prediction.double() - self.validation.targets.double()).square().mean(dim=1)
         for row, member in enumerate(self.active.tolist()):
             self.history[member][0].append(float(train_loss[row]))
@@ -209,7 +232,7 @@ class _Run:
                 )
         better = loss < self.best_loss[self.active]
         improved = self.active[better]
-        self.best[improved] = self.flat.detach()[better]
+        self.best[improved] = self._judged()[better]
         self.best_loss[improved] = loss[better]
         self.best_epoch[improved] = self.epoch
         going_on = self.epoch - self.best_epoch[self.active] < self.settings.patience
@@ -226,6 +249,7 @@ class _Run:
         moments = self._moments()
         assert moments is not None
         self.active = self.active[rows]
+        self.average = None if self.average is None else self.average[rows]
         self._set_parameters(self.flat.detach()[rows], (moments[0], moments[1][rows], moments[2][rows]))
 
     def _checkpoints(self) -> list[Checkpoint]:
@@ -240,6 +264,8 @@ class _Run:
                 tensors |= {"generator": generator.get_state(), "parameters": self.flat.detach()[row].clone()}
                 if moments is not None:
                     tensors |= {"step": moments[0].clone(), "mean": moments[1][row].clone(), "square": moments[2][row].clone()}
+                if self.average is not None:
+                    tensors["average"] = self.average[row].clone()
             train_loss, validation_loss = self.history[member]
             values = {
                 "finished": row is None,
@@ -281,6 +307,8 @@ class _Run:
             moments = None
             if "step" in states[0]:
                 moments = (states[0]["step"], torch.stack([s["mean"] for s in states]), torch.stack([s["square"] for s in states]))
+            if "average" in states[0]:
+                self.average = torch.stack([s["average"] for s in states])
             self._set_parameters(torch.stack([s["parameters"] for s in states]), moments)
 
     def finish(self) -> list[TrainingRecord]:
