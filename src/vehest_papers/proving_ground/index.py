@@ -8,6 +8,7 @@ import pandas as pd
 
 from vehest.report.document import Block, Column, Document, Table, as_code, as_text
 from vehest.studies.artefacts import StudyArtefacts
+from vehest_papers.proving_ground import gates
 from vehest_papers.proving_ground.papers import profile_of
 from vehest_papers.proving_ground.tables import COLUMNS, OVERVIEW, accidents, flagged_table, how_to_get, row_of
 from vehest_papers.proving_ground.tally import FINE, FLAGS, MOVING
@@ -26,6 +27,7 @@ def index_document(artefacts: StudyArtefacts, pages: Mapping[str, VehiclePage]) 
         "## Vehicles",
         _overview(pages),
         "\n".join(f"- [{profile_of(name).title}]({name}.md): {_figures_in_words(name)}" for name in pages),
+        *gates.blocks(artefacts.datasets),
         accidents(flagged, simulated),
     ]
     if flagged:

@@ -10,7 +10,7 @@ from vehest.report.document import Block, Column, Document, Figure, Table, as_co
 from vehest.report.style import fixed, significant
 from vehest.simulation.sensors.noise_reading import NOISE_ABOVE
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
-from vehest_papers.proving_ground import drawing, noise
+from vehest_papers.proving_ground import drawing, gates, noise
 from vehest_papers.proving_ground.index import index_document
 from vehest_papers.proving_ground.papers import Profile, profile_of
 from vehest_papers.proving_ground.tables import COLUMNS, QUANTITIES, accidents, flagged_table, how_to_get, row_of
@@ -27,7 +27,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     Raises:
         DataError: a recording lacks a channel that is shown.
     """
-    pages = survey(artefacts.datasets)
+    names = {own.name for own in artefacts.datasets}
+    pages = survey([own for own in artefacts.datasets if own.name != gates.BEFORE or gates.AFTER not in names])
     return {"report": index_document(artefacts, pages), **{name: _page(artefacts, page) for name, page in pages.items()}}
 
 

@@ -110,7 +110,7 @@ class Laps(Manoeuvre):
 
         laps = self.laps if self.laps is not None else math.ceil((self.duration or 0.0) / _lap_time(plan(2), course.length)) + 1
         end = (1 + self.laps) * course.length if self.laps is not None else math.inf
-        drawn = {"style": asdict(style), "driver": asdict(driver)}
+        drawn: dict[str, Any] = {"style": asdict(style), "driver": asdict(driver)}
         end_time = self.duration if self.duration is not None else math.inf
         if hands is not None:
             drawn["corrections"] = hands.size

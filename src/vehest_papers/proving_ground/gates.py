@@ -1,0 +1,298 @@
+"""Gates on the simulated race cars: what their inputs must look like before any network is trained on them.
+
+Fixed by what Da Lio et al. 2023 print of their recordings (Table I, Section VII-A) and by the one real recording at hand. No estimator's
+error is among them but that of the static map on its own car, which says how much of v needs more than a map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from vehest.constants import FloatArray
+from vehest.data.recording import Recording
+from vehest.data.transforms import Resample
+from vehest.evaluation.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest.report.document import Block, Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
+from vehest.studies.artefacts import StoredDataset
+from vehest_papers.proving_ground.papers import PROFILES
+
+BEFORE, AFTER = "sim_two_cars", "sim_race_cars"
+"""Data sets whose gates are shown: the first simulated cars, and those that the study of the KS-NN learns on."""
+RATE_HZ = 20.0
+"""Rate of the paper's recordings, at which all is read."""
+BANDS_HZ = tuple(float(0.1 * 2.0 ** (step / 3.0)) for step in range(14))
+"""Centres of thirds of an octave, 0.1 to 2.0 Hz."""
+SPECTRUM_DB = 3.0
+MAP_RANGE = (0.08, 0.13)
+"""FVU of a static map fitted on the car itself; the real Ferrari: 0.10."""
+BIAS_WITHIN = 0.03
+BIASES = {"c": 0.10, "f": -0.03}
+"""Mean of dv/dt - (ay - ωu) by car [m/s²] (Section VII-A1)."""
+CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}
+"""First letter of a drive -> the car that it is like."""
+
+QUANTITIES = {
+    "vy_q01": ("v, 1 % quantile [m/s]", "relative", 0.20),
+    "vy_q99": ("v, 99 % quantile [m/s]", "relative", 0.20),
+    "ay_abs_q99": ("|ay|, 99 % quantile [m/s²]", "relative", 0.05),
+    "ratio": ("v over ay, 1 to 99 % [s]", "relative", 0.20),
+    "vx_min": ("lowest speed [m/s]", "absolute", 4.0),
+    "vx_max": ("highest speed [m/s]", "absolute", 5.0),
+    "yaw_rate_min": ("lowest yaw rate [rad/s]", "relative", 0.15),
+    "yaw_rate_max": ("highest yaw rate [rad/s]", "relative", 0.15),
+    "distance": ("length [km]", "relative", 0.05),
+    "duration": ("duration [min]", "relative", 0.05),
+}
+"""Quantity of Table I -> its name, and how far from the paper's value it may lie: the paper's own two sets of a car are up to
+24 % apart in v, 2.4 % in ay, 30 % in the lowest speed and 7 % in the yaw rate."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One quantity of one set of drives, and the range that it must lie in.
+
+    Args:
+        of: set or car.
+        quantity: in words, with its unit.
+        wanted: what the paper or the real recording has, in words.
+        low, high: the range, both ends included.
+        values: data set -> what it has; a data set without these drives is left out.
+    """
+
+    of: str
+    quantity: str
+    wanted: str
+    low: float
+    high: float
+    values: Mapping[str, float]
+
+    def met(self, dataset: str) -> bool:
+        """Whether a data set's value lies in the range."""
+        return dataset in self.values and self.low <= self.values[dataset] <= self.high
+
+
+def static_map_left(recordings: Sequence[Recording]) -> float:
+    """FVU of v = r (b - k u²) with both numbers fitted by least squares on the very recordings."""
+    u, r, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "vy_ref"))
+    basis = np.stack([r, -r * u**2], axis=1)
+    left = v - basis @ np.linalg.lstsq(basis, v, rcond=None)[0]
+    return float(np.var(left) / np.var(v))
+
+
+def table_one(recordings: Sequence[Recording]) -> dict[str, float]:
+    """The paper's Table I of some recordings at `RATE_HZ`, by the names of `QUANTITIES`."""
+    u, r, ay, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "ay", "vy_ref"))
+    low, high = np.quantile(v, [0.01, 0.99])
+    most = float(np.quantile(np.abs(ay), 0.99))
+    return {
+        "vy_q01": float(low),
+        "vy_q99": float(high),
+        "ay_abs_q99": most,
+        "ratio": float(high - low) / (2.0 * most),
+        "vx_min": float(u.min()),
+        "vx_max": float(u.max()),
+        "yaw_rate_min": float(r.min()),
+        "yaw_rate_max": float(r.max()),
+        "distance": sum(float(own["vx"].sum() / own.rate_hz) for own in recordings) / 1000.0,
+        "duration": sum(own.duration for own in recordings) / 60.0,
+    }
+
+
+def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
+    """Of dv/dt, and of the process noise dv/dt - (ay - ωu)."""
+    rate = recordings[0].rate_hz
+    return periodogram([lateral_velocity_rate(own) for own in recordings], rate), periodogram(
+        [process_noise(own) for own in recordings], rate
+    )
+
+
+def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> list[Gate]:
+    """All gates.
+
+    Args:
+        drives: data set -> set of drives, ``c1`` say -> its recordings at `RATE_HZ`.
+        real: the real Ferrari's, at the same rate; empty where it is not at hand, and the gate on its spectrum is then left out.
+    """
+    found = [gate for page in ("corvette_grand_sport", "ferrari_250_lm") for gate in _of_table_one(page, drives)]
+    by_car = {
+        name: {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
+        for name, sets in drives.items()
+    }
+    for letter, car in CARS.items():
+        own = {name: cars[letter] for name, cars in by_car.items() if cars[letter]}
+        if letter in BIASES:
+            wanted = BIASES[letter]
+            values = {name: mean_bias(recordings) for name, recordings in own.items()}
+            found.append(
+                Gate(car, "mean bias of ay − ωu [m/s²]", f"{fixed(wanted, 2)}", wanted - BIAS_WITHIN, wanted + BIAS_WITHIN, values)
+            )
+        left = {name: static_map_left(recordings) for name, recordings in own.items()}
+        found.append(Gate(car, "FVU of the car's own static map", "0.10 (real Ferrari)", *MAP_RANGE, left))
+    if real:
+        noise = spectra_of(real)[1]
+        for hz in BANDS_HZ:
+            values = {name: decibels(spectra_of(cars["f"])[1].level(hz), noise.level(hz)) for name, cars in by_car.items() if cars["f"]}
+            found.append(
+                Gate("Ferrari", f"process noise at {hz:.2g} Hz, against the real one [dB]", "0", -SPECTRUM_DB, SPECTRUM_DB, values)
+            )
+    return found
+
+
+def _of_table_one(page: str, drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> list[Gate]:
+    found = []
+    for paper in PROFILES[page].sets:
+        published = {name: value for name, value in paper.values.items() if name in QUANTITIES}
+        published["ratio"] = (published["vy_q99"] - published["vy_q01"]) / (2.0 * published["ay_abs_q99"])
+        published["distance"], published["duration"] = published["distance"] / 1000.0, published["duration"] / 60.0
+        ours = {name: table_one(sets[paper.drives]) for name, sets in drives.items() if sets.get(paper.drives)}
+        for name, (title, how, within) in QUANTITIES.items():
+            wanted = published[name]
+            room = within * abs(wanted) if how == "relative" else within
+            values = {dataset: own[name] for dataset, own in ours.items()}
+            found.append(Gate(paper.name, title, f"{wanted:.3g}", wanted - room, wanted + room, values))
+    return found
+
+
+def drives_of(datasets: Sequence[StoredDataset]) -> tuple[dict[str, dict[str, list[Recording]]], list[Recording]]:
+    """Recordings at `RATE_HZ` with what gates read: of the simulated race cars by data set and set, and of the real Ferrari."""
+    drives: dict[str, dict[str, list[Recording]]] = {}
+    real: list[Recording] = []
+    for dataset in datasets:
+        if dataset.name not in (BEFORE, AFTER) and dataset.name != PROFILES["ferrari_250_lm"].counterpart:
+            continue
+        for recording in dataset.recordings():
+            kept = Resample(RATE_HZ)(recording.select(["vx", "yaw_rate", "ay", "vy_ref"]))
+            if dataset.kind == "real":
+                real.append(kept)
+            else:
+                drives.setdefault(dataset.name, {}).setdefault(recording.id.split("_")[0], []).append(kept)
+    return drives, real
+
+
+def blocks(datasets: Sequence[StoredDataset]) -> list[Block]:
+    """The table of gates with its verdict in a sentence, and the spectra; nothing where the race cars are not among the data sets."""
+    drives, real = drives_of(datasets)
+    if AFTER not in drives:
+        return []
+    found = gates(drives, real)
+    rows = [
+        {
+            "of": gate.of,
+            "quantity": gate.quantity,
+            "wanted": gate.wanted,
+            "low": gate.low,
+            "high": gate.high,
+            "before": gate.values.get(BEFORE, np.nan),
+            "after": gate.values.get(AFTER, np.nan),
+            "met": "yes" if gate.met(AFTER) else "NO",
+        }
+        for gate in found
+    ]
+    missed = [f"{gate.of}: {gate.quantity} ({gate.values.get(AFTER, np.nan):.3g})" for gate in found if not gate.met(AFTER)]
+    met_before = sum(gate.met(BEFORE) for gate in found)
+    verdict = f"{len(found) - len(missed)} of {len(found)} gates are met by `{AFTER}`"
+    verdict += f"; before, by `{BEFORE}`, {met_before} were." if BEFORE in drives else "."
+    verdict += f" Not met: {'; '.join(missed)}." if missed else ""
+    absent = "" if real else " The gate on the spectrum needs the real recording, which is not here."
+    table = Table(
+        "gates",
+        "Gates on the simulated race cars' inputs, fixed before any network was trained on them: what the paper prints of its recordings "
+        "or the real Ferrari shows, the range that counts as met, the first simulated cars, and today's.",
+        pd.DataFrame(rows),
+        {
+            "of": Column("of"),
+            "quantity": Column("quantity"),
+            "wanted": Column("paper or real"),
+            "low": Column("from", each=True),
+            "high": Column("to", each=True),
+            "before": Column("before", each=True),
+            "after": Column("after", each=True),
+            "met": Column("met"),
+        },
+    )
+    return [
+        "## Are the race cars as hard as the road?",
+        f"{verdict}{absent} No error of a network or an observer is a gate.",
+        table,
+        _figure(drives, real),
+        _differ(drives[AFTER]),
+    ]
+
+
+def _differ(sets: Mapping[str, Sequence[Recording]]) -> Block:
+    """How much of v a static map of one car leaves on another."""
+    by_car = {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
+    present = {letter: recordings for letter, recordings in by_car.items() if recordings}
+    rows = []
+    for fitted, source in present.items():
+        row: dict[str, object] = {"fitted": CARS[fitted]}
+        weights = _map_of(source)
+        for tested, target in present.items():
+            basis, v = _basis(target)
+            row[tested] = float(np.var(v - basis @ weights) / np.var(v))
+        rows.append({**row, "b": float(weights[0]), "k": 1000.0 * float(weights[1])})
+    return Table(
+        "static_maps",
+        f"FVU that the static map v = r·(b − k·u²) of one car leaves on another, `{AFTER}` (simulated): how far the cars differ. The first "
+        "two cars' maps left 0.06 on each other.",
+        pd.DataFrame(rows),
+        {
+            "fitted": Column("fitted on"),
+            **{letter: Column(f"FVU on the {CARS[letter]}", decimals=3) for letter in present},
+            "b": Column("b [m]", decimals=2),
+            "k": Column("k [10⁻³ s²/m]", decimals=2),
+        },
+    )
+
+
+def _basis(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
+    u, r, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "vy_ref"))
+    return np.stack([r, -r * u**2], axis=1), v
+
+
+def _map_of(recordings: Sequence[Recording]) -> FloatArray:
+    basis, v = _basis(recordings)
+    return np.asarray(np.linalg.lstsq(basis, v, rcond=None)[0])
+
+
+def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> Figure:
+    """Figure 4 of the paper: dv/dt and process noise, the real Ferrari, and each simulated car before and after."""
+    panels: list[tuple[str, Sequence[Recording]]] = [("Ferrari, real", real)] if real else []
+    for letter, car in CARS.items():
+        for name, when in ((BEFORE, "simulated, before"), (AFTER, "simulated, after")):
+            own = [recording for key, part in drives.get(name, {}).items() if key[:1] == letter for recording in part]
+            if own:
+                panels.append((f"{car}, {when}", own))
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 1.9 * ((len(panels) + 1) // 2) + 0.5)
+        grid = figure.subplots((len(panels) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False)
+        for axes in grid.flat[len(panels) :]:
+            axes.set_visible(False)
+        for axes, (title, recordings) in zip(grid.flat, panels, strict=False):
+            rate, noise = spectra_of(recordings)
+            shown = (rate.frequency >= 0.08) & (rate.frequency <= 5.0)
+            axes.loglog(rate.frequency[shown], rate.density[shown], color="#0072B2", label="$\\dot{v}$")
+            axes.loglog(
+                noise.frequency[shown],
+                noise.density[shown],
+                color="#555555",
+                linestyle="dashed",
+                label="process noise $\\dot{v} - (a_y - \\omega u)$",
+            )
+            axes.set_title(title, loc="left")
+            above = decibels(rate.level(1.0), noise.level(1.0))
+            axes.annotate(f"{above:.0f} dB at 1 Hz", (1.0, rate.level(1.0)), textcoords="offset points", xytext=(4, 6), fontsize=7)
+            axes.set_ylabel("density [(m/s²)²/Hz]")
+        for axes in grid[-1]:
+            axes.set_xlabel("frequency [Hz]")
+        legend_above(figure, grid[0, 0], columns=2)
+    caption = (
+        "Spectra of v̇ and of the process noise, as in the paper's Figure 4: how far the signal stands above what the kinematics leave "
+        "unexplained. Welch's method at 20 Hz, Hann windows of 25.6 s."
+    )
+    return Figure("gate_spectra", caption, figure)
