@@ -135,7 +135,7 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
         file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "kind": "real"}, allow_unicode=True))
     file = place.folder / "pipelines" / "both.yaml"
     content = yaml.safe_load(file.read_text())
-    content["parts"]["devbot_ferrari"] = content["parts"]["tilted_1"] = {"split": "back", "sweeps": CANDIDATES[::2]}
+    content["parts"]["devbot_ferrari"] = content["parts"]["minutes_5_a"] = {"split": "back", "sweeps": CANDIDATES[::2]}
     file.write_text(yaml.safe_dump(content, sort_keys=False))
     code, _, err = place("run", "both", "--jobs", "1", "tracking=none")
     assert code == 0, err
@@ -166,24 +166,36 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
 
 def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
     simulated, official = read_pipeline("ksnn"), read_pipeline("ksnn_revs")
-    shared = [part for part in simulated.parts if not part.name.startswith("tilted")]
-    changed = {part.name: part.split for part, other in zip(official.parts, shared, strict=True) if part != other}
-    assert changed == {"scheme_1": "cross_vehicle_1", "scheme_2": "cross_vehicle_2", "one_vehicle": "one_vehicle"}
+    shared = [part for part in simulated.parts if not part.name.startswith("same_")]
+    changed = {part.split: other.split for part, other in zip(shared, official.parts, strict=True) if part != other}
+    assert changed == {
+        "cross_vehicle_1_sim": "cross_vehicle_1",
+        "cross_vehicle_2_sim": "cross_vehicle_2",
+        "one_vehicle_sim": "one_vehicle",
+    }
     assert all(
         dataclasses.replace(part, split="") == dataclasses.replace(other, split="")
         for part, other in zip(official.parts, shared, strict=True)
     )
 
 
-def test_both_schemes_have_the_39_candidates_of_table_3():
+def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
     configs = pipeline_configs(read_pipeline("ksnn"), [])
+    baselines = ("zero", "static_map", "kinematic")
     for scheme in ("scheme_1", "scheme_2"):
         names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
-        candidates = dict.fromkeys(names)
+        candidates = [name for name in dict.fromkeys(names) if name[0] not in baselines]
+        assert {name[0] for name in names} - {name[0] for name in candidates} == set(baselines)
         assert len(candidates) == 39
         categories = [category_of(*name) for name in candidates]
         assert {name: categories.count(name) for name in categories} == {name: row.variants for name, row in paper.TABLE_III.items()}
-        assert all(names.count(name) == (1 if name[0] == "luenberger" else 5) for name in candidates)
+        assert all(names.count(name) in ((1,) if name[0] == "luenberger" else (5, 10)) for name in candidates)
+
+
+def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_static_map_beside_it():
+    for part in read_pipeline("ksnn").parts:
+        said = {name for sweep in part.sweeps for name in sweep[0].removeprefix("estimator=").split(",")}
+        assert {"zero", "static_map"} <= said or part.name == "ferrari_whole", part.name
 
 
 @pytest.mark.parametrize(
