@@ -186,10 +186,11 @@ def _simulated_sensors() -> Iterable[str]:
     levers = ("lever_x", "lever_y", "lever_z", "lever_error")
     yield "## Simulated sensors"
     yield (
-        "`shown = quantise((1 + scale) true(t - delay) + offset + drift(t) + noise(t))`, in the channel's unit. Noise is a density: at a "
-        "rate of f Hz it is the √(f/2)-fold as standard deviation of a sample, 7.07 times at 100 Hz. Offset and scale are drawn for each "
-        "drive, with these standard deviations; drift is a first-order Gauss-Markov process of this standard deviation and correlation "
-        "time. Each error of each sensor has a random stream of its own: what one level is changes no other sample."
+        "`shown = quantise((1 + gain)(1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))`, in the channel's unit. "
+        "`gain` and `bias` belong to the car, the same in each of its drives. Noise is a density: at a rate of f Hz it is the √(f/2)-fold "
+        "as standard deviation of a sample, 7.07 times at 100 Hz. Offset and scale are drawn for each drive, with these standard "
+        "deviations; drift is a first-order Gauss-Markov process of this standard deviation and correlation time. Each error of each "
+        "sensor has a random stream of its own: what one level is changes no other sample."
     )
     yield (
         "`imu` is where the gyros and accelerometers sit (`lever_x`, `lever_y`, `lever_z` from the centre of gravity [m]) and how they are "

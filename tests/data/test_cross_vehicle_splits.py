@@ -36,14 +36,16 @@ def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme: str
     learnt, stopped = SCHEMES[scheme]
     assert sets_of(found.train) == [learnt] * 3
     assert sets_of(found.validation) == [stopped] * 3
-    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2}
+    third = {"j1": ["J-1"] * 2} if place else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
 
 
 @pytest.mark.parametrize("name", ["one_vehicle", "one_vehicle_sim"])
 def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stops(name: str) -> None:
     found = split(name)
     assert (sets_of(found.train), sets_of(found.validation)) == (["F-1"] * 2, ["F-1"])
-    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2}
+    third = {"j1": ["J-1"] * 2} if name.endswith("_sim") else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
 
 
 @pytest.mark.parametrize("name", [*SCHEMES, "one_vehicle"])
@@ -56,7 +58,8 @@ def test_every_recording_is_one_of_its_data_set(name: str, tmp_path) -> None:
             assert {span.recording for span in spans if span.dataset == dataset} <= set(ids)
 
 
-def test_simulated_sets_last_as_long_as_the_papers() -> None:
-    drives = compose_config("ingest", ["dataset=sim_two_cars"])["dataset"]["drives"]
-    minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives}
+@pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])
+def test_simulated_sets_last_as_long_as_the_papers(dataset: str) -> None:
+    drives = compose_config("ingest", [f"dataset={dataset}"])["dataset"]["drives"]
+    minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives if entry["id"] != "j1"}
     assert minutes == pytest.approx({"c1": 19.0, "c2": 12.6, "f1": 25.7, "f2": 18.1}, abs=0.05)

@@ -20,7 +20,7 @@ from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
-OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")
+OURS = ("corvette_grand_sport", "ferrari_250_lm", "jaguar_e_type", "bmw_545i", "heavy_truck")
 ALL = (*OURS, "bmw_320i_low")
 
 each_vehicle = pytest.mark.parametrize("name", ALL)

@@ -23,29 +23,42 @@ class Variation:
     Args:
         parameters: the library's names, ``tire.p_dy1`` for one of a group.
         factor: lowest and highest scale, drawn uniformly for every drive.
+        log: draw uniformly over the logarithm instead, so that half as much is as likely as twice as much.
     """
 
     parameters: tuple[str, ...]
     factor: tuple[float, float]
+    log: bool = False
+
+    def drawn(self, generator: np.random.Generator) -> float:
+        """A scale."""
+        low, high = self.factor
+        if self.log:
+            return float(np.exp(generator.uniform(np.log(low), np.log(high))))
+        return float(generator.uniform(low, high))
 
 
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
-    """Variations as a data set's ``vary`` spells them: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``.
+    """Variations as a data set's ``vary`` spells them: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
 
     Raises:
         ConfigurationError: an entry says something else.
     """
     if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
-        raise ConfigurationError(f"vary is a list of {{parameters, factor}}, not {entries}")
+        raise ConfigurationError(f"vary is a list of {{parameters, factor, log}}, not {entries}")
     variations = []
     for entry in entries:
-        named = isinstance(entry, Mapping) and set(entry) == {"parameters", "factor"} and isinstance(entry["parameters"], list | tuple)
-        if not named or not all(isinstance(name, str) for name in entry["parameters"]):
+        named = (
+            isinstance(entry, Mapping)
+            and set(entry) - {"log"} == {"parameters", "factor"}
+            and isinstance(entry["parameters"], list | tuple)
+        )
+        if not named or not all(isinstance(name, str) for name in entry["parameters"]) or not isinstance(entry.get("log", False), bool):
             raise ConfigurationError(f"vary: an entry is {{parameters: [m, m_s], factor: [0.9, 1.2]}}, not {entry}")
         factor = _range(entry["factor"], "vary")
         if factor[0] == 0.0:
             raise ConfigurationError(f"vary: a factor must be positive, not {entry['factor']}")
-        variations.append(Variation(tuple(entry["parameters"]), factor))
+        variations.append(Variation(tuple(entry["parameters"]), factor, bool(entry.get("log", False))))
     return tuple(variations)
 
 
@@ -62,7 +75,7 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
     published, rear = library_parameters(vehicle), rear_tyre(vehicle)
     scaled: dict[str, float] = {}
     for variation in variations:
-        factor = float(generator.uniform(*variation.factor))
+        factor = variation.drawn(generator)
         for name in variation.parameters:
             *group, last = name.split(".")
             holder: Any = published
@@ -88,7 +101,7 @@ def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) ->
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     factors: dict[str, float] = {}
     for variation in variations:
-        factor = float(generator.uniform(*variation.factor))
+        factor = variation.drawn(generator)
         for name in variation.parameters:
             factors[name] = factors.get(name, 1.0) * factor
     return scaled_car(car, factors)
@@ -100,9 +113,11 @@ class SensorVariation:
 
     Args:
         factors: kind of error (``noise``, ``offset``, …) -> lowest and highest scale.
+        roll_share: lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it.
     """
 
     factors: Mapping[str, tuple[float, float]]
+    roll_share: tuple[float, float] | None = None
 
     @classmethod
     def from_config(cls, entries: Any) -> SensorVariation:
@@ -112,13 +127,14 @@ class SensorVariation:
             ConfigurationError: an unknown kind of error, or no range.
         """
         kinds = [entry.name for entry in fields(SensorLevel)]
-        if not isinstance(entries, Mapping) or set(entries) - set(kinds):
-            raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} to ranges of scales, not {entries}")
-        return cls({str(kind): _range(value, "vary_sensors") for kind, value in entries.items()})
+        if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
+            raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}")
+        factors = {str(kind): _range(value, "vary_sensors") for kind, value in entries.items() if kind != "roll_share"}
+        return cls(factors, _range(entries["roll_share"], "vary_sensors", lowest=-np.inf) if "roll_share" in entries else None)
 
     def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
         """Levels as the seed scales them; the same ones if nothing varies. References stay as they are."""
-        if not self.factors:
+        if not self.factors and self.roll_share is None:
             return levels
         generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
         changed: dict[str, Any] = {}
@@ -127,12 +143,14 @@ class SensorVariation:
             if isinstance(level, SensorLevel):
                 scales = {kind: float(generator.uniform(*factor)) for kind, factor in self.factors.items()}
                 changed[entry.name] = replace(level, **{kind: getattr(level, kind) * scale for kind, scale in scales.items()})
+        if self.roll_share is not None:
+            changed["tilt"] = replace(levels.tilt, roll_share=float(generator.uniform(*self.roll_share)))
         return replace(levels, **changed)
 
 
-def _range(value: Any, where: str) -> tuple[float, float]:
+def _range(value: Any, where: str, lowest: float = 0.0) -> tuple[float, float]:
     numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(is_number(end) for end in value)
-    if not numbers or len(value) != 2 or not 0.0 <= value[0] <= value[1]:
+    if not numbers or len(value) != 2 or not lowest <= value[0] <= value[1]:
         raise ConfigurationError(f"{where}: a range is a pair [lowest, highest] of scales, not {value}")
     return float(value[0]), float(value[1])
 

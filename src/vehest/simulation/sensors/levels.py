@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError
 class SensorLevel:
     """How large the errors of one sensor are; ``unit`` is its channel's unit.
 
-    shown = quantise((1 + gain + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
+    shown = quantise((1 + gain) (1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
 
     Gain and bias belong to the car, the same in each of its drives; scale, offset, drift and noise are drawn.
 
