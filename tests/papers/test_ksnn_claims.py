@@ -17,7 +17,7 @@ from vehest_papers.ksnn import claims, cost, paper, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
 from vehest_papers.ksnn.comparing import Change, Errors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
-from vehest_papers.ksnn.statements import Statement, Compared, counted, decided, outcomes
+from vehest_papers.ksnn.statements import Compared, Statement, counted, decided, outcomes
 
 PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
 

@@ -11,7 +11,7 @@ from vehest.report.document import Column, Table
 from vehest.report.style import listed
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.schemes import Scheme
-from vehest_papers.ksnn.statements import Outcome, Compared, outcomes
+from vehest_papers.ksnn.statements import Compared, Outcome, outcomes
 
 Order = Literal["comes out", "does not come out", "is open"]
 CAUSES = {"same_sensors": "the same sensors", "same_tyres": "the same tyres", "same_driving": "the same driving"}

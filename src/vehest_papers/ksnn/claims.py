@@ -13,7 +13,7 @@ from vehest.studies.kit.claims import Claim
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Change, Errors, short
 from vehest_papers.ksnn.schemes import THIRD, Scheme
-from vehest_papers.ksnn.statements import Statement, Compared, counted, outcomes
+from vehest_papers.ksnn.statements import Compared, Expected, Statement, counted, outcomes
 
 ABOUT_A_QUARTER = (0.20, 0.30)
 EXPLAINED = 0.10
@@ -79,15 +79,10 @@ def _label(scheme: Scheme, word: str = "") -> str:
     return f"S{number} {word}".strip()
 
 
-def _pairs(
-    schemes: Sequence[Scheme], first: Sequence[str], second: str, expected: str, metric: str = "fvu", test: str = ""
-) -> list[Compared]:
-    """From one category to several on the other car, or on a test set of this name."""
-    assert expected in ("lower", "higher")
+def _pairs(schemes: Sequence[Scheme], first: Sequence[str], second: str, expected: Expected, metric: str = "fvu") -> list[Compared]:
+    """From one category to several on the other car."""
     return [
-        Compared(
-            _label(scheme, _brief(name) if len(first) > 1 else ""), scheme.change(name, second, test or scheme.other, metric), expected
-        )  # type: ignore[arg-type]
+        Compared(_label(scheme, _brief(name) if len(first) > 1 else ""), scheme.change(name, second, scheme.other, metric), expected)
         for scheme in schemes
         for name in first
     ]

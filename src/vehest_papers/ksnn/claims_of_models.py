@@ -24,7 +24,7 @@ from vehest_papers.ksnn.comparing import N_RESAMPLES, Change, Measured, short
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_of
-from vehest_papers.ksnn.statements import Statement, Compared, counted, outcomes
+from vehest_papers.ksnn.statements import Compared, Statement, counted, outcomes
 
 ENOUGH, LONGER = "30", "60"
 """Samples of a window: the paper's 1.5 s, and twice that."""

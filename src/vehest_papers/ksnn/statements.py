@@ -12,6 +12,7 @@ from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.ksnn.comparing import CONFIDENCE, Change, short
 
 Outcome = Literal["as claimed", "the other way round", "not told apart"]
+Expected = Literal["lower", "higher"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Compared:
 
     label: str
     change: Change | None
-    expected: Literal["lower", "higher"] = "lower"
+    expected: Expected = "lower"
     beyond: float = 0.0
     shown: Literal["percent", "ratio", "decibels"] = "percent"
     limit: float = 1.0
