@@ -95,7 +95,7 @@ screenshots: $(INSTALLED) docs-site ## pictures of the quickstart's page and of 
 ferrari_drive: $(INSTALLED) ## the study on the real Ferrari recording; needs VEHEST_DATA
 	$(BIN)/vehest run pipelines/ferrari_drive.yaml
 
-ksnn: $(INSTALLED) ## every table and figure of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on the real Ferrari: an hour or more
+ksnn: $(INSTALLED) ## every statement of the KS-NN paper, on simulated cars and, with VEHEST_DATA, on real ones: hours
 	$(BIN)/vehest run pipelines/ksnn.yaml
 
 learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, on real tyre sets; needs VEHEST_DATA, and half an hour or two

@@ -397,7 +397,7 @@ def with_overview(page: str, source: Path) -> str:
     lines = []
     for model in dict.fromkeys(row["model"] for row in rows):
         own = [row for row in rows if row["model"] == model]
-        lines.append((model, *(f"{float(row[key]):.3f}" for row in own for key in ("paper_fvu_other", "fvu_other"))))
+        lines.append((model, *(f"{float(row[key]):.3f}" if row[key] else "–" for row in own for key in ("paper_fvu_other", "fvu_other"))))
     header = (
         "estimator",
         *(f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")),

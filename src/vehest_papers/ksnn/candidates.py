@@ -27,6 +27,9 @@ _NAMES = {
     "lstm": paper.LSTM,
     "kalman": paper.KALMAN,
     "factor_graph": paper.FACTOR_GRAPH,
+    "zero": paper.ZERO,
+    "static_map": paper.STATIC_MAP,
+    "kinematic": paper.KINEMATIC,
 }
 
 
@@ -89,9 +92,9 @@ def chosen(runs: pd.DataFrame) -> pd.Series:
 
 
 def chosen_by_category(runs: pd.DataFrame) -> dict[str, pd.Series]:
-    """Category -> the run that validation chooses among all its structures and seeds, in the order of Tables IV and V."""
-    present = dict.fromkeys(runs["category"])
-    order = [*(name for name in paper.CATEGORIES if name in present), *(name for name in present if name not in paper.CATEGORIES)]
+    """Category -> the run that validation chooses among all its structures and seeds: baselines, then as in Tables IV and V."""
+    present, known = dict.fromkeys(runs["category"]), (*paper.BASELINES, *paper.CATEGORIES)
+    order = [*(name for name in known if name in present), *(name for name in present if name not in known)]
     return {name: chosen(runs[runs["category"] == name]) for name in order}
 
 

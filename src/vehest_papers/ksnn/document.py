@@ -1,202 +1,254 @@
-"""The report: headline, how it was made, the paper's tables and figures in its order, then what it does not have."""
+"""The report: what came of every statement of the paper on the first page, what it rests on, then everything else in appendices."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_code
-from vehest.report.style import fixed, percent_below
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_code, as_text
+from vehest.report.style import fixed, listed
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
-from vehest.studies.sweep import interval, mean_and_half
-from vehest_papers.ksnn import analyses, paper, scatter, tables
-from vehest_papers.ksnn.candidates import chosen_by_category, runs_of, seeds_like
-from vehest_papers.ksnn.tilted import tilted
+from vehest.studies.kit.warnings import warnings_of
+from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables
+from vehest_papers.ksnn.causes import CAUSES, causes_table, headline
+from vehest_papers.ksnn.curve import Curve, curve_figure, curve_of, curve_table
+from vehest_papers.ksnn.schemes import SET_TITLES, Scheme
+from vehest_papers.ksnn.statements import Statement, decided
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
 """Part -> the paper's table, test set of the car that is learnt on, test set of the other."""
-
-SIMULATED = "simulated"
-ONE_SIMULATOR = (
-    "The two cars of the schemes are two parameter sets of one simulator, driven by one driver on one course, with sensors of one kind. "
-    "These two differ in all of that."
-)
-ALIKE = " With cars that differ this much, structure pays; the two simulated cars are most likely too much alike to show it."
+SAME_CARS = ("scheme", "steering", "no_steering", *CAUSES)
+"""Starts of the names of parts whose cars are those of the scheme that their number names."""
+OTHER_CARS = ("devbot_ferrari", "ferrari_devbot")
+SMALL = ("f1tenth", "dart", "roboracer")
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of the study.
 
     Raises:
-        DataError: a scheme is missing, its test sets are not ``c2`` and ``f2``, or metrics are missing.
+        DataError: a scheme is missing, it has no test sets ``c2`` and ``f2``, or metrics are missing.
     """
     for name in SCHEMES:
         if name not in artefacts.parts:
             raise DataError(f"study '{artefacts.study}' needs part '{name}'")
-        if set(artefacts.parts[name].split.tests) != set(tables.SETS):
-            raise DataError(f"study '{artefacts.study}': the test sets of part '{name}' must be called c2 and f2")
-    runs = {name: runs_of(part) for name, part in artefacts.parts.items()}
-    whole = pd.concat([runs[name] for name in SCHEMES], ignore_index=True)
-    kind = words_of_kinds(artefacts.parts["scheme_2"])
+        if not {"c2", "f2"} <= set(artefacts.parts[name].split.tests):
+            raise DataError(f"study '{artefacts.study}': two test sets of part '{name}' must be called c2 and f2")
+    parts = {name: scheme_of(artefacts, name) for name in artefacts.parts}
+    schemes = [parts[name] for name in SCHEMES]
+    ablations = {cause: own for cause in CAUSES if (own := [parts[name] for number in "12" if (name := f"{cause}_{number}") in parts])}
+    curve = curve_of(parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")})
+    pairs = _pairs(parts)
+    entries, found = _entries(schemes, parts, curve, pairs)
+    judged = decided(entries)
     blocks: list[Block] = [
-        *_headline(artefacts, runs),
-        overview(artefacts, runs),
-        *_how_it_was_made(artefacts),
-        "## The data",
-        *analyses.of_the_data(artefacts),
-        "## The candidates",
-        tables.instances(whole),
-        *analyses.of_activation(artefacts, runs),
-        "## On the car trained on and on the other one",
-        *_schemes(artefacts, runs),
-        *(tilted(artefacts, runs, SCHEMES) if kind == SIMULATED else []),
-        "## Sideslip angle, beside Kalman filter and factor graph",
-        tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), kind),
+        *_asked(artefacts),
+        headline(schemes, ablations),
+        claims_table(judged, _note(schemes)),
+        "## On the own car, on the other and on a third",
+        _figure_6(schemes),
+        tables.across_cars(schemes, "overview", _overview_caption(schemes)),
     ]
-    if "one_vehicle" in runs:
-        blocks += ["## Without cross-vehicle regularisation", tables.regularisation(runs["scheme_2"], runs["one_vehicle"])]
-    blocks += _other_cars(artefacts, runs, alike=kind == SIMULATED)
-    chosen = "The models are those that validation chooses in both schemes, as in the tables above."
-    blocks += [f"## How acceleration noise comes through\n\n{chosen}", *analyses.of_sensitivities(artefacts, runs)]
-    blocks += ["## What is left of the lateral velocity", *analyses.of_residuals(artefacts, runs)]
-    blocks += ["## What the networks have learnt", *analyses.of_interpretation(artefacts, runs)]
-    blocks += ["## When training stopped", tables.stopping(runs, artefacts.titles), PATENT_NOTE]
-    data = {f"candidates_{name}": tables.candidates(runs[name], list(tables.SETS)) for name in SCHEMES}
+    if ablations:
+        blocks += ["## Which difference between the cars matters", causes_table(schemes, ablations)]
+    if curve is not None:
+        blocks += ["## With fewer minutes", curve_figure(curve)]
+    blocks += _appendices(artefacts, parts, schemes, curve, found)
+    data = {f"candidates_{name}": tables.candidates(parts[name].runs, list(parts[name].part.split.tests)) for name in SCHEMES}
+    if pairs:
+        data["small_cars_all"] = tables.across_cars(pairs, "small_cars_all", "").frame
     return {REPORT: Document(artefacts.title, blocks, data)}
 
 
-def _headline(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
-    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
-    schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
-    others = [f"{artefacts.titles[name]}: {kind}" for name, kind in kinds.items() if name not in SCHEMES]
-    words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
-    if others:
-        words += f" The other parts: {'; '.join(others)}."
-    if artefacts.absent:
-        words += (
-            f" Not in this report, since the recordings were not at hand: {'; '.join(artefacts.titles[name] for name in artefacts.absent)}."
-        )
-    sentences = [_scheme_sentence(artefacts.titles[name], runs[name], other) for name, (_, _, other) in SCHEMES.items()]
-    fits = sum(len(own) for own in runs.values())
-    candidates = len(pd.concat([runs[name] for name in SCHEMES]).drop_duplicates(["estimator", "variant"]))
-    sentences.append(f"{fits} fits in all; {candidates} candidates in each of two schemes.")
-    return [words, " ".join(sentences), artefacts.about]
+def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
+    """A part with its cars: those of the paper's schemes by the name, others by which data set a test shares with what is learnt on."""
+    part, title = artefacts.parts[name], as_text(artefacts.titles[name])
+    if name in SCHEMES:
+        published, own, other = SCHEMES[name]
+        return Scheme(name, title, part, own, other, published)
+    tests = list(part.split.tests)
+    if {"c2", "f2"} <= set(tests):
+        own = "c2" if name.endswith("_1") else "f2"
+        return Scheme(name, title, part, own, "f2" if own == "c2" else "c2")
+    own = next((test for test in tests if _shares_a_car(part.split.tests[test], part.split.train)), tests[0])
+    return Scheme(name, title, part, own, next((test for test in tests if test != own), own))
 
 
-def _scheme_sentence(title: str, runs: pd.DataFrame, other: str) -> str:
-    picked = chosen_by_category(runs)
-    best = min(picked, key=lambda name: float(picked[name][f"fvu.{other}"]))
-    words = (
-        f"{title}: on {tables.SETS[other]}, the car not trained on, the lowest FVU is {fixed(picked[best][f'fvu.{other}'], 3)} by {best}"
-    )
-    if paper.LUENBERGER in picked and best != paper.LUENBERGER:
-        against = float(picked[paper.LUENBERGER][f"fvu.{other}"])
-        words += f", {percent_below(picked[best][f'fvu.{other}'], against)} below the Luenberger observer ({fixed(against, 3)})"
-    return words + "."
-
-
-def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    first = artefacts.parts["scheme_1"]
-    protocol = first.protocol
-    facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
-    lines = [
-        f"Command: {as_code(artefacts.command)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values; the first "
-        f"{protocol.skip_seconds:g} s of each {protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
-        "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
-        "Of several structures and seeds, the one with the lowest RMSE(v) on the validation set is shown, which in both schemes is "
-        "the other car. Test data choose nothing. `±` is half the 95 % confidence interval of the mean over seeds (Student's t).",
-        *facts,
-    ]
-    ranges = pd.DataFrame(
-        [
-            {
-                "part": artefacts.titles[name],
-                "kind": words_of_kinds(part),
-                "train": spans_in_words(part.split.train),
-                "validation": spans_in_words(part.split.validation),
-                **{"tests": "; ".join(f"{test}: {spans_in_words(spans)}" for test, spans in part.split.tests.items())},
-            }
-            for name, part in artefacts.parts.items()
-        ]
-    )
-    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
-    caption = "What was used for what (the first two rows are Table II of the paper)."
-    return [
-        "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines),
-        Table("table_2", caption, ranges, columns | {"tests": Column("tests")}),
-    ]
-
-
-def _schemes(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> list[Block]:
-    kind = words_of_kinds(artefacts.parts["scheme_1"]).upper()
-    columns = [scatter.Scheme(artefacts.titles[name], runs[name], *known) for name, known in SCHEMES.items()]
-    caption = (
-        f"The candidates on the two test sets (Figure 6 of the paper), ours on {kind} cars: filled marks, the seed that validation chooses "
-        f"of each structure; faint ones, the other seeds; hollow ones, what the paper reports of its real cars for the most general model "
-        f"of each category. On the dashed line both cars are estimated equally well. Seeds far outside are not shown; all figures are in "
-        f"[scheme 1](tables/candidates_scheme_1.csv) and [scheme 2](tables/candidates_scheme_2.csv)."
-    )
-    blocks: list[Block] = [scatter.two_tests(columns, caption)]
-    for number, (name, (published, own, other)) in zip(("IV", "V"), SCHEMES.items(), strict=True):
-        part = artefacts.parts[name]
-        learnt = ", ".join(dict.fromkeys(span.recording for span in part.split.train))
-        caption = (
-            f"Most general models per category, {artefacts.titles[name].lower()} (Table {number} of the paper): learnt on the car of "
-            f"{tables.SETS[own]} ({learnt}), stopped and chosen on the other. Ours: {words_of_kinds(part).upper()}. "
-            f"`seeds` is the mean over all seeds of that structure."
-        )
-        blocks += [tables.most_general(runs[name], published, f"table_{4 if name == 'scheme_1' else 5}", caption)]
-        blocks += [tables.order_in_words(runs[name], published, other), tables.specialisation_in_words(runs[name], published, own, other)]
-    return blocks
-
-
-def _other_cars(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame], *, alike: bool) -> list[Block]:
-    """Both schemes with other cars, where their recordings are at hand; ``alike`` where the cars of the schemes are simulated."""
-    blocks: list[Block] = []
-    for name in ("devbot_ferrari", "ferrari_devbot"):
-        if name not in runs:
-            continue
-        part = artefacts.parts[name]
-        tests = {
-            test: f"{test} ({' and '.join(sorted({part.kinds[span.dataset] for span in spans}))})"
-            for test, spans in part.split.tests.items()
-        }
-        caption = f"{artefacts.titles[name]}: of each category the run that the other car's validation range chooses."
-        blocks.append(tables.most_general(runs[name], {}, f"table_{name}", caption, tests))
-        unseen = [test for test, spans in part.split.tests.items() if not _shares_a_car(spans, part.split.train)]
-        blocks += [tables.families_in_words(runs[name], test, tests[test], ALIKE if alike else "") for test in unseen]
-    lead = "## The same with a real Ferrari and a simulated DevBot"
-    return [f"{lead}\n\n{ONE_SIMULATOR}" if alike else lead, *blocks] if blocks else []
+def _pairs(parts: Mapping[str, Scheme]) -> list[Scheme]:
+    """Parts of small cars, which are called by both."""
+    return [own for name, own in parts.items() if set(name.split("_")) <= set(SMALL)]
 
 
 def _shares_a_car(spans: Sequence[Span], others: Sequence[Span]) -> bool:
     return bool({span.dataset for span in spans} & {span.dataset for span in others})
 
 
-def overview(artefacts: StudyArtefacts, runs: Mapping[str, pd.DataFrame]) -> Table:
-    """What the terminal shows: FVU on the car not trained on, beside the paper's."""
-    rows = []
-    for name, (published, own, other) in SCHEMES.items():
-        for category, run in chosen_by_category(runs[name]).items():
-            mean, half = interval(seeds_like(runs[name], run)[f"fvu.{other}"].to_numpy(dtype=float))
-            row: dict[str, object] = {"scheme": artefacts.titles[name], "model": category, "structure": run["structure"]}
-            row |= {"paper_fvu_other": published[category].fvu(other) if category in published else math.nan}
-            row |= {"fvu_other": run[f"fvu.{other}"], "seeds": mean_and_half(mean, half, 3)}
-            rows.append(row | {"fvu_own": run[f"fvu.{own}"], "rmse_vy_other": run[f"rmse_vy.{other}"]})
-    columns = {
-        "scheme": Column("scheme"),
-        "model": Column("model"),
-        "structure": Column("structure"),
-        "paper_fvu_other": Column("FVU, other car, paper", decimals=3),
-        "fvu_other": Column("FVU, other car", decimals=3),
-        "seeds": Column("over seeds"),
-        "fvu_own": Column("FVU, own car", decimals=3),
-        "rmse_vy_other": Column("RMSE(v), other car [m/s]", decimals=3),
+def _entries(
+    schemes: Sequence[Scheme], parts: Mapping[str, Scheme], curve: Curve | None, pairs: Sequence[Scheme]
+) -> tuple[list[Statement | Claim], list[Table]]:
+    """All statements in the paper's order, and the tables behind those on how estimators behave."""
+    low, low_table = claims_of_models.at_low_yaw_rates(schemes)
+    converged, start_table = claims_of_models.on_convergence(schemes)
+    biases, bias_table = claims_of_models.on_biases(schemes)
+    parameters, parameter_table = claims_of_models.on_parameters(schemes)
+    window = 30
+    costs = cost.cost_rows(schemes[0], (paper.ZERO, paper.STATIC_MAP, *paper.CATEGORIES), window)
+    steering = [
+        (parts[f"steering_{number}"], parts[f"no_steering_{number}"])
+        for number in "12"
+        if f"steering_{number}" in parts and f"no_steering_{number}" in parts
+    ]
+    entries: list[Statement | Claim] = [*claims.on_accuracy(schemes), *claims.on_sideslip(parts.get("ferrari_drive"))]
+    entries += [claims_of_models.on_noise(schemes), *claims_of_models.on_spectra(schemes), claims_of_models.on_cost(costs, schemes[0].kind)]
+    if "one_vehicle" in parts:
+        entries += claims.on_regularisation(parts["scheme_2"], parts["one_vehicle"])
+    entries.append(claims_of_models.tuned(schemes))
+    for word, errors in curve.errors.items() if curve is not None else ():
+        assert curve is not None
+        entries.append(claims.on_minutes(errors, curve.minutes[0], schemes[-1], f"{word} car"))
+    entries += [low, *claims.on_steering(steering), converged, biases, *parameters]
+    entries.append(claims.on_pairs(pairs))
+    made = [low_table, start_table, bias_table, parameter_table, cost.cost_table(costs, window) if len(costs) else None]
+    return entries, [table for table in made if table is not None]
+
+
+def _asked(artefacts: StudyArtefacts) -> list[Block]:
+    kinds = {name: words_of_kinds(part) for name, part in artefacts.parts.items()}
+    schemes = " and ".join(dict.fromkeys(kinds[name] for name in SCHEMES))
+    words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
+    others = {kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind] for kind in kinds.values() if kind != schemes}
+    if others:
+        words += " " + " ".join(f"{kind.capitalize()}: {'; '.join(titles)}." for kind, titles in others.items())
+    if artefacts.absent:
+        absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
+        words += f" Not in this report, since the recordings were not at hand: {absent}."
+    return [f"{words} {artefacts.about}".strip()]
+
+
+def _note(schemes: Sequence[Scheme]) -> str:
+    seeds = max(len(scheme.models(category)) for scheme in schemes for category in scheme.chosen)
+    return (
+        f"Changes are relative, from the second to the first. Of each category the structure that validation chooses, over all its seeds "
+        f"(up to {seeds}); S1, S2: schemes. Own car: learnt on; other: stopped on. Here each statement is corrected for its own "
+        f"comparisons."
+    )
+
+
+def _figure_6(schemes: Sequence[Scheme]) -> Block:
+    caption = (
+        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
+        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
+        f"dashed line the own car is estimated better."
+    )
+    columns = [scatter.Scheme(own.title, own.runs, own.published, own.own, own.other) for own in schemes]
+    return scatter.two_tests(columns, caption)
+
+
+def _overview_caption(schemes: Sequence[Scheme]) -> str:
+    return (
+        "FVU, with 95 % intervals over blocks of the drives and seeds, and RMSE(v), since v varies differently from car to car; of each "
+        f"category the structure that validation chooses; all figures are in the CSV. {schemes[0].kind.upper()}."
+    )
+
+
+def _appendices(
+    artefacts: StudyArtefacts, parts: Mapping[str, Scheme], schemes: Sequence[Scheme], curve: Curve | None, found: Sequence[Table]
+) -> list[Block]:
+    runs = {name: own.runs for name, own in parts.items()}
+    blocks: list[Block] = ["## Appendix: statements on how estimators behave", *found]
+    if curve is not None:
+        blocks.append(curve_table(curve))
+    blocks += ["## Appendix: the paper's tables"]
+    for scheme, number in zip(schemes, ("IV", "V"), strict=True):
+        which = f"{scheme.title.lower()} (Table {number} of the paper). Ours: {scheme.kind.upper()}."
+        caption = f"The one run of each category that validation chooses, {which}"
+        blocks.append(tables.chosen_runs(scheme, f"table_{4 if number == 'IV' else 5}", caption))
+    blocks.append(tables.sideslip(runs["scheme_2"], runs.get("ferrari_drive"), runs.get("ferrari_whole"), schemes[0].kind))
+    if "one_vehicle" in runs:
+        blocks.append(tables.regularisation(runs["scheme_2"], runs["one_vehicle"]))
+    others = [parts[name] for name in OTHER_CARS if name in parts]
+    if others:
+        blocks += [
+            "## Appendix: a simulated DevBot and the real Ferrari",
+            tables.across_cars(
+                others, "devbot", "FVU and RMSE(v) with 95 % intervals, of each category the structure that validation chooses."
+            ),
+            *[tables.whether_an_order_means_anything(scheme) for scheme in others],
+        ]
+    pairs = _pairs(parts)
+    if pairs:
+        blocks += [
+            "## Appendix: pairs of small cars",
+            tables.small_cars(pairs),
+            *[tables.whether_an_order_means_anything(own) for own in pairs],
+        ]
+    blocks += ["## Appendix: noise of the accelerations", *analyses.of_sensitivities(schemes)]
+    blocks += ["## Appendix: spectra of the residuals", *analyses.of_residuals(schemes)]
+    blocks += ["## Appendix: what the networks have learnt", *analyses.of_interpretation(schemes)]
+    blocks += ["## Appendix: the data", *analyses.of_the_data(artefacts), *_warned(schemes)]
+    blocks += _how_it_was_made(artefacts)
+    whole = pd.concat([scheme.runs for scheme in schemes], ignore_index=True)
+    blocks += [tables.instances(whole), *analyses.of_activation(schemes), tables.stopping(runs, artefacts.titles), PATENT_NOTE]
+    return blocks
+
+
+def _warned(schemes: Sequence[Scheme]) -> list[Block]:
+    lines = list(dict.fromkeys(f"{scheme.title}: {line}" for scheme in schemes for line in warnings_of(scheme.part)))
+    return ["**Mind:**\n\n" + "\n".join(f"- {line}" for line in lines)] if lines else []
+
+
+def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
+    first = artefacts.parts["scheme_1"]
+    protocol = first.protocol
+    facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
+    fits = sum(len(part.models) for part in artefacts.parts.values())
+    lines = [
+        f"Command: {as_code(artefacts.command)}; {fits} fits",
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values; the first "
+        f"{protocol.skip_seconds:g} s of each {protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
+        "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
+        "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "
+        "is of the other car. Test data choose nothing.",
+        _averaging(artefacts),
+        "Intervals: paired block bootstrap over stretches of the drives and over seeds, on a logarithmic axis; Holm's correction within "
+        "each statement. Spectra: segments of 25.6 s in the place of blocks.",
+        *facts,
+    ]
+    ranges = pd.DataFrame([_ranges(artefacts.titles[name], part) for name, part in artefacts.parts.items()])
+    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
+    caption = "What was used for what (the first two rows are Table II of the paper)."
+    return [
+        "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines if line),
+        Table("table_2", caption, ranges, columns | {"tests": Column("tests")}),
+    ]
+
+
+def _ranges(title: str, part: PartArtefacts) -> dict[str, str]:
+    return {
+        "part": title,
+        "kind": words_of_kinds(part),
+        "train": spans_in_words(part.split.train),
+        "validation": spans_in_words(part.split.validation),
+        "tests": "; ".join(f"{SET_TITLES.get(test, test)}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()),
     }
-    return Table("overview", "The short of it: FVU on the car that was not trained on.", pd.DataFrame(rows), columns)
+
+
+def _averaging(artefacts: StudyArtefacts) -> str:
+    """What is kept of the weights, where trainings say it."""
+    decays = sorted(
+        {
+            float(model.training.get("averaging") or 0.0)
+            for part in artefacts.parts.values()
+            for model in part.models
+            if "averaging" in model.training
+        }
+    )
+    if decays in ([], [0.0]):
+        return "Networks keep the weights of their best epoch."
+    words = listed([fixed(own, 4).rstrip("0") for own in decays])
+    return f"Networks keep an exponential average of their weights, decay {words} a step, at its best epoch: docs/estimators/training.md."

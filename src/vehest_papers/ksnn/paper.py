@@ -10,9 +10,16 @@ LINEAR_BIAS, NONLINEAR_BIAS = "KS-NN linear + bias", "KS-NN nonlinear + bias"
 LINEAR, NONLINEAR = "KS-NN linear no bias", "KS-NN nonlinear no bias"
 KALMAN, FACTOR_GRAPH = "Kalman filter (KF)", "Factor graph (FG)"
 FIXED_LAG = "Factor graph (FG), fixed lag of"
+ZERO, STATIC_MAP, KINEMATIC = "v = 0", "Static map", "Kinematic integration"
+BASELINES = (ZERO, STATIC_MAP, KINEMATIC)
+"""Not in the paper; they stand in every table."""
 
 CATEGORIES = (LUENBERGER, GRU, LSTM, LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
 """In the order of Tables IV and V."""
+
+STRUCTURED = (LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
+WITHOUT_BIAS, WITH_BIAS = (LINEAR, NONLINEAR), (LINEAR_BIAS, NONLINEAR_BIAS)
+PLAIN = (GRU, LSTM)
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from vehest.report.document import Column, Table
-from vehest.report.style import MISSING, fixed
+from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.sweep import interval, mean_and_half
 from vehest_papers.ksnn import paper
-from vehest_papers.ksnn.candidates import chosen, chosen_by_category, seeds_like
-from vehest_papers.ksnn.paper import Instances, Published
+from vehest_papers.ksnn.candidates import chosen
+from vehest_papers.ksnn.paper import Instances
+from vehest_papers.ksnn.schemes import SET_TITLES, THIRD, Scheme
 
 SETS = {"c2": "C-2", "f2": "F-2"}
 
@@ -47,37 +48,83 @@ def instances(runs: pd.DataFrame) -> Table:
     return Table("table_3", "Candidates (Table III of the paper).", pd.DataFrame(rows), columns)
 
 
-def most_general(runs: pd.DataFrame, published: Mapping[str, Published], name: str, caption: str, tests: Mapping[str, str] = SETS) -> Table:
-    """Table IV or V: of each category the run that validation, on the other car, chooses; and the spread over its seeds."""
+def across_cars(schemes: Sequence[Scheme], name: str, caption: str) -> Table:
+    """Tables IV and V and Figure 6 in one: of each category the structure that validation chooses, over all its seeds, with 95 % intervals.
+
+    Args:
+        schemes: comparisons.
+        name: of the file.
+        caption: of the table.
+    """
     rows = []
-    for category, run in chosen_by_category(runs).items():
-        seeds = seeds_like(runs, run)
-        row: dict[str, object] = {"model": category}
-        known = published.get(category)
-        row["paper_structure"] = known.structure if known else MISSING
-        row |= {"structure": run["structure"], "n_parameters": int(run["n_parameters"]), "seed": int(run["seed"])}
-        for test in tests:
-            mean, half = interval(seeds[f"fvu.{test}"].to_numpy(dtype=float))
+    third, published = any(scheme.has_third for scheme in schemes), any(scheme.published for scheme in schemes)
+    for scheme in schemes:
+        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if scheme.has_third else {})
+        for category, run in scheme.chosen.items():
+            key, known, structure = scheme.name_of(category), scheme.published.get(category), str(run["structure"])
+            row: dict[str, object] = {"scheme": scheme.title, "model": category, "structure": structure}
+            row["candidate"] = category if structure == MISSING else f"{category}, {structure}"
+            row |= {"n_seeds": len(scheme.models(category)), "n_parameters": int(run["n_parameters"])}
+            row |= {f"paper_fvu_{word}": known.fvu(tests[word]) if known else math.nan for word in ("own", "other")}
+            for word, test in tests.items():
+                errors = scheme.errors(test)
+                row |= {f"{metric}_{word}": errors.value(key, metric) for metric in ("fvu", "rmse_vy")}
+                row |= {f"{metric}_{word}_shown": errors.in_words(key, metric) for metric in ("fvu", "rmse_vy")}
+            rows.append(row)
+    columns = {"scheme": Column("scheme"), "candidate": Column("model")}
+    for word, title in (("own", "own car"), ("other", "other car")):
+        columns |= {f"paper_fvu_{word}": Column(f"FVU, {title}, paper", decimals=3)} if published else {}
+        columns |= {f"fvu_{word}_shown" if word == "other" else f"fvu_{word}": Column(f"FVU, {title}", decimals=3)}
+    columns |= {"rmse_vy_other": Column("RMSE(v), other car [m/s]", decimals=3)}
+    if third:
+        columns |= {"fvu_third_shown": Column("FVU, third car")}
+    return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def chosen_runs(scheme: Scheme, name: str, caption: str) -> Table:
+    """Table IV or V as printed: of each category the one run that validation, on the other car, chooses."""
+    rows = []
+    for category, run in scheme.chosen.items():
+        known = scheme.published.get(category)
+        row: dict[str, object] = {
+            "model": category,
+            "paper_structure": known.structure if known else MISSING,
+            "structure": run["structure"],
+        }
+        row |= {"n_parameters": int(run["n_parameters"]), "seed": int(run["seed"])}
+        for test in (scheme.own, scheme.other):
             row[f"paper_fvu_{test}"] = known.fvu(test) if known else math.nan
             row[f"fvu_{test}"] = run[f"fvu.{test}"]
-            row[f"fvu_seeds_{test}"] = mean_and_half(mean, half, 3)
             row[f"paper_rmse_vy_{test}"] = known.rmse(test) if known else math.nan
             row[f"rmse_vy_{test}"] = run[f"rmse_vy.{test}"]
         row["epochs"] = run["epochs"] if run["epochs"] > 0 else math.nan
         rows.append(row)
-    columns = {"model": Column("model"), "structure": Column("structure")}
-    columns = columns | ({"paper_structure": Column("in the paper")} if published else {})
+    columns = {"model": Column("model"), "paper_structure": Column("in the paper"), "structure": Column("structure")}
     columns |= {"n_parameters": Column("params", decimals=0), "seed": Column("seed", decimals=0)}
-    for test, title in tests.items():
-        if published:
-            columns[f"paper_fvu_{test}"] = Column(f"{title} FVU, paper", decimals=3)
-        columns[f"fvu_{test}"] = Column(f"{title} FVU, ours", decimals=3)
-        columns[f"fvu_seeds_{test}"] = Column(f"{title} FVU, seeds")
-        if published:
-            columns[f"paper_rmse_vy_{test}"] = Column(f"{title} RMSE(v) [m/s], paper", decimals=3)
-        columns[f"rmse_vy_{test}"] = Column(f"{title} RMSE(v) [m/s], ours", decimals=3)
+    for test in (scheme.own, scheme.other):
+        title = SET_TITLES.get(test, test)
+        columns |= {f"paper_fvu_{test}": Column(f"{title} FVU, paper", decimals=3), f"fvu_{test}": Column("ours", decimals=3)}
+        columns |= {f"paper_rmse_vy_{test}": Column(f"{title} RMSE(v) [m/s], paper", decimals=3)}
+        columns |= {f"rmse_vy_{test}": Column("ours", decimals=3)}
     columns["epochs"] = Column("epochs", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
+
+
+def small_cars(pairs: Sequence[Scheme]) -> Table:
+    """Pairs of small cars: FVU on the car that was stopped on, a row a category."""
+    categories = dict.fromkeys(category for scheme in pairs for category in scheme.chosen)
+    rows = [
+        {"model": category} | {scheme.name: scheme.errors(scheme.other).in_words(scheme.name_of(category), "fvu") for scheme in pairs}
+        for category in categories
+    ]
+    rmse = {scheme.name: f"{scheme.title}" for scheme in pairs}
+    caption = (
+        "Pairs of small cars, real, all seen at a wheelbase of 0.33 m: FVU on the car that was stopped on, with 95 % intervals. Own cars "
+        "and RMSE(v) stand in [this table](tables/small_cars_all.csv)."
+    )
+    return Table(
+        "small_cars", caption, pd.DataFrame(rows), {"model": Column("model"), **{name: Column(title) for name, title in rmse.items()}}
+    )
 
 
 def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str, name: str = "table_6") -> Table:
@@ -92,7 +139,7 @@ def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFr
     """
     rows = []
     lags = [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)] if whole is not None else []
-    for category in [*paper.TABLE_VI, *lags]:
+    for category in [*paper.BASELINES, *paper.TABLE_VI, *lags]:
         row: dict[str, object] = {"model": category, "paper": paper.TABLE_VI.get(category, math.nan)}
         for column, runs, test in (("real_drive", drive, "test"), ("real_whole", whole, "test"), ("scheme_2", schemes, "f2")):
             own = runs[runs["category"] == category] if runs is not None else pd.DataFrame()
@@ -117,23 +164,24 @@ def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFr
 def regularisation(with_it: pd.DataFrame, without: pd.DataFrame) -> Table:
     """Table VII: the same two structures with and without cross-vehicle regularisation."""
     rows = []
-    for (category, regularised), published in paper.TABLE_VII.items():
+    plain = {(name, True): None for name in paper.BASELINES}
+    for (category, regularised), published in {**plain, **paper.TABLE_VII}.items():
         runs = with_it if regularised else without
-        own = runs[(runs["category"] == category) & (runs["structure"] == published.structure)]
+        own = runs[(runs["category"] == category) & ((published is None) | (runs["structure"] == getattr(published, "structure", "")))]
         if own.empty:
             continue
         run = chosen(own)
         row: dict[str, object] = {
-            "model": f"{category}, {published.structure}",
-            "regularisation": "with" if regularised else "without",
+            "model": category if published is None else f"{category}, {published.structure}",
+            "regularisation": MISSING if published is None else "with" if regularised else "without",
             "n_parameters": int(run["n_parameters"]),
-            "epochs": run["epochs"],
+            "epochs": run["epochs"] if run["epochs"] > 0 else math.nan,
         }
         for test in SETS:
             mean, half = interval(own[f"fvu.{test}"].to_numpy(dtype=float))
-            row |= {f"paper_fvu_{test}": published.fvu(test), f"fvu_{test}": run[f"fvu.{test}"]}
+            row |= {f"paper_fvu_{test}": published.fvu(test) if published else math.nan, f"fvu_{test}": run[f"fvu.{test}"]}
             row |= {f"fvu_seeds_{test}": mean_and_half(mean, half, 3)}
-            row |= {f"paper_rmse_vy_{test}": published.rmse(test), f"rmse_vy_{test}": run[f"rmse_vy.{test}"]}
+            row |= {f"paper_rmse_vy_{test}": published.rmse(test) if published else math.nan, f"rmse_vy_{test}": run[f"rmse_vy.{test}"]}
         rows.append(row)
     columns = {"model": Column("model"), "regularisation": Column("regularisation"), "n_parameters": Column("params", decimals=0)}
     for test, title in SETS.items():
@@ -189,81 +237,31 @@ def candidates(runs: pd.DataFrame, tests: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def order_in_words(runs: pd.DataFrame, published: Mapping[str, Published], other: str) -> str:
-    """The order of categories by FVU on the car not trained on, in the paper and here, and where they disagree by more than chance.
-
-    By more than chance: the 95 % intervals of the means over seeds do not overlap.
-    """
-    picked = {name: run for name, run in chosen_by_category(runs).items() if name in published}
-    ours = {name: float(run[f"fvu.{other}"]) for name, run in picked.items()}
-    theirs = {name: published[name].fvu(other) for name in ours}
-    over_seeds = {name: interval(seeds_like(runs, run)[f"fvu.{other}"].to_numpy(dtype=float)) for name, run in picked.items()}
-    lists = [sorted(values, key=values.__getitem__) for values in (theirs, ours)]
-    pairs = [(a, b) for position, a in enumerate(lists[0]) for b in lists[0][position + 1 :]]
-    swapped = [(a, b) for a, b in pairs if ours[a] > ours[b]]
-    words = (
-        f"Order by FVU on {SETS[other]}, the car not trained on, best first. Paper: {_ordered(lists[0], theirs)}. "
-        f"Ours: {_ordered(lists[1], ours)}. "
-    )
-    if not swapped:
-        return words + f"The order is the paper's in all {len(pairs)} pairs."
-    clear = [(a, b) for a, b in swapped if _above(over_seeds[a], over_seeds[b])]
-    words += f"{len(swapped)} of {len(pairs)} pairs are the other way round here"
-    if not clear:
-        return words + ", none of them by more than chance: the intervals over seeds overlap."
-    listed = "; ".join(f"{b} before {a} ({fixed(ours[b], 3)} against {fixed(ours[a], 3)})" for a, b in clear)
-    return words + f", {len(clear)} of them by more than chance (the intervals over seeds do not overlap): {listed}."
-
-
-def families_in_words(runs: pd.DataFrame, other: str, title: str, where_as_in_the_paper: str = "") -> str:
-    """Who comes first on the car not trained on: KS-NN, the observer, or networks without structure; and what the paper has.
-
-    Args:
-        runs: from `candidates.runs_of`.
-        other: test set of the car not trained on.
-        title: of that test set, for people.
-        where_as_in_the_paper: what is said on top where the families come in the paper's order.
-    """
-    fvu = {name: float(run[f"fvu.{other}"]) for name, run in chosen_by_category(runs).items()}
-    order = sorted(fvu, key=fvu.__getitem__)
-    words = f"Order by FVU on the {title}, the car not trained on, best first: {_ordered(order, fvu)}."
-    structured = [value for name, value in fvu.items() if name.startswith("KS-NN")]
-    plain = [fvu[name] for name in (paper.GRU, paper.LSTM) if name in fvu]
-    if min(fvu.values()) > 1.0:
-        return f"{words} All leave more than the whole variance of v: none knows that car."
-    if structured and plain and paper.LUENBERGER in fvu and max(structured) < fvu[paper.LUENBERGER] < min(plain):
-        words += (
-            " Every KS-NN comes before the Luenberger observer, and the observer before GRU and LSTM: the order of families that the paper "
-            f"has in its scheme 1.{where_as_in_the_paper}"
-        )
-    elif structured and plain and max(structured) < min(plain):
-        words += " Every KS-NN comes before GRU and LSTM, as in the paper."
-    return words
-
-
-def specialisation_in_words(runs: pd.DataFrame, published: Mapping[str, Published], own: str, other: str) -> str:
-    """How many times the FVU of the own car is left on the other one, in the paper and here: what is learnt of one car alone."""
-    ours = {name: float(run[f"fvu.{other}"]) / float(run[f"fvu.{own}"]) for name, run in chosen_by_category(runs).items()}
-    listed = "; ".join(
-        f"{name} {fixed(published[name].fvu(other) / published[name].fvu(own), 1)} in the paper, {fixed(ours[name], 1)} here"
-        for name in ours
-        if name in published
-    )
-    return (
-        f"What a network learns of one car alone shows in how much more it leaves on the other, FVU on {SETS[other]} over {SETS[own]}: "
-        f"{listed}."
-    )
-
-
-def _above(upper: tuple[float, float], lower: tuple[float, float]) -> bool:
-    """Whether a mean's interval lies above another's; a single value has none."""
-    halves = [0.0 if math.isnan(half) else half for _, half in (upper, lower)]
-    return upper[0] - halves[0] > lower[0] + halves[1]
-
-
-def _ordered(names: Sequence[str], values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} ({fixed(values[name], 3)})" for name in names)
-
-
 def _range(limits: tuple[int, int]) -> str:
     return str(limits[0]) if limits[0] == limits[1] else f"{limits[0]} to {limits[1]}"
+
+
+def whether_an_order_means_anything(scheme: Scheme) -> str:
+    """The order on the car that was stopped on, unless a candidate fails there or on the very car that it learnt on.
+
+    A candidate that leaves more of its own training car than v = 0 or the static map has not learnt that car; where it stands on another
+    says nothing of structure.
+    """
+    own, other = scheme.errors(scheme.own), scheme.errors(scheme.other)
+    names = {category: scheme.name_of(category) for category in scheme.chosen if category not in paper.BASELINES}
+    limit = min((1.0, *(own.value(scheme.name_of(name), "fvu") for name in paper.BASELINES if name in scheme.chosen)))
+    failed = [category for category, name in names.items() if not own.value(name, "fvu") <= limit]
+    fvu = {category: other.value(name, "fvu") for category, name in names.items()}
+    order = sorted((name for name in fvu if math.isfinite(fvu[name])), key=fvu.__getitem__)
+    listing = ", ".join(f"{name} ({fixed(fvu[name], 3)})" for name in order)
+    words = f"**{scheme.title}.** Order by FVU on the car that was stopped on, best first: {listing}."
+    if failed:
+        where = f"on the car that they learnt on themselves {listed(failed)} do no better than the baselines"
+        return f"{words} No order of families is read off this: {where}."
+    if order and min(fvu.values()) > 1.0:
+        return f"{words} All leave more than the whole variance of v: none knows that car."
+    if {paper.LUENBERGER, *paper.PLAIN, *paper.WITHOUT_BIAS} <= set(fvu):
+        middle = fvu[paper.LUENBERGER]
+        if max(fvu[name] for name in paper.WITHOUT_BIAS) < middle < min(fvu[name] for name in paper.PLAIN):
+            words += " KS-NN without biases before the observer, the observer before GRU and LSTM: the paper's order of families."
+    return words

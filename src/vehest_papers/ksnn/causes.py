@@ -1,0 +1,128 @@
+"""The order of families on the other car: whether it is the paper's, and which difference between the cars brings it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import pandas as pd
+
+from vehest.report.document import Column, Table
+from vehest.report.style import listed
+from vehest_papers.ksnn import paper
+from vehest_papers.ksnn.schemes import Scheme
+from vehest_papers.ksnn.statements import Compared, Outcome, outcomes
+
+Order = Literal["comes out", "does not come out", "is open"]
+CAUSES = {"same_sensors": "the same sensors", "same_tyres": "the same tyres", "same_driving": "the same driving"}
+"""Start of a part's name -> what its two cars have in common."""
+
+ORDER = tuple((name, paper.LUENBERGER) for name in paper.WITHOUT_BIAS) + tuple((paper.LUENBERGER, name) for name in paper.PLAIN)
+"""Lower and higher FVU on the other car, as in both of the paper's schemes."""
+IN_WORDS = "KS-NN without biases before Luenberger before GRU and LSTM"
+
+
+def order_tests(scheme: Scheme) -> list[Compared]:
+    """The four comparisons that make the paper's order of families."""
+    return [Compared(f"{first} below {second}", scheme.change(first, second, scheme.other, "fvu")) for first, second in ORDER]
+
+
+def order_of(found: Sequence[Outcome]) -> Order:
+    """What four outcomes say together."""
+    if "the other way round" in found:
+        return "does not come out"
+    return "comes out" if found and all(own == "as claimed" for own in found) else "is open"
+
+
+def orders(schemes: Sequence[Scheme]) -> dict[str, Order]:
+    """Name of a part -> what its order is, all comparisons corrected together by Holm."""
+    tests = [(scheme.name, own) for scheme in schemes for own in order_tests(scheme)]
+    found = outcomes([own for _, own in tests])
+    by_part: dict[str, list[Outcome]] = {scheme.name: [] for scheme in schemes}
+    for (name, _), (outcome, _) in zip(tests, found, strict=True):
+        by_part[name].append(outcome)
+    return {name: order_of(own) for name, own in by_part.items()}
+
+
+def headline(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Scheme]]) -> str:
+    """Sentences: whether the order of families is the paper's, who is first, the static map, and the causes."""
+    found = orders(schemes)
+    if set(found.values()) == {"comes out"}:
+        words = f"**The paper's order of families comes out in both schemes:** on the other car {IN_WORDS}, each by more than chance."
+    elif "does not come out" in found.values():
+        where = listed([scheme.title.lower() for scheme in schemes if found[scheme.name] == "does not come out"])
+        words = f"**The paper's order of families does not come out** ({where}): on the other car it has {IN_WORDS}."
+    else:
+        words = (
+            f"**The paper's order of families is not decided here:** on the other car it has {IN_WORDS}; no pair turns, "
+            "not all are told apart."
+        )
+    sentences = [words]
+    for scheme in schemes:
+        errors = scheme.errors(scheme.other)
+        shown = [name for name in scheme.chosen if name not in (paper.ZERO, paper.KINEMATIC) and scheme.name_of(name) in errors]
+        order = sorted(shown, key=lambda name: errors.value(scheme.name_of(name), "fvu"))
+        listing = ", ".join(f"{name} {errors.value(scheme.name_of(name), 'fvu'):.3f}" for name in order[:3])
+        sentences.append(f"{scheme.title}, lowest FVU on the other car: {listing}.")
+    sentences += _against_the_map(schemes)
+    return " ".join(sentences) + "\n\n" + causes_in_words(schemes, found, ablations)
+
+
+def _against_the_map(schemes: Sequence[Scheme]) -> list[str]:
+    tests = [Compared(scheme.title.lower(), scheme.change(paper.NONLINEAR, paper.STATIC_MAP, scheme.other, "fvu")) for scheme in schemes]
+    found = [outcome for outcome, _ in outcomes(tests)]
+    if all(own.change is None for own in tests):
+        return []
+    beaten = [own.label for own, outcome in zip(tests, found, strict=True) if outcome == "as claimed"]
+    return [
+        f"KS-NN nonlinear no bias is below the static map, two numbers of the car that was learnt on, by more than chance in "
+        f"{listed(beaten) if beaten else 'neither scheme'}."
+    ]
+
+
+def causes_in_words(schemes: Sequence[Scheme], found: Mapping[str, Order], ablations: Mapping[str, Sequence[Scheme]]) -> str:
+    """Which of the differences between the cars the order depends on, as far as one at a time can tell."""
+    if not ablations:
+        return "No difference between the cars was taken away here, so nothing is said of causes."
+    without = {cause: orders(own) for cause, own in ablations.items()}
+    numbered = {scheme.name[-1]: scheme for scheme in schemes}
+    sentences = []
+    for number, scheme in numbered.items():
+        states = {cause: order for cause, own in without.items() for name, order in own.items() if name.endswith(number)}
+        if not states:
+            continue
+        listing = "; ".join(f"with {CAUSES[cause]} it {order}" for cause, order in states.items())
+        sentence = f"{scheme.title}: with all differences the order {found[scheme.name]}; {listing}."
+        if found[scheme.name] == "comes out":
+            lost = [CAUSES[cause] for cause, order in states.items() if order != "comes out"]
+            sentence += (
+                f" It needs that the cars do not have {listed(lost)}."
+                if lost
+                else " No single difference brings it: it survives without each of them."
+            )
+        elif "comes out" in states.values():
+            gained = [CAUSES[cause] for cause, order in states.items() if order == "comes out"]
+            sentence += f" What stands against it is the difference that {listed(gained)} take away."
+        sentences.append(sentence)
+    return "**Causes, one taken away at a time.** " + " ".join(sentences)
+
+
+def causes_table(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Scheme]]) -> Table:
+    """FVU on the other car with one difference taken away at a time, a row a category, then the order."""
+    columns = {f"S{scheme.name[-1]} as it is": scheme for scheme in schemes}
+    for cause, own in ablations.items():
+        columns |= {f"S{scheme.name[-1]} {CAUSES[cause].removeprefix('the ')}": scheme for scheme in own}
+    ordered = {title: columns[title] for title in sorted(columns, key=lambda title: title[:2])}
+    categories = dict.fromkeys(category for scheme in ordered.values() for category in scheme.chosen if category != paper.KINEMATIC)
+    rows: list[dict[str, str]] = [
+        {"model": category}
+        | {title: scheme.errors(scheme.other).in_words(scheme.name_of(category), "fvu") for title, scheme in ordered.items()}
+        for category in categories
+    ]
+    states = orders(list(schemes)) | {name: order for own in ablations.values() for name, order in orders(own).items()}
+    rows.append({"model": "the paper's order of families"} | {title: states[scheme.name] for title, scheme in ordered.items()})
+    caption = (
+        "FVU on the other car where the two cars have one thing more in common than in the schemes, with 95 % intervals; of each family "
+        "the structure that validation chooses, three seeds in the ablations. S1, S2: schemes."
+    )
+    return Table("causes", caption, pd.DataFrame(rows), {"model": Column("model"), **{title: Column(title) for title in ordered}})

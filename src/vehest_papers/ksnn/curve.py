@@ -1,0 +1,120 @@
+"""Sample efficiency: the error on both cars by the minutes of recordings that were learnt and stopped on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from vehest.evaluation.blocks import Segments
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, legend_above, line_of, new_figure, paper_style
+from vehest.studies.artefacts import EvaluatedModel
+from vehest.studies.kit.reference_minutes import minutes_of
+from vehest_papers.ksnn.candidates import category_of
+from vehest_papers.ksnn.comparing import Errors
+from vehest_papers.ksnn.schemes import Scheme
+
+NAMED = re.compile(r"minutes_([\d.]+)(?:_[a-z])?")
+TESTS = {"own": "own car", "other": "other car"}
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Errors by category and amount.
+
+    Args:
+        errors: ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``.
+        minutes: amounts, from the least, as they are written in names.
+        lines: category -> estimator and variant.
+    """
+
+    errors: Mapping[str, Errors]
+    minutes: Sequence[str]
+    lines: Mapping[str, tuple[str, str]]
+
+
+def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
+    """The curve of parts called ``minutes_2.5_a`` and so on, and of the scheme that has all minutes; none where there are no such parts."""
+    found = [(match[1], scheme) for name, scheme in shorter.items() if (match := NAMED.fullmatch(name))]
+    if not found:
+        return None
+    amounts = sorted({minutes for minutes, _ in found}, key=float)
+    structures = {(model.estimator, model.variant) for _, scheme in found for model in scheme.part.models}
+    everything = f"{minutes_of(whole.part):.3g}"
+    sources = [*found, (everything, whole)]
+    segments: dict[str, dict[str, list[Segments]]] = {word: {} for word in TESTS}
+    for minutes, scheme in sources:
+        for model in scheme.part.models:
+            if (model.estimator, model.variant) in structures:
+                key = f"{category_of(model.estimator, model.variant)}@{minutes}"
+                for word in TESTS:
+                    segments[word].setdefault(key, []).append(_segments(model, scheme, word))
+    lines = {category_of(*name): name for name in sorted(structures)}
+    errors = {word: Errors(own, f"{getattr(whole, word)} by minutes") for word, own in segments.items()}
+    return Curve(errors, [*amounts, everything], lines)
+
+
+def _segments(model: EvaluatedModel, scheme: Scheme, word: str) -> Segments:
+    return model.segments(getattr(scheme, word))
+
+
+def curve_table(curve: Curve) -> Table:
+    """Table ``minutes``: FVU with intervals, both cars."""
+    rows = []
+    for word, title in TESTS.items():
+        errors = curve.errors[word]
+        for category in curve.lines:
+            row: dict[str, object] = {"test": title, "model": category}
+            rows.append(row | {minutes: errors.in_words(f"{category}@{minutes}", "fvu") for minutes in curve.minutes})
+    columns = {"test": Column("test"), "model": Column("model")} | {minutes: Column(f"{minutes} min") for minutes in curve.minutes}
+    caption = (
+        "FVU by the minutes learnt and stopped on together, scheme 2, with 95 % intervals over blocks, seeds and two places of the drives. "
+        "Structures as in the paper's Table V."
+    )
+    return Table("minutes", caption, pd.DataFrame(rows), columns)
+
+
+def curve_figure(curve: Curve) -> Figure:
+    """Figure ``minutes``: FVU over minutes, a panel a car."""
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 2.6)
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, (word, title) in zip(panels, TESTS.items(), strict=True):
+            errors = curve.errors[word]
+            for category, name in curve.lines.items():
+                points = [
+                    (float(minutes), own) for minutes in curve.minutes if (own := errors.get(f"{category}@{minutes}", "fvu")) is not None
+                ]
+                if not points:
+                    continue
+                line = line_of(*name)
+                values = [own.value for _, own in points]
+                ends = [own.interval for _, own in points]
+                bars = [
+                    [value - low for value, (low, _) in zip(values, ends, strict=True)],
+                    [high - value for value, (_, high) in zip(values, ends, strict=True)],
+                ]
+                axes.errorbar(
+                    [minutes for minutes, _ in points],
+                    values,
+                    yerr=bars,
+                    color=line.colour,
+                    linestyle=line.dash,
+                    marker=line.marker,
+                    elinewidth=0.6,
+                    label=category,
+                )
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_title(title, loc="left")
+            axes.set_xlabel("minutes learnt and stopped on")
+            ticks = [float(minutes) for minutes in curve.minutes]
+            axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            axes.minorticks_off()
+        panels[0].set_ylabel("FVU")
+        legend_above(figure, panels[0], columns=4)
+    caption = "FVU by the minutes of recordings learnt and stopped on, scheme 2, with 95 % intervals; logarithmic axes."
+    return Figure("minutes", caption, figure)

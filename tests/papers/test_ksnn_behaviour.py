@@ -1,0 +1,131 @@
+"""How estimators behave: biases taken off, the start of a window, low yaw rates and spectra, on drives whose truth is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from conftest import planar_drive
+from trained_ksnn import ksnn_with_weights
+from vehest.data.recording import Recording
+from vehest.data.splits import Span, Split
+from vehest.data.store import write_estimate, write_recording
+from vehest.estimators.model_files import save_model
+from vehest.estimators.registry import estimator_class
+from vehest.evaluation.blocks import segments_of, write_segments
+from vehest.evaluation.metrics import Protocol
+from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
+from vehest_papers.ksnn import behaviour, claims_of_models, paper
+from vehest_papers.ksnn.schemes import Scheme
+
+OFFSET = 0.2
+SECONDS = 240.0
+
+
+def without_ay(recording: Recording, offset: float) -> Recording:
+    return replace(recording, channels={**recording.channels, "ay": recording["ay"] - offset})
+
+
+def scheme(folder: Path, *, bias: bool = False) -> Scheme:
+    """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
+    drives = {name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))}
+    drives |= {name: without_ay(planar_drive(SECONDS, seed=seed, name=name), OFFSET) for seed, name in ((5, "f1"), (6, "f2"))}
+    references = {}
+    for name, recording in drives.items():
+        references["cars", name] = folder / f"{name}.parquet"
+        write_recording(recording, references["cars", name])
+    network, zero = ksnn_with_weights(n_local=2, bias=bias), estimator_class("zero").from_config({"rate_hz": 20.0})
+    spans = {name: (Span("cars", name),) for name in drives}
+    split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})
+    models, rows = [], []
+    for estimator in (network, zero):
+        at = folder / estimator.name
+        at.mkdir()
+        save_model(estimator, at)
+        models.append(EvaluatedModel(estimator.name, estimator.variant, estimator.full_title, 0, at, at))
+        for test in ("c2", "f2"):
+            (at / test).mkdir()
+            write_estimate(estimator.estimate([drives[test].without_references()])[0], at / test / "0.parquet")
+        for test in ("validation", "c2", "f2"):
+            for metric in ("rmse_vy", "fvu", "r2", "rmse_sideslip", "n_parameters", "epochs"):
+                own = ("ksnn", estimator.name, estimator.variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", 0)
+                rows.append((*own, metric, 1.0, "1", None, None))
+    protocol = Protocol()
+    titles, kinds, metrics = {"cars": "Cars"}, {"cars": "simulated"}, pd.DataFrame(rows, columns=list(METRIC_COLUMNS))
+    part = PartArtefacts("ksnn", "t", "a", "c", split, protocol, kinds, titles, metrics, models, references, [])
+    for model in models:
+        write_segments(model.evaluation_folder / "blocks.csv", {test: segments_of(part.scored(model, test), 20.0) for test in ("c2", "f2")})
+    return Scheme("scheme_1", "Scheme 1", part, "c2", "f2")
+
+
+def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(tmp_path):
+    own = scheme(tmp_path)
+    errors, biases = behaviour.without_biases(own, [paper.LINEAR], "f2")
+    assert biases["own"] == pytest.approx(0.0, abs=2e-3)
+    assert biases["other"] == pytest.approx(OFFSET, abs=2e-3)
+    network = ksnn_with_weights(n_local=2)
+    clean = planar_drive(SECONDS, seed=6)
+    error = (network.estimate([clean.without_references()])[0]["vy"] - clean["vy_ref"])[30:]
+    assert errors.value(f"{paper.LINEAR}, corrected", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
+    assert errors.value(f"{paper.LINEAR}, as measured", "rmse_vy") != pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
+
+
+def test_a_network_that_can_hold_an_offset_is_given_that_of_its_own_car(tmp_path):
+    turned = scheme(tmp_path, bias=True)
+    turned = Scheme(
+        "scheme_2",
+        "Scheme 2",
+        replace(turned.part, split=replace(turned.part.split, train=turned.part.split.validation, validation=turned.part.split.train)),
+        "f2",
+        "c2",
+    )
+    errors, _ = behaviour.without_biases(turned, [paper.LINEAR_BIAS], "c2")
+    network = ksnn_with_weights(n_local=2, bias=True)
+    shifted = without_ay(planar_drive(SECONDS, seed=1), OFFSET)
+    error = (network.estimate([shifted.without_references()])[0]["vy"] - shifted["vy_ref"])[30:]
+    assert errors.value(f"{paper.LINEAR_BIAS}, corrected", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
+
+
+def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimate(tmp_path):
+    own = scheme(tmp_path)
+    errors = behaviour.after_start(own, paper.LINEAR, "c2")
+    drive = planar_drive(SECONDS, seed=1)
+    estimate = ksnn_with_weights(n_local=2).estimate([drive.without_references()])[0]["vy"]
+    ends = np.arange(max(behaviour.WINDOWS), len(drive), behaviour.STRIDE)
+    error = (estimate - drive["vy_ref"])[ends]
+    assert errors.value("30", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=1e-9)
+    assert errors.value("5", "rmse_vy") != errors.value("30", "rmse_vy")
+
+
+def test_at_little_yaw_rate_v_0_errs_by_v(tmp_path):
+    own = scheme(tmp_path)
+    errors, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
+    drive = planar_drive(SECONDS, seed=1)
+    scored = np.arange(len(drive)) >= 30
+    low = scored & (np.abs(drive["yaw_rate"]) < 0.1)
+    assert share == pytest.approx(low.sum() / scored.sum())
+    assert errors.value(paper.ZERO, "rmse_vy") == pytest.approx(math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6)
+
+
+def test_a_threshold_that_is_never_or_always_reached_tells_nothing(tmp_path):
+    own = scheme(tmp_path)
+    for threshold in (0.0, 100.0):
+        assert paper.ZERO not in behaviour.at_low_yaw_rate(own, threshold, [paper.ZERO], "c2")[0]
+
+
+def test_band_levels_are_the_density_of_the_error(tmp_path):
+    own = scheme(tmp_path)
+    model = own.model(paper.ZERO)
+    drive = planar_drive(SECONDS, seed=1, name="c2")
+    noise = np.random.default_rng(0).normal(0.0, 0.1, len(drive))
+    estimate = estimator_class("zero").from_config({"rate_hz": 20.0}).estimate([drive])[0]
+    noisy = replace(estimate, channels={**estimate.channels, "vy": drive["vy_ref"] + noise})
+    write_estimate(noisy, model.evaluation_folder / "c2" / "0.parquet")
+    levels = claims_of_models.band_levels(own, {paper.ZERO: model}, "c2")
+    densities = [levels[paper.ZERO, hz].value for hz in claims_of_models.BANDS_HZ[3:]]
+    assert np.mean(densities) == pytest.approx(0.1**2 / 10.0, rel=0.1), "white noise of 0.1 m/s over 0 to 10 Hz"

@@ -1,0 +1,290 @@
+"""Verdicts on the paper's statements: where our errors are the paper's own figures they come out, and where they are turned they do not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
+from vehest.evaluation.blocks import Segments, segments_of
+from vehest.evaluation.metrics import Scored
+from vehest_papers.ksnn import claims, cost, paper, tables
+from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
+from vehest_papers.ksnn.comparing import Change, Errors, masked_segments
+from vehest_papers.ksnn.schemes import Scheme
+from vehest_papers.ksnn.statements import Compared, Statement, counted, decided, outcomes
+
+PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
+
+
+def schemes(folder: Path, fvus=None, **options) -> list[Scheme]:
+    """Both schemes, with the paper's figures if no others are given."""
+    made = []
+    for name, (table, train, own, other) in PUBLISHED.items():
+        part = planted_part(folder / name, (fvus or of_the_paper)(table), train=train, **options)
+        made.append(Scheme(name, name.replace("_", " ").capitalize(), part, own, other, table))
+    return made
+
+
+def turned(table):
+    """The paper's figures with networks without structure and those without biases exchanged."""
+    own = of_the_paper(table)
+    pairs = ((paper.GRU, paper.LINEAR), (paper.LSTM, paper.NONLINEAR))
+    return own | {name: own[other] for pair in pairs for name, other in (pair, pair[::-1])}
+
+
+def verdicts(made):
+    return {claim.claim: claim.verdict for claim in decided(claims.on_accuracy(made))}
+
+
+def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
+    found = verdicts(schemes(tmp_path))
+    assert found["Luenberger leaves about 25 % (20 to 30 %) of v's variance on either car"] == "reproduced"
+    for claim in (
+        "and are worse than Luenberger on the other",
+        "biases: lower FVU on the own car",
+        "no biases: lower FVU on the other",
+        "with biases below GRU, LSTM on the own car",
+        "with biases below Luenberger on the other",
+        "no biases: the cars further alike, FVU other over own",
+        "nonlinear no bias: RMSE(v) on the other car below Luenberger's",
+        "and below GRU's, LSTM's",
+        "the same by FVU, Luenberger",
+        "the same by FVU, GRU, LSTM",
+        "not in the paper: below the static map",
+        "all dots above the diagonal, scheme 1",
+    ):
+        assert found[claim] == "reproduced", claim
+    assert found["GRU, LSTM explain over 90 % on the own car"] == "not reproduced", "the paper's text rounds its Table IV"
+    assert found["all dots above the diagonal, scheme 2"] == "reproduced"
+    assert found[next(claim for claim in found if claim.startswith("a third car"))] == "not testable on this data"
+
+
+def test_turned_figures_turn_the_verdicts(tmp_path):
+    found = verdicts(schemes(tmp_path, turned))
+    for claim in (
+        "nonlinear no bias: RMSE(v) on the other car below Luenberger's",
+        "and below GRU's, LSTM's",
+        "the same by FVU, GRU, LSTM",
+    ):
+        assert found[claim] == "not reproduced", claim
+
+
+def test_headline_says_whether_the_order_of_families_is_the_papers(tmp_path):
+    assert "comes out in both schemes" in headline(schemes(tmp_path / "as"), {})
+    words = headline(schemes(tmp_path / "turned", turned), {})
+    assert words.startswith("**The paper's order of families does not come out** (scheme 1 and scheme 2)")
+    assert "static map" in words
+    level = headline(
+        schemes(tmp_path / "level", lambda table: {name: {"c2": 0.3, "f2": 0.3} for name in of_the_paper(table)}, spread=0.0), {}
+    )
+    assert "is not decided here" in level
+
+
+def test_the_cause_without_which_the_order_is_lost_is_named(tmp_path):
+    made = schemes(tmp_path / "main")
+    ablations = {
+        cause: [
+            Scheme(f"{cause}_{own.name[-1]}", cause, own.part, own.own, own.other)
+            for own in schemes(tmp_path / cause, turned if cause == "same_sensors" else None)
+        ]
+        for cause in CAUSES
+    }
+    words = causes_in_words(made, orders(made), ablations)
+    assert words.count("It needs that the cars do not have the same sensors.") == 2
+    table = causes_table(made, ablations)
+    assert table.frame.iloc[-1]["S1 as it is"] == "comes out"
+    assert table.frame.iloc[-1]["S2 same sensors"] == "does not come out"
+    assert {paper.ZERO, paper.STATIC_MAP} <= set(table.frame["model"])
+    whole = causes_in_words(made, orders(made), {cause: own for cause, own in ablations.items() if cause != "same_sensors"})
+    assert whole.count("survives without each of them") == 2
+    other = causes_in_words(
+        schemes(tmp_path / "t", turned),
+        dict.fromkeys(("scheme_1", "scheme_2"), "does not come out"),
+        {"same_tyres": ablations["same_tyres"]},
+    )
+    assert "difference that the same tyres take away" in other
+
+
+def test_a_third_car_counts_where_it_is_there(tmp_path):
+    def with_third(table):
+        return {name: {**own, "j1": own["c2"]} for name, own in of_the_paper(table).items()}
+
+    made = schemes(tmp_path, with_third, tests=("c2", "f2", "j1"))
+    found = verdicts(made)
+    assert found[next(claim for claim in found if claim.startswith("a third car"))] in ("reproduced", "not reproduced")
+    table = tables.across_cars(made, "overview", "caption")
+    assert "fvu_third_shown" in table.columns
+    assert table.frame["model"].tolist()[:2] == [paper.ZERO, paper.STATIC_MAP]
+    assert table.frame.set_index(["scheme", "model"]).loc[("Scheme 1", paper.LINEAR), "fvu_other"] == pytest.approx(0.152, rel=0.05)
+
+
+def test_regularisation_is_compared_on_the_same_structures(tmp_path):
+    with_it = schemes(tmp_path / "with")[1]
+    table = {paper.LSTM: {"c2": 0.84, "f2": 0.042}, paper.NONLINEAR: {"c2": 0.197, "f2": 0.059}}
+    without = Scheme("one_vehicle", "Without", planted_part(tmp_path / "without", table, train="f"), "f2", "c2")
+    found = decided(claims.on_regularisation(with_it, without))
+    assert [claim.verdict for claim in found] == ["reproduced"] * 3
+    assert "−57 %" in found[0].ours
+
+
+def test_an_order_is_not_read_where_a_candidate_failed_on_its_own_car(tmp_path):
+    made = schemes(tmp_path)[0]
+    assert "the paper's order of families" in tables.whether_an_order_means_anything(made)
+    failing = of_the_paper(paper.TABLE_IV) | {paper.GRU: {"c2": 1.3, "f2": 0.9}}
+    scheme = Scheme("x_1", "Pair", planted_part(tmp_path / "failing", failing, train="c"), "c2", "f2")
+    words = tables.whether_an_order_means_anything(scheme)
+    assert "on the car that they learnt on themselves GRU do no better than the baselines" in words
+    assert "order of families." not in words.split("No order")[1]
+
+
+def test_figures_are_those_of_the_samples():
+    segments = planted_segments(0.2, "c2", 3)
+    errors = Errors({"one": [segments, segments]}, "c2")
+    assert errors.value("one", "fvu") == pytest.approx(0.2)
+    assert errors.value("one", "rmse_vy") == pytest.approx(math.sqrt(0.2) * DEVIATION["c2"])
+    low, high = errors.get("one", "fvu").interval
+    assert low < 0.2 < high
+
+
+def test_intervals_hold_the_true_ratio_as_often_as_they_say():
+    generator, inside = np.random.default_rng(0), 0
+    for trial in range(150):
+        scale = generator.lognormal(0.0, 0.3, 40)
+        parts = {}
+        for name, level in (("first", 0.8), ("second", 1.0)):
+            squares = [level * scale * generator.lognormal(0.0, 0.3, 40) * math.exp(0.1 * generator.standard_normal()) for _ in range(4)]
+            parts[name] = [_of_pieces(own) for own in squares]
+        change = Errors(parts, f"trial {trial}").change("first", "second", "rmse_vy")
+        low, high = change.ends()
+        inside += low < math.sqrt(0.8) < high
+    assert stats.binomtest(inside, 150, 0.95).pvalue > 0.01, inside
+
+
+def _of_pieces(squares):
+    """Segments each in a piece of its own, so that each is a block."""
+    zeros = np.zeros_like(squares)
+    n = np.arange(len(squares), dtype=float)
+    return Segments(n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares))
+
+
+def test_the_same_networks_under_two_conditions_are_compared_seed_by_seed():
+    parts = {name: [planted_segments(level * fvu, "c2", 3) for fvu in (0.1, 0.2, 0.4)] for name, level in (("a", 0.9), ("b", 1.0))}
+    together = Errors(parts, "c2", same_models=True).change("a", "b", "fvu")
+    apart = Errors(parts, "c2").change("a", "b", "fvu")
+    assert together.ends() == pytest.approx((0.9, 0.9), rel=1e-6)
+    assert apart.ends()[0] < 0.5
+
+
+def test_candidates_with_infinite_errors_are_left_out():
+    broken = planted_segments(math.inf, "c2", 0)
+    errors = Errors({"good": [planted_segments(0.1, "c2", 0)], "broken": [broken]}, "c2")
+    assert "broken" not in errors
+    assert errors.change("good", "broken", "fvu") is None
+    assert errors.in_words("broken", "fvu") == "–"
+
+
+def test_masked_segments_without_a_mask_are_the_evaluations_own():
+    generator = np.random.default_rng(2)
+    time = np.arange(90) / 20.0
+    vy, reference = generator.normal(size=90), generator.normal(size=90)
+    part = Scored(time, vy, reference, vy / 20.0, reference / 20.0, np.zeros(90))
+    own, plain = masked_segments([part], [np.ones(90)], 20.0), segments_of([part], 20.0)
+    assert all(np.allclose(getattr(own, name), getattr(plain, name)) for name in vars(plain))
+    half = masked_segments([part], [(time < 2.0).astype(float)], 20.0)
+    assert half.samples.sum() == 40
+    assert half.squared_error_vy.sum() == pytest.approx(np.sum((vy - reference)[:40] ** 2))
+
+
+def change(ratio: float, error: float) -> Change:
+    return Change(math.log(ratio), error, 30.0)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "verdict"),
+    [((0.5, 0.6), "reproduced"), ((0.5, 0.99), "undecided"), ((0.5, 2.0), "not reproduced"), ((), "not testable on this data")],
+)
+def test_a_statement_is_reproduced_only_where_all_its_comparisons_are(ratios, verdict):
+    statement = Statement("claim", "paper", "simulated", [Compared(str(own), change(own, 0.05)) for own in ratios])
+    (claim,) = decided([statement])
+    assert claim.verdict == verdict
+    assert ("−50 % [" in claim.ours) == bool(ratios)
+
+
+def test_many_comparisons_are_corrected_for_their_number():
+    weak = Compared("", change(0.9, 0.045))
+    assert outcomes([weak])[0][0] == "as claimed"
+    assert {outcome for outcome, _ in outcomes([weak] * 10)} == {"not told apart"}
+    _, confidence = outcomes([weak] * 10)[0]
+    assert confidence == pytest.approx(1.0 - 0.05 / 10)
+
+
+def test_bounds_are_relative_changes_too():
+    within = Compared("", change(1.0, 0.005), beyond=0.02)
+    assert outcomes([within])[0][0] == "as claimed"
+    assert outcomes([Compared("", change(1.05, 0.005), beyond=0.02)])[0][0] == "the other way round"
+
+
+def test_counted_claims_need_every_case():
+    assert counted("c", "p", "o", "d", [True, True], "w").verdict == "reproduced"
+    assert counted("c", "p", "o", "d", [True, False], "w").verdict == "undecided"
+    assert counted("c", "p", "o", "d", [False], "w").verdict == "not reproduced"
+    assert counted("c", "p", "o", "d", [], "w").verdict == "not testable on this data"
+
+
+class Number:
+    """Counts what is done with it; constants are plain numbers."""
+
+    done = 0
+
+    def __add__(self, other):
+        Number.done += 1
+        return Number()
+
+    __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __add__
+
+
+@pytest.mark.parametrize(("n_hidden", "bias"), [(0, False), (0, True), (2, False), (3, True)])
+def test_operations_of_a_ksnn_are_those_of_its_equations(n_hidden, bias):
+    """Eqs. 7 to 9 of two active modules, carried out on numbers that count."""
+    Number.done, tanhs = 0, 0
+    v, u, speed, omega, ay, ax, w = (Number() for _ in range(7))
+    error, slip, thrust = u - speed, ay - omega * speed, ax + v * omega
+    upper = w * omega - w  # activations: place among the centres, then one less it
+    lower = 1 - upper
+    totals = []
+    for phi in (lower, upper):
+        rows = []
+        for _ in range(2):
+            f = w * error
+            if bias:
+                f = f + w
+            for _ in range(n_hidden):
+                inner = w * error
+                if bias:
+                    inner = inner + w
+                tanhs += 1
+                f = f + w * inner
+            rows.append(f)
+        totals.append((phi * (w * v + w * slip - omega * rows[0]), phi * (w * u + w * thrust - rows[1])))
+    assert totals[0][0] + totals[1][0] is not totals[0][1] + totals[1][1]
+    assert cost.ksnn_operations(2, n_hidden, bias=bias) == (Number.done, tanhs)
+    assert cost.ksnn_operations(6, n_hidden, bias=bias) == (Number.done, tanhs), "two modules at most are active"
+
+
+def test_times_in_c_are_those_that_were_published():
+    published = pd.read_csv(Path(__file__).parents[2] / "results" / "export" / "metrics.csv")
+    for (estimator, variant), shown in cost.IN_C_US.items():
+        own = published[(published["family"] == estimator) & (published["variant"] == variant) & (published["drive"] == "ferrari_250lm")]
+        measured = float(own[own["precision"] == "double"]["c_method_ns"].iloc[0]) / 1e3
+        assert shown == pytest.approx(measured, rel=0.01)
+
+
+def test_every_category_has_a_name_here():
+    assert set(NAMES) >= set(paper.CATEGORIES)
+    assert SEGMENTS % 2 == 0
