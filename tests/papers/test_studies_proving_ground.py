@@ -24,7 +24,7 @@ from vehest.report.document import Document, write_document
 from vehest.report.recording_figures import Distribution, beyond
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
-from vehest_papers.proving_ground import documents
+from vehest_papers.proving_ground import documents, gates
 from vehest_papers.proving_ground.handling import HandlingPoints, characteristic, single_track_gradient
 from vehest_papers.proving_ground.noise import spectra
 from vehest_papers.proving_ground.papers import PROFILES, page_of
@@ -366,3 +366,61 @@ def test_samples_beyond_the_drawn_range_are_counted():
     edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
     distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
     assert beyond(distributions, 20.0) == pytest.approx(2.5)
+
+
+# Gates
+
+
+def _set(name: str, seed: int, seconds: float = 60.0) -> Recording:
+    return replace(_simulated(_drive(f"{name}_001", seed, seconds)), vehicle=f"car {name[0]}")
+
+
+def test_a_static_map_explains_all_of_a_car_that_is_one() -> None:
+    own = _set("f1", 1)
+    exact = own["yaw_rate"] * (1.07 - 0.005 * own["vx"] ** 2)
+    mapped = replace(own, channels={**own.channels, "vy_ref": exact})
+    assert gates.static_map_left([mapped]) < 1e-20
+    noisy = replace(
+        own, channels={**own.channels, "vy_ref": exact + 0.3 * np.std(exact) * np.random.default_rng(0).standard_normal(len(exact))}
+    )
+    assert gates.static_map_left([noisy]) == pytest.approx(0.09 / 1.09, rel=0.1)
+
+
+def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path) -> None:
+    drives = {gates.AFTER: {"c1": [_set("c1", 1)], "f1": [_set("f1", 2)]}}
+    found = gates.gates(drives, [])
+    assert {gate.of for gate in found} == {"C-1", "C-2", "F-1", "F-2", "Corvette", "Ferrari"} | {"Jaguar"}
+    lengths = [gate for gate in found if gate.of == "C-1" and gate.quantity == "duration [min]"]
+    assert [gate.met(gates.AFTER) for gate in lengths] == [False]  # a minute instead of nineteen
+    assert not any(gate.met(gates.AFTER) for gate in found if gate.of == "C-2")  # no such drives
+    stored = [_stored(tmp_path, gates.AFTER, "simulated", [own for part in drives[gates.AFTER].values() for own in part])]
+    said = [block for block in gates.blocks(stored) if isinstance(block, str)]
+    assert any("C-1: duration [min] (1)" in text for text in said)
+    assert any("needs the real recording" in text for text in said)
+
+
+def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels() -> None:
+    own = _set("f1", 3, 120.0)
+    rate = np.gradient(own["vy_ref"]) * own.rate_hz
+    twice = replace(
+        own, channels={**own.channels, "ay": own["vx"] * own["yaw_rate"] + rate - 2.0 * (rate - own["ay"] + own["vx"] * own["yaw_rate"])}
+    )
+    found = [gate for gate in gates.gates({gates.AFTER: {"f1": [own]}}, [own]) if "process noise" in gate.quantity]
+    assert len(found) == len(gates.BANDS_HZ)
+    assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in found)
+    doubled = [gate for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own]) if "process noise" in gate.quantity]
+    np.testing.assert_allclose([gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1)
+
+
+def test_the_first_cars_stand_in_the_gates_only(tmp_path) -> None:
+    stored = [
+        _stored(tmp_path, name, "simulated", [replace(_set(letter, seed), vehicle=vehicle)])
+        for name, letter, seed, vehicle in (
+            (gates.AFTER, "f1", 4, "ferrari_250_lm"),
+            (gates.BEFORE, "c1", 5, "corvette_grand_sport"),
+        )
+    ]
+    made = documents(StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run x.yaml", datasets=stored))
+    assert "corvette_grand_sport" not in made
+    assert "ferrari_250_lm" in made
+    assert any(getattr(block, "name", "") == "excitation" for block in made["report"].blocks)

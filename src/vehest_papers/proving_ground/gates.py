@@ -15,11 +15,12 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
-from vehest.evaluation.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest.evaluation.spectra import SEGMENT_SECONDS, Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import StoredDataset
 from vehest_papers.proving_ground.papers import PROFILES
+from vehest_papers.proving_ground.tally import MOVING
 
 BEFORE, AFTER = "sim_two_cars", "sim_race_cars"
 """Data sets whose gates are shown: the first simulated cars, and those that the study of the KS-NN learns on."""
@@ -35,6 +36,8 @@ BIASES = {"c": 0.10, "f": -0.03}
 """Mean of dv/dt - (ay - ωu) by car [m/s²] (Section VII-A1)."""
 CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}
 """First letter of a drive -> the car that it is like."""
+
+READ_AT_HZ = (0.1, 0.3, 1.0)
 
 QUANTITIES = {
     "vy_q01": ("v, 1 % quantile [m/s]", "relative", 0.20),
@@ -221,7 +224,57 @@ def blocks(datasets: Sequence[StoredDataset]) -> list[Block]:
         table,
         _figure(drives, real),
         _differ(drives[AFTER]),
+        excitation(datasets),
     ]
+
+
+def excitation(datasets: Sequence[StoredDataset]) -> Table:
+    """How much every vehicle slides, and how far its signal stands above what the kinematics leave unexplained.
+
+    Spectra are those of drives that last a segment or longer; a static map is fitted to the very drives.
+    """
+    rows: list[dict[str, object]] = []
+    for dataset in datasets:
+        cars: dict[str, list[Recording]] = {}
+        for recording in dataset.recordings():
+            flags = recording.provenance.get("flags", {})
+            if not (flags.get("spun") or flags.get("left_road")):
+                kept = recording.select(["vx", "yaw_rate", "ay", "vy_ref"])
+                cars.setdefault(recording.vehicle, []).append(Resample(RATE_HZ)(kept) if kept.rate_hz > RATE_HZ else kept)
+        for vehicle, recordings in cars.items():
+            u, ay, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "ay", "vy_ref"))
+            moving = u > MOVING
+            long = [own for own in recordings if own.duration >= SEGMENT_SECONDS]
+            row: dict[str, object] = {
+                "vehicle": vehicle,
+                "dataset": dataset.name,
+                "kind": dataset.kind,
+                "drives": len(recordings),
+                "ay": float(np.quantile(np.abs(ay[moving]), 0.99)),
+                "sideslip": float(np.degrees(np.quantile(np.abs(np.arctan2(v[moving], u[moving])), 0.99))),
+                "map": static_map_left(recordings),
+            }
+            if long:
+                rate, noise = spectra_of(long)
+                row |= {f"above_{hz:g}": decibels(rate.level(hz), noise.level(hz)) for hz in READ_AT_HZ}
+            rows.append(row)
+    return Table(
+        "excitation",
+        "What each vehicle's drives excite, accidents left out, at 20 Hz: 99 % quantiles above 5 m/s, FVU that a static map fitted to them "
+        "leaves, and how far v̇ stands above the process noise. A map that leaves little, or a signal below the noise, tells "
+        "estimators apart by little.",
+        pd.DataFrame(rows),
+        {
+            "vehicle": Column("vehicle"),
+            "dataset": Column("data set"),
+            "kind": Column("kind"),
+            "drives": Column("drives", decimals=0),
+            "ay": Column("|ay| 99 % [m/s²]", decimals=2),
+            "sideslip": Column("|β| 99 % [deg]", decimals=2),
+            "map": Column("FVU of the own static map", decimals=3),
+            **{f"above_{hz:g}": Column(f"v̇ over noise at {hz:g} Hz [dB]", decimals=1) for hz in READ_AT_HZ},
+        },
+    )
 
 
 def _differ(sets: Mapping[str, Sequence[Recording]]) -> Block:
