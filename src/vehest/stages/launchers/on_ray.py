@@ -353,7 +353,8 @@ def _run_on_ray(order: Order, board: Any) -> tuple[str, Report]:
         failed = 0
         return stopping
 
-    return str(ray.get_runtime_context().get_node_id()), run_order(order, exchange)
+    node = str(ray.get_runtime_context().get_node_id())
+    return node, run_order(order, exchange, node)
 
 
 def _why(error: Exception, exceptions: Any) -> str:

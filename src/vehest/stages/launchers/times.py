@@ -24,6 +24,7 @@ from vehest.stages.train import TrainJob, read_fit_metrics
 
 GUESS_SECONDS = 10.0  # of a member of which nothing like it was ever trained here
 GUESS_BYTES = 300_000
+MOST_KEPT = 48  # times of a kind
 MOST_READ = 12  # artefacts of a kind that are looked at
 
 Basis = Literal["same", "variant", "estimator", "guess"]
@@ -75,11 +76,14 @@ class Times:
         return self._costs[key]
 
     def learn(self, group: Group, seconds: float) -> None:
-        """Know from now on what a group took [s], where nothing with its settings was recorded."""
+        """Count a group that has just ended [s] among what is recorded."""
         for job in group.jobs:
-            known = self.cost_of(job)
-            if known.basis != "same":
-                self._costs[_key(job)] = Cost(seconds / len(group.jobs), known.bytes, "same")
+            own = _Recorded(_settings(job), seconds / len(group.jobs), GUESS_BYTES)
+            for start in (f"{_stem(job)}-seed", f"{job.estimator['name']}-"):
+                known = self._recorded(start)
+                known.append(own)
+                del known[:-MOST_KEPT]
+        self._costs = {key: cost for key, cost in self._costs.items() if cost.basis == "same"}
 
     def _looked_up(self, estimator: str, stem: str, settings: Mapping[str, Any]) -> Cost:
         alike = self._recorded(f"{stem}-seed")

@@ -145,12 +145,13 @@ def _cpu() -> str:
     return str(llvmlite.binding.get_host_cpu_name())
 
 
-def run_order(order: Order, exchange: Exchange) -> Report:
+def run_order(order: Order, exchange: Exchange, node: str = "") -> Report:
     """Do a task.
 
     Args:
         order: the task.
         exchange: tells the parent of progress; returns whether to stop.
+        node: what the cluster calls this machine.
     """
     host = socket.gethostname()
     store = Store(order.store) if order.store else None
@@ -158,7 +159,7 @@ def run_order(order: Order, exchange: Exchange) -> Report:
     if unsuitable:
         return Report(host, this_world().cpu, [], unsuitable)
     output = order.output if store is None else store.scratch / "outputs"
-    journal = _Journal(output / JOURNAL / order.run, host)
+    journal = _Journal(output / JOURNAL / order.run, host, node)
     ended: list[Ended] = []
     with use_limits(order.limits):
         for position, given in order.groups:
@@ -364,12 +365,13 @@ class _Beat:
 class _Journal:
     """What was begun and made by this process, a line each; nothing depends on it but those who want to know."""
 
-    def __init__(self, folder: Path, host: str) -> None:
-        self._file = folder / f"{host}-{os.getpid()}.jsonl"
+    def __init__(self, folder: Path, host: str, node: str) -> None:
+        self._file, self._node = folder / f"{host}-{os.getpid()}.jsonl", node
 
     def say(self, event: str, group: Group, **further: Any) -> None:
         keys = [job.plan.key for job in group.jobs]
-        line = {"at": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, "group": group.name, "keys": keys, **further}
+        at = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = {"at": at, "node": self._node, "event": event, "group": group.name, "keys": keys, **further}
         with suppress(OSError):
             self._file.parent.mkdir(parents=True, exist_ok=True)
             with open(self._file, "a", encoding="utf-8") as stream:
