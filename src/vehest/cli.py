@@ -794,6 +794,35 @@ def sweep(
             remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
 
 
+@app.command()
+def plan(
+    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
+    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Cores that the time is for; by default those of this machine.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what is left to do of a study and what it would cost, by what trainings of the same kinds took; runs nothing.
+
+    Trainings, tasks of a cluster, core hours, memory, data to move, and the time on so many cores. What is guessed, since nothing like it
+    was trained into this output root, is called a guess.
+    """
+    from vehest.stages.launcher import default_jobs
+    from vehest.stages.launchers.plan import plan_study
+    from vehest.stages.pipeline import pipeline_configs, read_pipeline
+
+    study = read_pipeline(pipeline)
+    configs = pipeline_configs(study, overrides or [])
+    with _workshop(next(iter(configs.values()))[0], force=set(), dry_run=True, quiet=True) as workshop:
+        cost = plan_study(study, configs, workshop, cores or default_jobs())
+    if as_json:
+        _echo(_json(cost.figures()), keep="\n")
+    else:
+        for name, value in cost.rows():
+            _echo(f"{name:<11} {value}")
+
+
 @app.command("config")
 def show_config(
     command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_complete_command)],

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from two_nodes import Driver, TwoNodes, begun, journal, metrics, server, sweep_of, trained, under_way, weights, with_recordings
 
 from place import Place
-from two_nodes import Driver, TwoNodes, begun, journal, metrics, server, sweep_of, trained, under_way, weights, with_recordings
 
 pytestmark = [
     pytest.mark.cluster,

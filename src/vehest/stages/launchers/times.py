@@ -70,9 +70,19 @@ class Times:
 
     def cost_of(self, job: TrainJob) -> Cost:
         """What a member takes, its seed aside."""
-        key = _key(job)
+        return self.cost(str(job.estimator["name"]), _stem(job), _settings(job))
+
+    def cost(self, estimator: str, stem: str, settings: Mapping[str, Any]) -> Cost:
+        """What a member takes.
+
+        Args:
+            estimator: its name.
+            stem: estimator and variant, as the label of a training begins.
+            settings: ``estimator`` and ``training``, as the manifest of a training has them.
+        """
+        key = repr((stem, settings))
         if key not in self._costs:
-            self._costs[key] = self._looked_up(str(job.estimator["name"]), _stem(job), _settings(job))
+            self._costs[key] = self._looked_up(estimator, stem, settings)
         return self._costs[key]
 
     def learn(self, group: Group, seconds: float) -> None:
@@ -127,10 +137,6 @@ def _stem(job: TrainJob) -> str:
 
 def _settings(job: TrainJob) -> dict[str, Any]:
     return {name: job.plan.config[name] for name in ("estimator", "training")}
-
-
-def _key(job: TrainJob) -> str:
-    return repr((_stem(job), _settings(job)))
 
 
 def bytes_of(artefact: Artefact) -> int:
