@@ -27,7 +27,7 @@ WORDS = {
     "same": "trainings with the same settings",
     "variant": "the same variant under other settings",
     "estimator": "other variants of the estimator",
-    "guess": "nothing: guessed",
+    "guess": "nothing like it was trained here",
 }
 
 
