@@ -105,12 +105,13 @@ class Driver:
 
 
 def journal(*roots: Path) -> list[dict[str, Any]]:
-    """What workers have written down of their groups, each entry with the number of its process."""
+    """What workers have written down of their groups, each entry with its process and the parent's run."""
     entries = []
     for root in roots:
         for file in sorted(root.glob("journal/*/*.jsonl")):
             pid = int(file.stem.rpartition("-")[2])
-            entries += [{**json.loads(line), "pid": pid} for line in file.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+            lines = [line for line in file.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
+            entries += [{**json.loads(line), "pid": pid, "run": file.parent.name} for line in lines]
     return entries
 
 

@@ -203,7 +203,8 @@ def _done(position: int, group: Group, inputs: Sequence[Artefact], beat: _Beat, 
         raise outcome.error
     made: list[str] = []
     if not isinstance(outcome, Failure):
-        made = [member.job.plan.key for member in outcome if member.model is not None and not member.model.skipped]
+        models = [member.model for member in outcome if member.model is not None]
+        made = [model.key for model in models if model.status == "complete" and not model.skipped]
         if store is not None:
             _push(outcome, store)
     seconds = time.monotonic() - begun
