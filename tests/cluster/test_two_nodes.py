@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import random
 import signal
 import socket
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,8 +52,17 @@ def alone(folder: Path) -> dict[str, Path]:
     return roots
 
 
+@pytest.fixture(scope="session")
+def cluster(folder: Path) -> Iterator[TwoNodes]:
+    """One that outlives a test, since nothing happens to its nodes."""
+    nodes = TwoNodes(folder / "cluster")
+    yield nodes
+    nodes.shut_down()
+
+
 @pytest.fixture
-def cluster(folder: Path, tmp_path: Path) -> Iterator[TwoNodes]:
+def mortal(folder: Path, tmp_path: Path) -> Iterator[TwoNodes]:
+    """One of which a node will be lost."""
     nodes = TwoNodes(tmp_path)
     yield nodes
     nodes.shut_down()
@@ -121,17 +132,17 @@ def test_a_killed_worker_costs_no_more_than_what_came_after_its_last_checkpoint(
     assert not list(output.glob("checkpoints/*"))
 
 
-def test_a_lost_node_takes_nothing_that_was_finished(cluster, folder, alone, tmp_path):
+def test_a_lost_node_takes_nothing_that_was_finished(mortal, folder, alone, tmp_path):
     output = with_recordings(alone["longer"], tmp_path / "out")
-    driver = swept(cluster, folder, output, *LONGER)
+    driver = swept(mortal, folder, output, *LONGER)
 
     def on_second_node() -> dict | None:
         entry = training_with_a_checkpoint(output)
-        return entry if entry and entry["node"] == cluster.nodes[1].node_id else None
+        return entry if entry and entry["node"] == mortal.nodes[1].node_id else None
 
     lost = driver.sees(on_second_node)
     before = trained(output)
-    cluster.lose(cluster.nodes[1])
+    mortal.lose(mortal.nodes[1])
     assert driver.ended() == 0, driver.said
     assert metrics(output) == metrics(alone["longer"])
     assert set(trained(output).values()) == {1}
@@ -160,19 +171,19 @@ def test_ctrl_c_loses_nothing_and_the_next_call_goes_on(cluster, folder, alone, 
     assert set(trained(output).values()) == {1}
 
 
-def test_nodes_without_a_common_folder_share_a_store_and_go_on_with_each_others_checkpoints(cluster, folder, alone, tmp_path):
+def test_nodes_without_a_common_folder_share_a_store_and_go_on_with_each_others_checkpoints(mortal, folder, alone, tmp_path):
     output = with_recordings(alone["longer"], tmp_path / "out")
-    driver = swept(cluster, folder, output, *LONGER, "--store", f"file://{tmp_path / 'store'}")
-    scratches = [next(iter((tmp_path / f"scratch-{name}").glob("*/outputs")), tmp_path / "none") for name in ("head", "second")]
+    driver = swept(mortal, folder, output, *LONGER, "--store", f"file://{tmp_path / 'store'}")
+    scratches: list[Path] = []
 
     def kept() -> dict | None:
         scratches[:] = [own for name in ("head", "second") for own in (tmp_path / f"scratch-{name}").glob("*/outputs")]
         names = {file.name.rpartition("-")[2] for file in (tmp_path / "store" / "checkpoints").glob("*")}
-        on_second = [entry for entry in under_way(*scratches) if entry["node"] == cluster.nodes[1].node_id]
+        on_second = [entry for entry in under_way(*scratches) if entry["node"] == mortal.nodes[1].node_id]
         return next((entry for entry in on_second if {key[:12] for key in entry["keys"]} <= names), None)
 
     lost = driver.sees(kept)
-    cluster.lose(cluster.nodes[1])
+    mortal.lose(mortal.nodes[1])
     assert driver.ended() == 0, driver.said
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
@@ -210,3 +221,76 @@ def test_an_object_store_serves_as_one(folder, alone, tmp_path, monkeypatch):
         assert metrics(output) == metrics(alone["longer"])
         assert weights(output) == weights(alone["longer"])
         assert fsspec.filesystem("s3").ls("s3://trainings/vehest/objects")
+
+
+def test_a_node_that_cannot_keep_copies_is_left_out_and_the_other_does_its_work(folder, alone, tmp_path):
+    nodes = TwoNodes(tmp_path, scratch_of_second="/proc/none")
+    try:
+        output = with_recordings(alone["longer"], tmp_path / "out")
+        driver = swept(nodes, folder, output, *LONGER, "--store", f"file://{tmp_path / 'store'}")
+        assert driver.ended() == 0, driver.said
+    finally:
+        nodes.shut_down()
+    assert driver.said.count("is left out: cannot keep copies in '/proc/none/") == 1
+    assert metrics(output) == metrics(alone["longer"])
+
+
+def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(cluster, folder, alone, tmp_path):
+    output = with_recordings(alone["longer"], tmp_path / "out")
+    one_seed = (*(word for word in LONGER if not word.startswith("seed=")), "seed=0")
+    driver = swept(cluster, folder, output, *one_seed)
+    poisoned = driver.sees(lambda: under_way(output))[0]
+    killed: set[int] = set()
+    for _ in range(3):
+        entry = driver.sees(lambda: next((e for e in under_way(output) if e["keys"] == poisoned["keys"] and e["pid"] not in killed), None))
+        killed.add(entry["pid"])
+        os.kill(entry["pid"], signal.SIGKILL)
+    assert driver.ended() == 5, driver.said
+    assert driver.said.count("its worker died, the 3rd time") >= 1
+    assert len(metrics(output)) == 3
+    again = swept(cluster, folder, output, *one_seed)
+    assert again.ended() == 0, again.said
+    assert len(metrics(output)) == 4
+    assert metrics(output).items() <= metrics(alone["longer"]).items()
+
+
+def test_the_head_lost_loses_nothing_that_was_finished(mortal, folder, alone, tmp_path):
+    output = with_recordings(alone["longer"], tmp_path / "out")
+    driver = swept(mortal, folder, output, *LONGER)
+    driver.sees(lambda: training_with_a_checkpoint(output))
+    mortal.lose(mortal.nodes[0])
+    assert driver.ended() != 0
+    before = trained(output)
+    again = Driver(folder, output, "sweep", *LONGER, "--jobs", "2")
+    assert again.ended() == 0, again.said
+    assert metrics(output) == metrics(alone["longer"])
+    assert set(before.values()) <= {1}
+
+
+@pytest.mark.slow
+def test_two_hundred_trainings_survive_twenty_kills_at_random_moments(cluster, folder, tmp_path):
+    words = (*SMALL, "estimator.n_local=2,3,4,5,6", "estimator.n_hidden=0,1,2,3", "seed=range(10)", "training.patience=1000")
+    words = (*words, "training.max_epochs=30", "training.checkpoint_seconds=0.01")
+    alone = Driver(folder, tmp_path / "alone", "sweep", *words, "--jobs", "2")
+    assert alone.ended() == 0, alone.said
+    output = with_recordings(alone.output, tmp_path / "out")
+    driver = swept(cluster, folder, output, *words)
+    draw = random.Random(0)
+    killed: set[int] = set()
+    for moment in sorted(draw.randrange(20) for _ in range(20)):  # groups that have ended by then
+        entry = driver.sees(lambda moment=moment: victim(output, moment, killed, draw))
+        killed.add(entry["pid"])
+        os.kill(entry["pid"], signal.SIGKILL)
+    assert driver.ended() == 0, driver.said
+    assert metrics(output) == metrics(alone.output)
+    assert weights(output) == weights(alone.output)
+    assert set(trained(output).values()) == {1}
+
+
+def victim(output: Path, moment: int, killed: set[int], draw: random.Random) -> dict | None:
+    """A worker to kill, once so many groups have ended; one group is not killed twice more than it may die."""
+    if sum(entry["event"] == "ended" for entry in journal(output)) < moment:
+        return None
+    deaths = Counter(entry["group"] for entry in journal(output) if entry["event"] == "begun" and entry["pid"] in killed)
+    open_ones = [entry for entry in under_way(output) if entry["pid"] not in killed and deaths[entry["group"]] < 2]
+    return draw.choice(open_ones) if open_ones else None

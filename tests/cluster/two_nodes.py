@@ -24,17 +24,17 @@ PATIENCE = 300.0  # s, after which an event that never came is a failure of the 
 class TwoNodes:
     """A cluster of a head and a further node, a core each, on loopback."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, scratch_of_second: str = "") -> None:
         from ray.cluster_utils import Cluster
 
-        self._folder = folder
         self._cluster = Cluster()
-        self.nodes = [self.add("head", include_dashboard=False), self.add("second")]
+        second = scratch_of_second or str(folder / "scratch-second")
+        self.nodes = [self._add(str(folder / "scratch-head"), include_dashboard=False), self._add(second)]
         self._cluster.wait_for_nodes()
 
-    def add(self, name: str, **options: Any) -> Any:
+    def _add(self, scratch: str, **options: Any) -> Any:
         """A node, which keeps its copies in a folder of its own, as another machine would."""
-        own = {"VEHEST_SCRATCH": str(self._folder / f"scratch-{name}"), "RAY_USAGE_STATS_ENABLED": "0"}
+        own = {"VEHEST_SCRATCH": scratch, "RAY_USAGE_STATS_ENABLED": "0"}
         return self._cluster.add_node(num_cpus=1, env_vars=own, **options)
 
     @property

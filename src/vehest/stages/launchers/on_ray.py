@@ -299,7 +299,7 @@ class RayLauncher:
             course.begun.discard(at)
             if course.deaths[at] >= MOST_DEATHS or course.losses[at] >= MOST_LOST:
                 times = course.deaths[at] + course.losses[at]
-                yield Done(at, Failure(f"{why}, the {times}th time; --launcher local shows what ends it"))
+                yield Done(at, Failure(f"{why}, the {times}{'rd' if times == 3 else 'th'} time; --launcher local shows what ends it"))
             else:
                 self._messages.line("again", "train", course.groups[at].name, f"{why}; it goes on elsewhere from its last checkpoint")
                 course.again.append(_Lot([at]))

@@ -12,6 +12,7 @@ import os
 import platform
 import resource
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ from vehest.training.context import Progress
 
 JOURNAL = "journal"  # folder in an output root: what was begun and made by which process, a file a process
 SHARED = "shared"  # in a run's journal: by which other machines know that they see the same folder
+PROBE_BYTES = 1_000_000  # that a machine must have room for before it begins
 DIGITS = ("numpy", "scipy", "torch", "numba")  # libraries whose version may move the last digits
 Value = TypeVar("Value")
 Exchange = Callable[[Sequence[tuple[int, Progress | Waiting | None]]], bool]
@@ -155,7 +157,7 @@ def run_order(order: Order, exchange: Exchange, node: str = "") -> Report:
     """
     host = socket.gethostname()
     store = Store(order.store) if order.store else None
-    unsuitable = _unsuitable(order)
+    unsuitable = _unsuitable(order, store)
     if unsuitable:
         return Report(host, this_world().cpu, [], unsuitable)
     output = order.output if store is None else store.scratch / "outputs"
@@ -177,11 +179,18 @@ def run_order(order: Order, exchange: Exchange, node: str = "") -> Report:
     return Report(host, this_world().cpu, ended)
 
 
-def _unsuitable(order: Order) -> str:
+def _unsuitable(order: Order, store: Store | None) -> str:
     """Why this machine cannot do a task; empty if it can."""
     differs = order.world.differs(this_world())
     if differs:
         return differs
+    if store is not None:
+        try:
+            store.scratch.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=store.scratch) as probe:
+                probe.write(b"\0" * PROBE_BYTES)
+        except OSError as error:
+            return f"cannot keep copies in '{store.scratch}' ({error.strerror}); free some space there, or set VEHEST_SCRATCH"
     if order.token:
         with suppress(OSError):
             if (order.output / JOURNAL / order.run / SHARED).read_text(encoding="utf-8") == order.token:
