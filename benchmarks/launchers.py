@@ -18,15 +18,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.data.files import remove_leftovers
-from vehest.data.limits import use_limits
 from vehest.stages.comparison import plain_resampling
 from vehest.stages.config import compose_config
 from vehest.stages.console import Messages
@@ -77,7 +75,6 @@ def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:
 def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
     """Both launchers on the same groups, each into a fresh output root; the best of the repeats."""
     recordings = scratch / "recordings"
-    groups_of(recordings, 1)
     found: dict[str, list[dict[str, float]]] = {"local": [], "ray": []}
     on_ray.LEAST_SECONDS = 0.0  # a task a group
     for repeat in range(repeats):
@@ -239,35 +236,56 @@ def million(measured: Mapping[str, Any], seconds: float = 10.0, trainings: float
     }
 
 
+def parts(scratch: Path, given: argparse.Namespace) -> dict[str, Callable[[], Any]]:
+    """What is measured, by name."""
+    return {
+        "launchers": lambda: launchers(scratch, given.tasks, given.repeats),
+        "scheduler": lambda: scheduler(5000),
+        "planning": lambda: planning(100),
+        "listing": lambda: folder_listing(scratch, 100_000),
+        "sweep": lambda: {name: sweep(scratch, given.combinations, given.seeds, name) for name in ("none", "mlflow")},
+    }
+
+
+def computed(result: dict[str, Any]) -> None:
+    """Add what follows from what was measured."""
+    if "launchers" in result:
+        result["second_node_pays_from_s"] = break_even(result["launchers"]["local"], result["launchers"]["ray"])
+    if "sweep" in result:
+        plain, tracked = result["sweep"]["none"], result["sweep"]["mlflow"]
+        if "parent_cpu_s_a_training" in plain and "parent_cpu_s_a_training" in tracked:
+            tracked["mlflow_s_a_training"] = round(tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4)
+    if {"launchers", "scheduler", "planning", "listing", "sweep"} <= set(result):
+        result["million_trainings_on_1000_cores"] = million(result)
+
+
 def main() -> None:
-    """Measure every part, print and write it."""
+    """Measure every part, or those that are named; write each as soon as it is measured."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", type=int, default=100, help="groups of the comparison of launchers")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--combinations", type=int, default=20, help="of the sweeps of trainings")
+    parser.add_argument("--combinations", type=int, default=200, help="of the sweeps of trainings")
     parser.add_argument("--seeds", type=int, default=10, help="of each combination")
+    parser.add_argument("--parts", nargs="*", help="of: launchers scheduler planning listing sweep; what others measured before stays")
     given = parser.parse_args()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    with tempfile.TemporaryDirectory(prefix="launchers-") as folder, use_limits(replace(on_ray.current_limits())):
-        scratch = Path(folder)
-        os.chdir(scratch)
-        result: dict[str, Any] = {"command": " ".join(["benchmarks/launchers.py", *sys.argv[1:]])}
-        load = [os.getloadavg()[0]]
-        result["launchers"] = launchers(scratch, given.tasks, given.repeats)
-        result["second_node_pays_from_s"] = break_even(result["launchers"]["local"], result["launchers"]["ray"])
-        result["scheduler"] = scheduler(5000)
-        result["planning"] = planning(100)
-        result["listing"] = folder_listing(scratch, 100_000)
-        result["sweep"] = {name: sweep(scratch, given.combinations, given.seeds, name) for name in ("none", "mlflow")}
-        tracked, plain = result["sweep"]["mlflow"], result["sweep"]["none"]
-        tracked["mlflow_s_a_training"] = round(tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4)
-        result["million_trainings_on_1000_cores"] = million(result)
-        load.append(os.getloadavg()[0])
-    result["load"] = [round(own, 1) for own in load]  # of the machine before and after: what else ran there
+    result: dict[str, Any] = json.loads(RESULT.read_text(encoding="utf-8")) if given.parts and RESULT.is_file() else {}
     result["machine"] = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
     RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(result, indent=1))
+    with tempfile.TemporaryDirectory(prefix="launchers-") as folder:
+        scratch = Path(folder)
+        os.chdir(scratch)
+        groups_of(scratch / "recordings", 1)
+        for name, measure in parts(scratch, given).items():
+            if given.parts and name not in given.parts:
+                continue
+            before = os.getloadavg()[0]
+            result[name] = measure()
+            load = {"before": round(before, 1), "after": round(os.getloadavg()[0], 1)}
+            result["load"] = {**result.get("load", {}), name: load}  # what else ran on the machine
+            computed(result)
+            RESULT.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+            print(f"{name}: {json.dumps(result[name])}", flush=True)
 
 
 if __name__ == "__main__":
