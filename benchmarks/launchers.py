@@ -213,7 +213,7 @@ def break_even(local: Mapping[str, float], cluster: Mapping[str, float]) -> dict
 
 def million(measured: Mapping[str, Any], seconds: float = 10.0, trainings: float = 1e6, cores: float = 1e3) -> dict[str, float]:
     """10⁶ trainings of 10 s on 1,000 cores, each part by itself, from what was measured here [h, unless it says otherwise]."""
-    plain, tracked = measured["sweep"]["none"], measured["sweep"].get("mlflow", {})
+    plain, tracked = measured["sweep"]["none"], measured["sweep"]["mlflow"]
     wanted = trainings / (trainings * seconds / cores)
     listing = measured["listing"]
     quick = {
@@ -221,18 +221,17 @@ def million(measured: Mapping[str, Any], seconds: float = 10.0, trainings: float
         "added by Ray": trainings * measured["launchers"]["ray"]["added_s"] / cores,
         "scheduling, one process": trainings / measured["scheduler"]["empty_tasks_a_second"],
         "the rest of the parent, one process": trainings * plain["parent_cpu_s_a_training"],
+        "MLflow, one process": trainings * tracked["mlflow_s_a_training"],
         "planning, one process": trainings * measured["planning"]["seconds_a_combination"],
         "looking for leftovers, all cores": 3 * trainings * (trainings / 2) * listing["seconds"] / listing["folders"] / cores,
     }
-    if "mlflow_s_a_training" in tracked:
-        quick["MLflow, one process"] = trainings * tracked["mlflow_s_a_training"]
     return {
         **{name: round(value / 3600, 2) for name, value in quick.items()},
         "trainings a second that keep all cores busy": wanted,
         "artefacts [GB]": round(trainings * plain["bytes_a_training"] / 1e9, 1),
         "files [millions]": round(trainings * plain["files_a_training"] / 1e6, 1),
-        "MLflow rows [millions]": round(trainings * tracked.get("mlflow_rows_a_training", float("nan")) / 1e6),
-        "MLflow [GB]": round(trainings * tracked.get("mlflow_bytes_a_training", float("nan")) / 1e9),
+        "MLflow rows [millions]": round(trainings * tracked["mlflow_rows_a_training"] / 1e6),
+        "MLflow [GB]": round(trainings * tracked["mlflow_bytes_a_training"] / 1e9),
     }
 
 
@@ -255,7 +254,9 @@ def computed(result: dict[str, Any]) -> None:
         plain, tracked = result["sweep"]["none"], result["sweep"]["mlflow"]
         if "parent_cpu_s_a_training" in plain and "parent_cpu_s_a_training" in tracked:
             tracked["mlflow_s_a_training"] = round(tracked["parent_cpu_s_a_training"] - plain["parent_cpu_s_a_training"], 4)
-    if {"launchers", "scheduler", "planning", "listing", "sweep"} <= set(result):
+    if {"launchers", "scheduler", "planning", "listing"} <= set(result) and "mlflow_s_a_training" in result.get("sweep", {}).get(
+        "mlflow", {}
+    ):
         result["million_trainings_on_1000_cores"] = million(result)
 
 

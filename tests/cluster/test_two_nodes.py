@@ -41,15 +41,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     os.environ.update(former)
 
 
-@pytest.fixture(scope="session")
-def alone(folder: Path) -> dict[str, Path]:
-    """Output roots of the same sweeps by the local launcher."""
-    roots = {}
-    for name, words in (("forty", FORTY), ("longer", LONGER)):
-        roots[name] = output = folder / f"alone-{name}"
-        driver = Driver(folder, output, "sweep", *words, "--jobs", "2")
+class Alone(dict[str, Path]):
+    """Output roots of the same sweeps by the local launcher, each made when it is first asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._folder = folder
+
+    def __missing__(self, name: str) -> Path:
+        words = {"forty": FORTY, "longer": LONGER}[name]
+        driver = Driver(self._folder, self._folder / f"alone-{name}", "sweep", *words, "--jobs", "2")
         assert driver.ended() == 0, driver.said
-    return roots
+        self[name] = driver.output
+        return driver.output
+
+
+@pytest.fixture(scope="session")
+def alone(folder: Path) -> Alone:
+    return Alone(folder)
 
 
 @pytest.fixture(scope="session")

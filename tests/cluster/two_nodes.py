@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 
 MOMENT = 0.02  # between two looks for an event
-PATIENCE = 300.0  # s, after which an event that never came is a failure of the test
+PATIENCE = 900.0  # s, after which an event that never came is a failure of the test
 
 
 class TwoNodes:
