@@ -34,7 +34,7 @@ class TwoNodes:
 
     def _add(self, scratch: str, **options: Any) -> Any:
         """A node, which keeps its copies in a folder of its own, as another machine would."""
-        own = {"VEHEST_SCRATCH": scratch, "RAY_USAGE_STATS_ENABLED": "0"}
+        own = {"VEHEST_SCRATCH": scratch, "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
         return self._cluster.add_node(num_cpus=1, env_vars=own, **options)
 
     @property
