@@ -16,7 +16,7 @@ KILLS ?= 100
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-export export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
+.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -42,7 +42,7 @@ run: $(INSTALLED) ## train and compare four families on simulated drives (a few 
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
 test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export"
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
@@ -52,6 +52,10 @@ test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
 
 test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rules and emulators, as far as these are installed (15 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -rs -m "export and not slow" tests/export
+
+test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, workers and a node killed in the middle (4 minutes); installs Ray
+	$(BIN)/python -m pip install -q -e ".[cluster-tests]"
+	$(BIN)/python -m pytest -rs -m "cluster and not slow" tests/cluster
 
 test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
 	$(BIN)/python -m pytest -m "page and not slow" -rs
@@ -161,6 +165,10 @@ bench-trust: $(INSTALLED) ## what contract, band and health cost a step online a
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py
+
+bench-launchers: $(INSTALLED) ## what a task costs the local launcher and Ray, and from which length on a second node pays; installs Ray (10 minutes)
+	$(BIN)/python -m pip install -q -e ".[ray]"
+	$(BIN)/python benchmarks/launchers.py
 
 replay_check: $(INSTALLED) ## models on the frames of a bus against themselves offline, on the real Ferrari's test range; needs VEHEST_DATA
 	$(BIN)/python benchmarks/replay.py check

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -47,6 +47,7 @@ LONGEST_LINE = 4_000
 MOST_ATTEMPTS = 5  # at an answer
 MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
+LAUNCHERS = ("local", "ray")
 
 
 def _offered(*groups: str) -> str:
@@ -110,6 +111,31 @@ DatasetOrFile = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and the outcome.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes that run side by side; by default one a core.")]
+LauncherName = Annotated[
+    str,
+    typer.Option(
+        "--launcher",
+        help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster (docs/many_machines.md).",
+        autocompletion=lambda incomplete: [name for name in LAUNCHERS if name.startswith(incomplete)],
+    ),
+]
+Address = Annotated[
+    str | None,
+    typer.Option(
+        "--address",
+        help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is part of. "
+        "By default RAY_ADDRESS, else a Ray of its own on this machine.",
+        show_default=False,
+    ),
+]
+StoreAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--store",
+        help="With --launcher ray, where machines share no folder: file:///FOLDER or s3://BUCKET/FOLDER to keep artefacts in.",
+        show_default=False,
+    ),
+]
 Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=_complete_dataset)]
 
 
@@ -644,6 +670,9 @@ def run(
         float | None,
         typer.Option(help="Be done in this time, report included; what did not fit is named, and the same command goes on with it."),
     ] = None,
+    launcher: LauncherName = "local",
+    address: Address = None,
+    store: StoreAddress = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
@@ -652,7 +681,16 @@ def run(
     if minutes is not None and not minutes > 0:
         raise ConfigurationError(f"--minutes must be positive, not {minutes:g}")
     _run_pipeline(
-        pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=jobs, only_report=False, minutes=minutes
+        pipeline,
+        overrides or [],
+        dry_run=dry_run,
+        force=force,
+        as_json=as_json,
+        quiet=quiet,
+        jobs=jobs,
+        only_report=False,
+        minutes=minutes,
+        where=_Where(launcher, address, store),
     )
 
 
@@ -718,6 +756,9 @@ def sweep(
     as_json: AsJson = False,
     quiet: Quiet = False,
     jobs: Jobs = None,
+    launcher: LauncherName = "local",
+    address: Address = None,
+    store: StoreAddress = None,
 ) -> None:
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
 
@@ -744,12 +785,42 @@ def sweep(
         return workshop.outcome(swept.folder, shown_of_sweep(swept), None, planned.first["tracking"], raw), swept
 
     forced = {"train", "calibrate", "evaluate", "sweep"} if force else set()
-    with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True) as workshop:
+    where = _Where(launcher, address, store)
+    with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True, where=where) as workshop:
         outcome, swept = whole_way(workshop)
         _print_sweep(outcome.shown, as_json, outcome.report.folder, skipped=swept.folder.skipped)
         if not dry_run:
             swept.raise_failures()
             remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
+
+
+@app.command()
+def plan(
+    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
+    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    cores: Annotated[
+        int | None, typer.Option(min=1, help="Cores that the time is for; by default those of this machine.", show_default=False)
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what is left to do of a study and what it would cost, by what trainings of the same kinds took; runs nothing.
+
+    Trainings, tasks of a cluster, core hours, memory, data to move, and the time on so many cores. What is guessed, since nothing like it
+    was trained into this output root, is called a guess.
+    """
+    from vehest.stages.launcher import default_jobs
+    from vehest.stages.launchers.plan import plan_study
+    from vehest.stages.pipeline import pipeline_configs, read_pipeline
+
+    study = read_pipeline(pipeline)
+    configs = pipeline_configs(study, overrides or [])
+    with _workshop(next(iter(configs.values()))[0], force=set(), dry_run=True, quiet=True) as workshop:
+        cost = plan_study(study, configs, workshop, cores or default_jobs())
+    if as_json:
+        _echo(_json(cost.figures()), keep="\n")
+    else:
+        for name, value in cost.rows():
+            _echo(f"{name:<11} {value}")
 
 
 @app.command("config")
@@ -1124,6 +1195,7 @@ def _run_pipeline(
     jobs: int | None,
     only_report: bool,
     minutes: float | None = None,
+    where: _Where | None = None,
 ) -> None:
     begun = time.monotonic()
     from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
@@ -1149,7 +1221,7 @@ def _run_pipeline(
         return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome
 
     forced = {"report"} if only_report else {"ingest", "downsample", "train", "calibrate", "evaluate", "report"}
-    with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
+    with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs, where=where) as workshop:
         workshop.until = _until(minutes, begun)
         outcome, made = whole_way(workshop)
         _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})
@@ -1230,14 +1302,31 @@ def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
     return config, plan_training(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
 
 
+@dataclass(frozen=True)
+class _Where:
+    """Where trainings run, as options say it."""
+
+    launcher: str
+    address: str | None
+    store: str | None
+
+
 @contextmanager
 def _workshop(
-    config: Config, *, force: set[str], dry_run: bool, quiet: bool, jobs: int | None = None, track: bool = False
+    config: Config,
+    *,
+    force: set[str],
+    dry_run: bool,
+    quiet: bool,
+    jobs: int | None = None,
+    track: bool = False,
+    where: _Where | None = None,
 ) -> Iterator[Workshop]:
     """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
     from vehest.data.limits import limits_from_config, use_limits
     from vehest.stages.console import Messages
     from vehest.stages.launcher import default_jobs
+    from vehest.stages.launchers.base import chosen_launcher
     from vehest.stages.signals import StopSignals
     from vehest.stages.tracking import Tracker
     from vehest.stages.workshop import NotThereYet, Workshop
@@ -1245,11 +1334,16 @@ def _workshop(
     messages, stop, output = Messages(quiet=quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if track else None
     workshop = Workshop(output, messages, stop, jobs or default_jobs(), frozenset(force), dry_run, tracker)
+    if where is not None:
+        workshop.launcher = chosen_launcher(where.launcher, where.address, where.store, jobs, output, messages)
     with use_limits(limits_from_config(config["limits"])), stop.installed():
         try:
             yield workshop
         except NotThereYet:
             raise typer.Exit from None
+        finally:
+            if workshop.launcher is not None:
+                workshop.launcher.close()
 
 
 def _raise_failure(failures: list[tuple[str, Any]]) -> None:

@@ -7,15 +7,19 @@ import hashlib
 import os
 import re
 import shutil
+import socket
 import stat
+import time
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError, VehestError
 
 ASIDE_PREFIX = ".writing-"
+FOREIGN_SECONDS = 24 * 3600.0  # after which what another host writes is taken for left over; its processes cannot be looked at from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_ROOM_WORDS = {
     **{os.strerror(number): number for number in sorted(NO_ROOM)},
@@ -147,8 +151,16 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def is_left_over(path: Path) -> bool:
-    """Whether the process that was writing ``path``, by its name a file or folder aside, is gone."""
-    return path.name.startswith(ASIDE_PREFIX) and not _is_alive(_writer(path))
+    """Whether the process that was writing ``path``, by its name something aside, is gone; on another host: whether it is a day old."""
+    if not path.name.startswith(ASIDE_PREFIX):
+        return False
+    host = re.match(rf"{re.escape(ASIDE_PREFIX)}\d+-([0-9a-f]{{8}})[0-9a-f]{{8}}-", path.name)
+    if host is not None and host[1] != _host():
+        try:
+            return time.time() - path.lstat().st_mtime > FOREIGN_SECONDS
+        except OSError:
+            return False
+    return not _is_alive(_writer(path))
 
 
 def aside_of(path: Path) -> Path:
@@ -179,11 +191,17 @@ def _target(path: Path, aside: Path, error: OSError) -> Path:
 
 def _as_finished(path: Path) -> Path:
     """A path as it will be called once what is written aside is in its place."""
-    return Path(*(re.sub(rf"^{re.escape(ASIDE_PREFIX)}\d+-[0-9a-f]{{8}}-", "", part) for part in path.parts))
+    return Path(*(re.sub(rf"^{re.escape(ASIDE_PREFIX)}\d+-(?:[0-9a-f]{{8}}){{1,2}}-", "", part) for part in path.parts))
 
 
 def _aside_name(name: str) -> str:
-    return f"{ASIDE_PREFIX}{os.getpid()}-{uuid.uuid4().hex[:8]}-{name}"
+    return f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name}"
+
+
+@cache
+def _host() -> str:
+    """Start of a hash of this host's name: process numbers mean nothing on another one that shares the folder."""
+    return hashlib.sha256(socket.gethostname().encode("utf-8", "surrogateescape")).hexdigest()[:8]
 
 
 def _writer(path: Path) -> int:

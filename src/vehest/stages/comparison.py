@@ -105,7 +105,7 @@ def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: 
     configs = [config for position, config in enumerate(prepared.configs) if position not in prepared.failures]
     first = configs[0]
     try:
-        groups, unplanned = _groups(configs, workshop)
+        groups, unplanned = groups_of(configs, workshop)
     except NotThereYet:
         _say_plan(configs, workshop)
         raise
@@ -168,7 +168,7 @@ def failed_in(compared: Iterable[Compared], workshop: Workshop) -> JobsFailedErr
     )
 
 
-def _groups(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group], list[tuple[str, Failure]]]:
+def groups_of(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group], list[tuple[str, Failure]]]:
     """Jobs that fit one batch, with the data they need, which is made on the way; and those whose data cannot be made, by name.
 
     Raises:

@@ -26,10 +26,12 @@ MARKS = {
     "fail": ("failed", "red"),
     "stop": ("stopped", "yellow"),
     "wait": ("waiting", "cyan"),
+    "again": ("again", "yellow"),
 }
 """Status -> its word and colour."""
 
 MOST_STANDING = 12
+MOST_BARS = 16  # of trainings that run at a time
 LINE_BREAK = "\n"
 
 
@@ -116,14 +118,27 @@ class Bars:
         self._tasks: dict[str, TaskID] = {}
         self._standing: dict[str, tuple[float, ...]] = {}
         self._header: tuple[str, ...] = ()
+        self._counted: Mapping[str, str] = {}
 
     def __rich__(self) -> RenderableType:
-        if not self._standing:
-            return self._progress
+        shown: list[RenderableType] = [self._progress]
+        if self._standing:
+            shown.insert(0, self._table())
+        if self._counted:
+            counts = Table(*self._counted, box=None, header_style="dim", padding=(0, 2))
+            counts.add_row(*self._counted.values())
+            shown.append(counts)
+        return Group(*shown)
+
+    def count(self, counted: Mapping[str, str]) -> None:
+        """Say how much is done; nothing where there is nothing to count."""
+        self._counted = counted
+
+    def _table(self) -> Table:
         table = Table(*self._header, box=None, header_style="dim", padding=(0, 2))
         for name, values in sorted(self._standing.items(), key=lambda row: row[1])[:MOST_STANDING]:
             table.add_row(Text(printable(name)), *(f"{value:.3f}" for value in values))
-        return Group(table, self._progress)
+        return table
 
     def stands(self, name: str, figures: Mapping[str, float]) -> None:
         """Add one that is done, by its figures; the first of them sorts the rows."""
@@ -133,6 +148,8 @@ class Bars:
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar; it appears when it is first moved."""
+        if name not in self._tasks and len(self._tasks) >= MOST_BARS:
+            return
         if name not in self._tasks:
             self._tasks[name] = self._progress.add_task(printable(name), total=total, note="")
         self._progress.update(self._tasks[name], completed=done, total=total, note=printable(note))

@@ -20,6 +20,7 @@ EXTRAS = {
     "factor-graph": ("gtsam", "factor graphs"),
     "bus": ("cantools", "CAN logs and replays"),
     "tuning": ("optuna", "noise levels tuned by Optuna"),
+    "ray": ("ray", "trainings on many machines"),
 }
 """Extra -> the package it brings, and what needs it."""
 

@@ -350,7 +350,7 @@ def _fingerprint(asked: Asked) -> str:
             content = file.read_bytes()
             texts.append(content.decode("utf-8", "replace"))
             digest.update(repr((name, hashlib.sha256(content).hexdigest())).encode("utf-8", "surrogateescape"))
-        for name, file in _own_files():
+        for name, file in own_files():
             digest.update(repr((name, hashlib.sha256(file.read_bytes()).hexdigest())).encode())
     except (OSError, VehestError):
         return ""
@@ -384,8 +384,8 @@ def _described_by(asked: Asked) -> list[tuple[str, Path]]:
     return files
 
 
-def _own_files() -> list[tuple[str, Path]]:
-    """Vehest's own modules and templates."""
+def own_files() -> list[tuple[str, Path]]:
+    """Vehest's own modules and templates, each with its name."""
     root = Path(__file__).resolve().parents[1]
     files: list[tuple[str, Path]] = []
     for folder, folders, names in os.walk(root):

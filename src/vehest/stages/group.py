@@ -106,7 +106,7 @@ def is_finished(group: Group, member: Member) -> bool:
     """Whether nothing is left to do for a member."""
     if member.model is None or (group.evaluation is not None and member.evaluation is None):
         return False
-    return member.calibration is not None or _calibration_job(group, member.job, member.model) is None
+    return member.calibration is not None or calibration_job(group, member.job, member.model) is None
 
 
 def is_calibrated(group: Group) -> bool:
@@ -159,7 +159,7 @@ def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Calla
         model = models[job.plan.key]
         calibration = evaluation = None
         if model is not None and model.status == "complete" and not should_stop():
-            calibrating = _calibration_job(group, job, model)
+            calibrating = calibration_job(group, job, model)
             if calibrating is not None:
                 calibration = _calibrated(group, job, calibrating, should_stop, on_progress)
             if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
@@ -207,14 +207,14 @@ def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progres
     return artefacts
 
 
-def _calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
+def calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
     """How a model is calibrated; none where it is not, or there is nothing to calibrate it by."""
     split = group.split_of_bands
     return None if split is None else plan_calibrate(model, split, job.data, job.plan.output)
 
 
 def _found_calibration(group: Group, job: TrainJob, model: Artefact | None) -> Artefact | None:
-    calibrating = None if model is None or STAGE in group.force else _calibration_job(group, job, model)
+    calibrating = None if model is None or STAGE in group.force else calibration_job(group, job, model)
     return None if calibrating is None else find(calibrating.plan)
 
 
@@ -230,7 +230,7 @@ def _calibrated(
 def _found_evaluation(group: Group, job: TrainJob, model: Artefact | None, calibration: Artefact | None) -> Artefact | None:
     if model is None or group.evaluation is None or "evaluate" in group.force:
         return None
-    if calibration is None and _calibration_job(group, job, model) is not None:
+    if calibration is None and calibration_job(group, job, model) is not None:
         return None
     return find(group.evaluation.of(model, calibration).plan)
 

@@ -39,10 +39,11 @@ class Task(Generic[Outcome]):
 
 @dataclass(frozen=True)
 class Done(Generic[Outcome]):
-    """How a task ended."""
+    """How a task ended, and how long it ran [s]."""
 
     position: int
     outcome: Outcome | Failure
+    seconds: float = 0.0
 
 
 Reporter = Callable[[int, Progress | Waiting | None], None]
@@ -75,9 +76,10 @@ def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals | TimeLimit, 
         if stop.requested():
             return
         report(position, None)
+        begun = time.monotonic()
         with stop.deferred():
-            outcome = _guarded(task, stop.requested, lambda progress, at=position: report(at, progress))  # type: ignore[misc]
-        yield Done(position, outcome)
+            outcome = guarded(task, stop.requested, lambda progress, at=position: report(at, progress))  # type: ignore[misc]
+        yield Done(position, outcome, time.monotonic() - begun)
 
 
 def _launch_in_processes(
@@ -103,9 +105,10 @@ def _launch_in_processes(
                 if future.cancelled():
                     continue
                 error = future.exception()
-                outcome = future.result() if error is None else Failure(f"a worker process ended unexpectedly ({error})")
+                failed = (Failure(f"a worker process ended unexpectedly ({error})"), 0.0)
+                outcome, seconds = future.result() if error is None else failed
                 if outcome is not None:
-                    yield Done(futures[future], outcome)
+                    yield Done(futures[future], outcome, seconds)
 
 
 _worker: dict[str, Any] = {}
@@ -127,12 +130,12 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _work(position: int, task: Task[Outcome]) -> Outcome | Failure | None:
+def _work(position: int, task: Task[Outcome]) -> tuple[Outcome | Failure | None, float]:
     stopping, messages = _worker["stopping"], _worker["messages"]
     if stopping.is_set():
-        return None
+        return None, 0.0
     messages.put((position, None))
-    last = 0.0
+    last, begun = 0.0, time.monotonic()
 
     def on_progress(progress: Progress | Waiting) -> None:
         nonlocal last
@@ -141,10 +144,11 @@ def _work(position: int, task: Task[Outcome]) -> Outcome | Failure | None:
             messages.put((position, progress))
 
     with use_limits(_worker["limits"]):
-        return _guarded(task, stopping.is_set, on_progress)
+        return guarded(task, stopping.is_set, on_progress), time.monotonic() - begun
 
 
-def _guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Outcome | Failure:
+def guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Outcome | Failure:
+    """Run a task; what it raises comes back as a value."""
     try:
         return task.run(should_stop, on_progress)
     except Exception as error:

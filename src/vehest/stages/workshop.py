@@ -27,9 +27,10 @@ from vehest.stages.downsample import plan_downsample, write_downsample
 from vehest.stages.evaluate import read_metrics, read_scored
 from vehest.stages.failures import Failure
 from vehest.stages.finished import Outcome, RawFolder
-from vehest.stages.group import Evaluation, Group, Member, drop_finished_checkpoint, existing, is_calibrated, is_finished, run_group
+from vehest.stages.group import Evaluation, Group, Member, drop_finished_checkpoint, existing, is_calibrated, is_finished
 from vehest.stages.ingest import drop_parts, plan_ingest, write_ingest
-from vehest.stages.launcher import Task, launch
+from vehest.stages.launchers.base import Launcher, LocalLauncher
+from vehest.stages.launchers.standing import Standing
 from vehest.stages.locks import Waiting
 from vehest.stages.publishing import Publication
 from vehest.stages.rates import Note
@@ -59,6 +60,7 @@ class Workshop:
         dry_run: say what would run, run nothing.
         tracker: where runs are logged; none for no tracking.
         tags: what runs are tagged with.
+        launcher: runs groups; none for this machine's cores.
         until: reading of ``time.monotonic`` from which on no training is begun, and those that run are stopped; none for no limit.
         artefacts: what was found or made so far, by folder.
     """
@@ -72,6 +74,7 @@ class Workshop:
     tracker: Tracker | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
     until: float | None = None
+    launcher: Launcher | None = None
     artefacts: dict[Path, Artefact] = field(default_factory=dict)
     _made: dict[str, Artefact] = field(default_factory=dict)
     _datasets: dict[str, Config] = field(default_factory=dict)
@@ -259,28 +262,33 @@ class Workshop:
         for split in dict.fromkeys(group.split_of_bands.name for group in waiting if group.split_of_bands and not is_calibrated(group)):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
         failures: list[tuple[str, Failure]] = []
-        tasks = [Task(group.name, partial(run_group, group)) for group in waiting]
+        launcher = self.launcher or LocalLauncher(self.jobs)
+        standing = Standing(len(waiting))
         with self.messages.bars() as bars:
 
             def report(at: int, progress: Progress | Waiting | None) -> None:
                 if isinstance(progress, Waiting):
                     self._say_waiting(progress)
                 else:
-                    bars.fit(tasks[at].name, progress)
+                    standing.runs(at)
+                    bars.fit(waiting[at].name, progress)
+                    bars.count(standing.row(launcher.cores))
 
-            for done in launch(tasks, self.jobs, TimeLimit(self.stop, self.until), report):
-                name = tasks[done.position].name
-                bars.close(name)
-                if isinstance(done.outcome, Failure):
-                    failures.append((name, done.outcome))
-                    self.messages.line("fail", "train", name, done.outcome.message)
+            for done in launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
+                group, outcome = waiting[done.position], done.outcome
+                standing.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
+                bars.close(group.name)
+                bars.count(standing.row(launcher.cores))
+                if isinstance(outcome, Failure):
+                    failures.append((group.name, outcome))
+                    self.messages.line("fail", "train", group.name, outcome.message)
                     continue
-                for member in done.outcome:
+                for member in outcome:
                     members.append(member)
                     self._say_made(member)
                     if member.evaluation is not None:
                         bars.stands(member.job.plan.label, _shown_errors(member.evaluation))
-                    self._track(member, waiting[done.position].evaluation)
+                    self._track(member, group.evaluation)
         self.stop.raise_if_requested()
         for made in (artefact for member in members for artefact in (member.model, member.calibration, member.evaluation)):
             if made is not None:
