@@ -26,7 +26,7 @@ from vehest.studies.kit.reading import recordings_of
 from vehest.training.members import prepare
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Errors, masked_segments, yaw_rates
-from vehest_papers.ksnn.schemes import Scheme
+from vehest_papers.ksnn.schemes import Scheme, segments_on
 
 WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)
 """Samples after the start at v = 0 at which errors are read."""
@@ -133,7 +133,7 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
     segments: dict[str, list[Segments]] = {}
     for category in categories:
         for model in scheme.models(category)[:MOST_SEEDS]:
-            segments.setdefault(f"{category}, as measured", []).append(model.segments(test))
+            segments.setdefault(f"{category}, as measured", []).append(segments_on(model, test))
             segments.setdefault(f"{category}, corrected", []).append(_corrected(scheme, model, biases, test))
     return Errors(segments, f"{test} with and without biases", same_models=True), biases
 

@@ -12,7 +12,7 @@ from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Change, Errors, short
-from vehest_papers.ksnn.schemes import THIRD, Scheme
+from vehest_papers.ksnn.schemes import THIRD, Scheme, segments_on
 from vehest_papers.ksnn.statements import Compared, Expected, Statement, counted, outcomes
 
 ABOUT_A_QUARTER = (0.20, 0.30)
@@ -243,7 +243,7 @@ def on_regularisation(with_it: Scheme, without: Scheme) -> list[Statement]:
         for word, scheme in (("with", with_it), ("without", without)):
             for category in (paper.LSTM, paper.NONLINEAR):
                 models = [own for own in scheme.part.models if f"{own.estimator}/{own.variant}" == without.name_of(category)]
-                segments[f"{category}, {word}"] = [model.segments(test) for model in models]
+                segments[f"{category}, {word}"] = [segments_on(model, test) for model in models]
         shared[test] = Errors(segments, test)
 
     def change(category: str, test: str) -> Change | None:
@@ -308,7 +308,7 @@ def on_steering(pairs: Sequence[tuple[Scheme, Scheme]]) -> list[Statement]:
     for with_it, without in pairs:
         for word, test in (("own", with_it.own), ("other", with_it.other)):
             segments = {
-                name: [model.segments(test) for model in scheme.part.models if model.estimator == "velocity_gru"]
+                name: [segments_on(model, test) for model in scheme.part.models if model.estimator == "velocity_gru"]
                 for name, scheme in (("with", with_it), ("without", without))
             }
             change = Errors(segments, test).change("with", "without", "fvu")

@@ -15,7 +15,7 @@ from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.kit.reference_minutes import minutes_of
 from vehest_papers.ksnn.candidates import category_of
 from vehest_papers.ksnn.comparing import Errors
-from vehest_papers.ksnn.schemes import Scheme
+from vehest_papers.ksnn.schemes import Scheme, segments_on
 
 NAMED = re.compile(r"minutes_([\d.]+)(?:_[a-z])?")
 TESTS = {"own": "own car", "other": "other car"}
@@ -58,7 +58,7 @@ def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
 
 
 def _segments(model: EvaluatedModel, scheme: Scheme, word: str) -> Segments:
-    return model.segments(getattr(scheme, word))
+    return segments_on(model, getattr(scheme, word))
 
 
 def curve_table(curve: Curve) -> Table:

@@ -52,7 +52,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         claims_table(judged, _note(schemes)),
         "## On the own car, on the other and on a third",
         _figure_6(schemes),
-        tables.across_cars(schemes, "overview", _overview_caption(schemes)),
+        tables.across_cars(schemes, "overview", _overview_caption(schemes), without=(paper.KINEMATIC,)),
     ]
     if ablations:
         blocks += ["## Which difference between the cars matters", causes_table(schemes, ablations)]

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
+from pathlib import Path
 
 import pandas as pd
 
+from vehest.evaluation.blocks import Segments, read_segments
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import words_of_kinds
 from vehest.studies.kit.runs import by_name
@@ -19,6 +21,21 @@ from vehest_papers.ksnn.paper import Published
 THIRD = "j1"
 """Test set of a car that no network learns or stops on, where there is one."""
 SET_TITLES = {"c2": "C-2", "f2": "F-2", THIRD: "third car"}
+
+
+@lru_cache(maxsize=600)
+def _read(path: Path) -> dict[str, Segments]:
+    return read_segments(path)
+
+
+def segments_on(model: EvaluatedModel, test: str) -> Segments:
+    """Errors of a model by segments of a test set, its file read once for all tests.
+
+    Raises:
+        DataError: the file is damaged, or has no such test set.
+    """
+    found = _read(model.evaluation_folder / "blocks.csv")
+    return found[test] if test in found else model.segments(test)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +98,7 @@ class Scheme:
         """Of all structures on a test set, named as `name_of` names them."""
         if test not in self._errors:
             groups = by_name(self.part.models)
-            segments = {"/".join(name): [model.segments(test) for model in models] for name, models in groups.items()}
+            segments = {"/".join(name): [segments_on(model, test) for model in models] for name, models in groups.items()}
             self._errors[test] = Errors(segments, test)
         return self._errors[test]
 

@@ -48,19 +48,22 @@ def instances(runs: pd.DataFrame) -> Table:
     return Table("table_3", "Candidates (Table III of the paper).", pd.DataFrame(rows), columns)
 
 
-def across_cars(schemes: Sequence[Scheme], name: str, caption: str) -> Table:
+def across_cars(schemes: Sequence[Scheme], name: str, caption: str, without: Sequence[str] = ()) -> Table:
     """Tables IV and V and Figure 6 in one: of each category the structure that validation chooses, over all its seeds, with 95 % intervals.
 
     Args:
         schemes: comparisons.
         name: of the file.
         caption: of the table.
+        without: categories that are left out.
     """
     rows = []
     third, published = any(scheme.has_third for scheme in schemes), any(scheme.published for scheme in schemes)
     for scheme in schemes:
         tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if scheme.has_third else {})
         for category, run in scheme.chosen.items():
+            if category in without:
+                continue
             key, known, structure = scheme.name_of(category), scheme.published.get(category), str(run["structure"])
             row: dict[str, object] = {"scheme": scheme.title, "model": category, "structure": structure}
             row["candidate"] = category if structure == MISSING else f"{category}, {structure}"
