@@ -59,9 +59,9 @@ def scan(  # type: ignore[no-untyped-def]
         upper: of states, (n,).
         rolling: variances of the first four states of a car that rolls, (4,).
         start_tyres: covariance of the logarithms of the adapted parameters at the start, (n - 4, n - 4).
-        largest: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well, since
-            they are taken to be the reason.
-        lost: variance of β [rad²] from which on the motion alone is guessed anew. Without measurements the model may be unstable.
+        largest: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well: they
+            are taken to be the reason.
+        lost: variance of β [rad²] from which on the motion alone is guessed anew; without measurements the model may be unstable.
         step: Δt [s].
         minimum_speed: [m/s].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
