@@ -30,6 +30,7 @@ BOX = {"ay": (-4.0, 4.0), "steer": (-6.0, 4.0), "tyres": (-8.0, 2.0)}
 """Powers of ten that the search may take: σ_ay [m/s²], σ_δ [rad √s], wander of the logarithms of tyre parameters [1/√s]."""
 DEVIATION = 0.26  # of these logarithms at the start: the rms of ln(1 + mismatch) over the cells of the map
 DRAWN, REFINED, EVALUATIONS = 128, 3, 80  # points of the box, how many of the best are refined, and evaluations of each
+TUNING_SECONDS = 60.0
 EDGE = 0.02  # of a box's width: nearer to its end than this the search ended on it
 TUNED_SLIPS, TUNED_MISMATCHES, FIRST_TUNING_SEED = (2.5, 4.5, 6.5), (-0.25, -0.05, 0.15), 1000
 
@@ -86,11 +87,14 @@ def mistaken(mismatch: float) -> FloatArray:
 def states_of(name: str, levels: Levels, own: Drive, curves: FloatArray, car: SingleTrackParameters = TRUCK) -> FloatArray:
     """States along a drive: β first, tyre parameters last, (T, n)."""
     estimator = estimator_of(name, levels, curves, car)
-    return crossfall_filter.filtered(estimator, own.samples) if name.endswith(WITH_STATE) else estimator.filter_samples(own.samples).mean
+    if name.endswith(WITH_STATE):
+        return crossfall_filter.filtered(estimator, own.samples)
+    states = crossfall_filter.filtered(estimator, own.samples, deviation=0.0, wander=0.0)
+    return np.delete(states, crossfall_filter.FIRST_TYRE - 1, axis=1)
 
 
 def oracle(levels: Levels, own: Drive) -> FloatArray:
-    """β of RATT that is told the plant's tyres, their loads and the friction at each sample, (T,); its mass stays that of the data sheet."""
+    """β of RATT that is told the plant's tyres, their loads and the friction at each sample, (T,), but not the payload's mass."""
     changes = np.flatnonzero(np.diff(own.friction)) + 1
     found, state = np.empty(len(own.friction)), None
     for begin, end in itertools.pairwise([0, *changes.tolist(), len(own.friction)]):
@@ -119,7 +123,7 @@ def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray
 
 
 def tuning_drives(*, plain: bool = False) -> list[tuple[float, Drive]]:
-    """Mismatch and drive of 18 cells that lie between those of the map, on seeds that none of its cells has.
+    """Mismatch and drive of 18 cells between those of the map, on seeds that none of its cells has.
 
     Args:
         plain: all without payload, wet patches and crossfall; otherwise over all combinations of these.
@@ -128,14 +132,15 @@ def tuning_drives(*, plain: bool = False) -> list[tuple[float, Drive]]:
     found = []
     for number, (slip, mismatch, _) in enumerate(itertools.product(TUNED_SLIPS, TUNED_MISMATCHES, range(2))):
         own = Conditions(slip, *conditions[(3 * number) % len(conditions)])
-        found.append((mismatch, drive(own, FIRST_TUNING_SEED + number)))
+        found.append((mismatch, drive(own, FIRST_TUNING_SEED + number, TUNING_SECONDS)))
     return found
 
 
 def tuned(name: str, drives: Sequence[tuple[float, Drive]]) -> Tuned:
-    """Levels with the smallest geometric mean of RMSE(β) over the tuning drives, so that each cell counts by its percentages, as in the map.
+    """Levels with the smallest geometric mean of RMSE(β) over the tuning drives, so that cells count by percentages, as in the map.
 
-    The gyroscope's level is that of its data sheet, as in the paper. Points spread over the whole box (Sobol), then Nelder and Mead from the best.
+    The gyroscope's level is that of its data sheet, as in the paper. Points are spread over the whole box (Sobol); from the best of them
+    Nelder and Mead go on.
     """
     searched = _searched(name)
 

@@ -2,7 +2,8 @@
 
     β'⁺ = (F_F + F_R)/(M u) - r + b/u,   a_y = u (β' + r) - b,   b⁺ = b
 
-All else is `vehest.estimators.rational_ekf`, which it agrees with where b is known to be nothing. The single track of Di Biase, Lenzo &
+All else is `vehest.estimators.rational_ekf`, guards included, which it agrees with where b is known to be nothing; it is two to three times
+as fast, since it notes means alone, so that the twin runs all filters through it. The single track of Di Biase, Lenzo &
 Timpone 2020 has no such state; their outlook names bank angles.
 """
 
@@ -14,7 +15,7 @@ import numba
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.estimators.rational_ekf import RationalFilter
+from vehest.estimators.rational_ekf import LOST, ROLLING, RationalFilter
 from vehest.vehicle.rational_tyres import rational_axle
 from vehest.vehicle.tyre_track import TYRE_PARAMETERS
 
@@ -50,6 +51,10 @@ def filtered(estimator: RationalFilter, samples: FloatArray, deviation: float = 
         np.array([TYRE_PARAMETERS.index(name) for name in settings.adapted], dtype=np.int64),
         np.square([levels["yaw_rate"], levels["ay"], levels["steer"], levels["tyres"], wander]),
         bound,
+        np.square(ROLLING),
+        estimator.start_tyres(),
+        settings.largest_sideslip,
+        LOST**2,
         1.0 / settings.rate_hz,
         mean,
         covariance,
@@ -62,7 +67,7 @@ _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(samples, car, nominal, adapted, variances, bound, step, mean, cov, means):  # type: ignore[no-untyped-def]
+def _scan(samples, car, nominal, adapted, variances, bound, rolling, start_tyres, largest, lost, step, mean, cov, means):  # type: ignore[no-untyped-def]
     """The extended filter in its plain form, measurements one after the other."""
     n = len(mean)
     slope, left, cross = np.zeros((n, n)), np.empty((n, n)), np.empty(n)
@@ -83,6 +88,12 @@ def _scan(samples, car, nominal, adapted, variances, bound, step, mean, cov, mea
             cov[4, 4] += step * variances[4]
             for i in range(5, n):
                 cov[i, i] += step * variances[3]
+            _clip(mean, bound)
+            if not abs(mean[0]) < largest:
+                _roll(mean, cov, rolling, car, samples[k, 1], samples[k, 3])
+                mean[5:], cov[5:, 5:] = 0.0, start_tyres
+            elif not cov[0, 0] < lost:
+                _roll(mean, cov, rolling, car, samples[k, 1], samples[k, 3])
         for which in range(2):
             u = samples[k, 1]
             for i in range(n):
@@ -95,9 +106,25 @@ def _scan(samples, car, nominal, adapted, variances, bound, step, mean, cov, mea
                 mean[i] += cross[i] / total * error
                 for j in range(n):
                     cov[i, j] -= cross[i] * cross[j] / total
-        for i in range(n):
-            mean[i] = min(max(mean[i], -bound[i]), bound[i])
+        _clip(mean, bound)
         means[k] = mean
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _clip(mean, bound):  # type: ignore[no-untyped-def]
+    for i in range(len(mean)):
+        mean[i] = min(max(mean[i], -bound[i]), bound[i])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _roll(mean, cov, rolling, car, u, steer):  # type: ignore[no-untyped-def]
+    """The motion of a car that rolls without slip; what is known of road and tyres stays."""
+    turn = steer / (car[2] + car[3])
+    mean[0], mean[1], mean[2], mean[3] = car[3] * turn, u * turn, 0.0, 0.0
+    for i in range(4):
+        cov[i, :] = 0.0
+        cov[:, i] = 0.0
+        cov[i, i] = rolling[i]
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""The factorial experiment on the twin: every filter in every cell of slip, stiffness, payload, friction and crossfall, on 20 seeds a cell."""
+"""The factorial experiment on the twin: every filter in every cell of slip, stiffness, payload, friction and crossfall, 20 seeds a cell."""
 
 from __future__ import annotations
 

@@ -6,9 +6,9 @@ Every filter of the paper runs on its own model here, so that what it gains or l
     F = c₂ μ F_z/F_z0 α c₁(μ + 1)/(α² + c₁(μ + 1)),  α_F = δ - β - a_F r/u,  α_R = -β + a_R r/u    (Eqs. 4 to 6)
     a_y = (F_F + F_R)/M = u (β' + r) - g sin φ
 
-The driver holds a wanted slip of the rear axle α* by two loops, one inside the other: the yaw rate that turns the rear axle's slip towards
-α*, r* = (F_R l/(M a_F) - g sin φ)/u + α*' + k (α* - α_R), is exact where J = M a_F a_R, and the front force that turns the car towards it,
-F_F = (J k_r (r* - r) + a_R F_R)/a_F. So a car beyond its rear axle's peak is held by countersteering, as a driver does, and spins in no cell.
+The driver holds a wanted slip of the rear axle α* by two loops, one inside the other: the yaw rate that turns the rear axle's slip
+towards α*, r* = (F_R l/(M a_F) + g sin φ)/u + α*' + k (α* - α_R), is exact where J = M a_F a_R, and the front force that turns the car
+towards it, F_F = (J k_r (r* - r) + a_R F_R)/a_F. So a car beyond its rear axle's peak is held by countersteering, as a driver does.
 """
 
 from __future__ import annotations

@@ -46,9 +46,12 @@ ROWS = (ZERO, STATIC_MAP, DATA_SHEET, *FILTERS, ORACLE)
 Changes = dict[tuple[int, tuple[str, str]], Change]
 
 ASKED_BEFOREHAND = (
-    "**Asked before the twin was run: could it come out the other way?** Yes. At small slip a rational tyre is a linear one, and RATTE has two more "
-    "parameters that nothing shows: it may lose to LINT. With the right stiffness RATT is the oracle, and RATTE can only lose to it. With levels of noise "
-    "that let LINT's stiffness follow the secant of the curve, LINT may do without the curve. A crossfall, which no filter of the paper knows, looks like "
+    "**Asked before the twin was run: could it come out the other way?** Yes. At small slip a rational tyre is a linear one, and RATTE "
+    "has two more "
+    "parameters that nothing shows: it may lose to LINT. With the right stiffness RATT is the oracle, and RATTE can only lose to it. "
+    "With levels of noise "
+    "that let LINT's stiffness follow the secant of the curve, LINT may do without the curve. A crossfall, which no filter of the paper "
+    "knows, looks like "
     "tyres. Each of these would show as a cell that is not blue."
 )
 
@@ -128,9 +131,12 @@ def _map(cells: Sequence[Cell], found: Changes, name: str, tuned_on: str) -> Fig
     apart = {pair: np.array([found[at, pair].told_apart for at in range(len(cells))]).reshape(shape) for pair in CLAIMED}
     figure = _drawn(values, apart)
     caption = (
-        f"Change of RATTE's RMSE(β) against RATT (left) and LINT (right), {DATA}, {SEEDS} seeds a cell; dry, flat, without payload. Horizontal: largest rear "
-        "slip; vertical: by how much the filters' cornering stiffnesses differ from the plant's at the start. Blue: RATTE is better. Hatched: not told apart "
-        f"(paired over seeds, Holm over all cells and pairs of the map). Lines: the paper's −44 % and −65 %; where there is none, no cell reaches it. "
+        f"Change of RATTE's RMSE(β) against RATT (left) and LINT (right), {DATA}, {SEEDS} seeds a cell; dry, flat, without payload. "
+        "Horizontal: largest rear "
+        "slip; vertical: by how much the filters' cornering stiffnesses differ from the plant's at the start. Blue: RATTE is better. "
+        "Hatched: not told apart "
+        "(paired over seeds, Holm over all cells and pairs of the map). Lines: the paper's −44 % and −65 %; where there is none, no "
+        "cell reaches it. "
         f"Colours end at ±{LIMIT:.0f} %. Levels of noise tuned once on: {tuned_on}."
     )
     return Figure(name, caption, figure)
@@ -185,7 +191,8 @@ def _in_words(found: Changes) -> str:
         better, worse, claimed = _counts([None] * len(own), found, pair)  # type: ignore[list-item]
         low, high = min(change.percent for change in own), max(change.percent for change in own)
         sentences.append(
-            f"**{pair[0]} lies below {pair[1]} in {better} of {len(own)} cells and above it in {worse}**, by more than chance; in {claimed} by the paper's "
+            f"**{pair[0]} lies below {pair[1]} in {better} of {len(own)} cells and above it in {worse}**, by more than chance; in "
+            f"{claimed} by the paper's "
             f"{paper.GAINS[pair]:.0f} % or more (changes from {fixed(low, 0)} to {fixed(high, 0)} %)."
         )
     return " ".join(sentences) + " All figures of the map: [CSV](tables/twin_map_cells.csv)."
@@ -205,8 +212,10 @@ def _rows(own: Factorial) -> Table:
     columns = {"candidate": Column("candidate")}
     columns |= {f"cell_{at}": Column(f"{slip:g}°, {100 * mismatch:+.0f} % [deg]") for at, (slip, mismatch) in enumerate(SHOWN)}
     caption = (
-        f"RMSE(β) with 95 % intervals over {SEEDS} seeds in four cells of the map, {DATA}. {ORACLE.capitalize()}: RATT with the plant's own curves; "
-        f"static map: fitted on the tuning drives; data sheet: wheelbase and centre of gravity; `{WITH_STATE.removeprefix(', ')}`: one more state, beyond the paper."
+        f"RMSE(β) with 95 % intervals over {SEEDS} seeds in four cells of the map, {DATA}. {ORACLE.capitalize()}: RATT with the plant's "
+        "own curves; "
+        f"static map: fitted on the tuning drives; data sheet: wheelbase and centre of gravity; `{WITH_STATE.removeprefix(', ')}`: one "
+        "more state, beyond the paper."
     )
     return Table("twin_rows", caption, pd.DataFrame(rows), columns)
 
@@ -241,7 +250,8 @@ def _regions(own: Factorial) -> Table:
         "lost": Column(f"drives with RATTE {LOST_DEGREES:.0f}° off [%]", decimals=1),
     }
     caption = (
-        f"In how many of {len(SLIPS) * len(MISMATCHES)} cells RATTE lies below or above the others by more than chance (Holm within each row), {DATA}. No filter "
+        f"In how many of {len(SLIPS) * len(MISMATCHES)} cells RATTE lies below or above the others by more than chance (Holm within each "
+        f"row), {DATA}. No filter "
         "knows of the payload; the oracle is told the tyres under it and the friction, not the mass."
     )
     return Table("twin_regions", caption, pd.DataFrame(rows), columns)
@@ -261,7 +271,8 @@ def _crossfall_in_words(own: Factorial) -> str:
             for name in (paper.RATTE, f"{paper.RATTE}{WITH_STATE}", f"{paper.LINT}{WITH_STATE}")
         ]
         parts.append(
-            f"{_plant_name(plant)}: RATTE {fixed(medians[0], 2)}°, with the state {fixed(medians[1], 2)}°, LINT with the state {fixed(medians[2], 2)}°"
+            f"{_plant_name(plant)}: RATTE {fixed(medians[0], 2)}°, with the state {fixed(medians[1], 2)}°, LINT with the state "
+            f"{fixed(medians[2], 2)}°"
         )
     return (
         "One state for the pull of the crossfall does more than the curve of the tyre: medians of RMSE(β) over the cells, "
@@ -286,7 +297,8 @@ def _absorbed_blocks(own: Factorial) -> list[Block]:
         "end_rear": Column("c2R at the end [%]", decimals=0),
     }
     caption = (
-        f"Tyres that are right, something else that is wrong: RMSE(β) against the truth at 5° of rear slip, {DATA}, {SEEDS} seeds, and by how much RATTE's stiffnesses "
+        f"Tyres that are right, something else that is wrong: RMSE(β) against the truth at 5° of rear slip, {DATA}, {SEEDS} seeds, and "
+        "by how much RATTE's stiffnesses "
         "differ from the plant's in the fit that it starts from and in the last 20 s. Intervals: Holm within the table."
     )
     absorbing = [
@@ -310,13 +322,20 @@ def _plant_in_words(own: Factorial) -> str:
     noise = f"{math.degrees(NOISE['yaw_rate']):.2g}°/s, {NOISE['ay']:g} m/s², {math.degrees(NOISE['steer']):.2g}° and {NOISE['vx']:g} m/s"
     reached = sorted({(cell.conditions.slip, round(cell.reached[0], 1)) for cell in _flat(own.grid())})
     return (
-        f"The plant is Equations 1, 2, 4 to 6 with Table 1's curves, by Runge and Kutta at 400 Hz; drives of {SECONDS:g} s at 10.5 to 28 m/s, sampled at 20 Hz; white noise of "
-        f"{noise} on yaw rate, a_y, steering and speed, assumed. A driver holds the rear slip of bends to either side, drawn by the seed, by countersteering where it "
-        f"must; reached are {', '.join(f'{value:g}° for {slip:g}°' for slip, value in reached)} (means over seeds). **No cell rolls over**: inner wheels lift at "
-        f"a_y = g t/(2h) = {empty.roll_over:.1f} m/s² (track {TRACK:g} m, centre of gravity at {CG_HEIGHT:g} m, both assumed) and {laden.roll_over:.1f} with the payload "
-        f"(h {laden.cg_height:.2f} m), while the axles cannot make more than (39.0 + 38.6) kN over 7.9 t, {empty.slides_at:.1f} m/s²: it slides first. The largest a_y of all "
-        f"drives is {largest:.1f} m/s², so the bound holds for a centre of gravity below {lifts:.2f} m; a higher one rolls before the rear slip of the steeper cells. Payload: "
-        "a quarter of the mass, 1 m behind the centre of gravity and 1.4 m above the road; axle curves grow with the load (Eq. 4). Wet patches: friction 0.6 for 12 to 25 s "
+        f"The plant is Equations 1, 2, 4 to 6 with Table 1's curves, by Runge and Kutta at 400 Hz; drives of {SECONDS:g} s at 10.5 to 28 "
+        "m/s, sampled at 20 Hz; white noise of "
+        f"{noise} on yaw rate, a_y, steering and speed, assumed. A driver holds the rear slip of bends to either side, drawn by the "
+        "seed, by countersteering where it "
+        f"must; reached are {', '.join(f'{value:g}° for {slip:g}°' for slip, value in reached)} (means over seeds). **No cell rolls "
+        "over**: inner wheels lift at "
+        f"a_y = g t/(2h) = {empty.roll_over:.1f} m/s² (track {TRACK:g} m, centre of gravity at {CG_HEIGHT:g} m, both assumed) and "
+        f"{laden.roll_over:.1f} with the payload "
+        f"(h {laden.cg_height:.2f} m), while the axles cannot make more than (39.0 + 38.6) kN over 7.9 t, {empty.slides_at:.1f} m/s²: it "
+        "slides first. The largest a_y of all "
+        f"drives is {largest:.1f} m/s², so the bound holds for a centre of gravity below {lifts:.2f} m; a higher one rolls before the "
+        "rear slip of the steeper cells. Payload: "
+        "a quarter of the mass, 1 m behind the centre of gravity and 1.4 m above the road; axle curves grow with the load (Eq. 4). Wet "
+        "patches: friction 0.6 for 12 to 25 s "
         "at a time. Every cell of the twin, with and without a crossfall state: [CSV](tables/twin_cells.csv)."
     )
 
@@ -334,8 +353,11 @@ def _tuning(own: Factorial) -> Table:
         "at_limits": Column("levels that ended on a limit"),
     }
     caption = (
-        "Levels of noise, tuned once for all cells: smallest geometric mean of RMSE(β) over 18 drives whose slips (2.5, 4.5, 6.5°), stiffnesses (−25, −5, +15 %) and seeds no scored "
-        f"cell has; {DRAWN} points of a box of 8 to 10 decades a level, the best {REFINED} refined by Nelder and Mead. The gyroscope's level is its data sheet's. Logarithms of tyre parameters start with a "
-        "deviation of 0.26, the spread of the cells. A level that ended on a limit is given with what a decade inwards changes: nothing where it is switched off."
+        "Levels of noise, tuned once for all cells: smallest geometric mean of RMSE(β) over 18 drives of 60 s whose slips (2.5, 4.5, 6.5°), "
+        "stiffnesses (−25, −5, +15 %) and seeds no scored "
+        f"cell has; {DRAWN} points of a box of 8 to 10 decades a level, the best {REFINED} refined by Nelder and Mead. The gyroscope's "
+        "level is its data sheet's. Logarithms of tyre parameters start with a "
+        "deviation of 0.26, the spread of the cells. A level that ended on a limit is given with what a decade inwards changes: nothing "
+        "where it is switched off."
     )
     return Table("twin_tuning", caption, frame, columns)

@@ -61,7 +61,10 @@ def eigenvalues_table(car: SingleTrackParameters) -> Table:
         "eigenvalues": Column("eigenvalues [1/s]"),
         "ratio": Column("ratio of their sizes", decimals=2),
     }
-    caption = "Eigenvalues of the linear single track; the paper: ratio 1 above 6 m/s, up to about 1.3 below. Inertia and wheelbase are chosen for it."
+    caption = (
+        "Eigenvalues of the linear single track; the paper: ratio 1 above 6 m/s, up to about 1.3 below. Inertia and wheelbase are chosen "
+        "for it."
+    )
     return Table("eigenvalues", caption, pd.DataFrame(rows), columns)
 
 
@@ -123,8 +126,10 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         "mean_change": Column("change [m/s]"),
     }
     caption = (
-        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels about their mean, and their mean against "
-        f"the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by least squares, {fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
+        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels "
+        "about their mean, and their mean against "
+        "the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by least squares, "
+        f"{fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
         "Its yaw rate is low-passed by 0.4 s."
     )
     return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)], claims
