@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -102,11 +103,12 @@ def test_gains_are_those_of_the_figures() -> None:
 
 def estimated(drive: Recording, gain: float, noise: float = 0.0) -> Estimate:
     sideslip = gain * drive["sideslip_ref"] + noise * np.random.default_rng(1).standard_normal(len(drive))
-    return Estimate(drive.id, drive.rate_hz, drive.start_time, {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip})
+    return Estimate(drive.id, "scaled", drive.rate_hz, drive.start_time, {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip})
 
 
 def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim() -> None:
     drive = short_drive(120.0)
+    drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
     estimates = {"nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}}
     gains = accuracy.gains_of({"nominal_laps": drive}, estimates, ["LINT", "RATT"])
     assert gains["nominal_laps", "LINT"][0] == pytest.approx(0.8, abs=0.01)
@@ -128,8 +130,8 @@ def test_the_stop_is_the_last_time_that_the_truck_moved() -> None:
     assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
 
 
-def test_correction_of_wheels_takes_their_spread_away_where_they_roll() -> None:
-    """Eqs. 61 to 64 with the rolling radius of the AV-21 on wheels that roll about the truck's tracks."""
+def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
+    """The truck's tracks, from wheels with the rolling radius of the AV-21."""
     drive = short_drive(60.0)
     wheels = {
         name: samples * WHEELS.wheel_radius / vehicle.RADIUS for name, samples in drive.channels.items() if name.startswith("wheel_speed")

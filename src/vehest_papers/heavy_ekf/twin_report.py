@@ -353,8 +353,8 @@ def _tuning(own: Factorial) -> Table:
         "at_limits": Column("levels that ended on a limit"),
     }
     caption = (
-        "Levels of noise, tuned once for all cells: smallest geometric mean of RMSE(β) over 18 drives of 60 s whose slips (2.5, 4.5, 6.5°), "
-        "stiffnesses (−25, −5, +15 %) and seeds no scored "
+        "Levels of noise, tuned once for all cells: smallest geometric mean of RMSE(β) over 18 drives of 60 s whose slips (2.5, 4.5, "
+        "6.5°), stiffnesses (−25, −5, +15 %) and seeds no scored "
         f"cell has; {DRAWN} points of a box of 8 to 10 decades a level, the best {REFINED} refined by Nelder and Mead. The gyroscope's "
         "level is its data sheet's. Logarithms of tyre parameters start with a "
         "deviation of 0.26, the spread of the cells. A level that ended on a limit is given with what a decade inwards changes: nothing "
