@@ -116,7 +116,7 @@ class RationalSettings(SingleTrackSettings):
         largest_sideslip: sideslip angle beyond which the filter counts as lost: the motion begins anew as that of a car that rolls, and the
             tyres as they were at the start [rad].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²]; 0: never, as in the paper. Straight ahead
-            offsets of sensors are all that there is to adapt to.
+            a crossfall and offsets of sensors are all that there is to adapt to.
         noise: levels of noise.
         curves: axle curves.
         gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
