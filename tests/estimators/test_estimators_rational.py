@@ -141,6 +141,30 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
         assert np.abs(filtered.mean[:, 0]).max() < 1.5
 
 
+@pytest.mark.parametrize("tyres", KINDS)
+def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_forms(tyres, drive):
+    """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
+    estimator, short = rational(tyres, largest_sideslip=np.radians(1.5)), drive.cut(0.0, 12.0)
+    samples = short.stack(estimator.channels)
+    ours, first = estimator.filter_samples(samples), estimator.start(samples[0])
+    measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
+    theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).steps.filtered
+    assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
+    assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
+    free = rational(tyres).filter_samples(samples).mean
+    assert np.abs(free[:, 0]).max() > np.radians(1.5)
+    assert np.mean(np.abs(ours.mean[:, 0]) > np.radians(1.5)) < np.mean(np.abs(free[:, 0]) > np.radians(1.5))
+
+
+def test_a_yaw_rate_of_the_other_sign_does_not_take_the_filter_beyond_its_limit(drive):
+    """Tyres that adapt to it make a car that spins; the estimate comes back each time it gets there."""
+    flipped = changed(drive, {"yaw_rate": -drive["yaw_rate"]})
+    free, limited = (rational(largest_sideslip=limit).estimate([flipped])[0]["sideslip"] for limit in (1.5, 0.3))
+    assert np.abs(free).max() > 0.8
+    assert np.abs(limited).max() < 0.35
+    assert np.sqrt(np.mean(np.square(limited))) < 0.5 * np.sqrt(np.mean(np.square(free)))
+
+
 @pytest.mark.parametrize(
     "config", [{"tyres": tyres} for tyres in KINDS] + [{"filter": "unscented"}, {"filter": "unscented", "adapt_above": 2.0}]
 )
@@ -218,6 +242,13 @@ def test_tyre_parameters_stay_inside_their_bounds_whatever_is_measured(drive):
         assert (np.abs(states) <= np.log(1.5)).all()
 
 
+def test_the_bound_lies_outside_what_the_filter_knows_at_the_start():
+    """With logarithms known to 0.5 the bound of a factor of 3 would cut their band at 2.2 standard deviations."""
+    wide, narrow = rational(curves={**CURVES, "deviation": 0.5}), rational()
+    assert wide.bounds()[4:] == pytest.approx([1.5] * 4)
+    assert narrow.bounds()[4:] == pytest.approx([np.log(3.0)] * 4)
+
+
 # Bad input
 
 
@@ -284,6 +315,23 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     other = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     other.load_weights(estimator.weights())
     assert np.array_equal(other.estimate([held_out])[0]["vy"], estimator.estimate([held_out])[0]["vy"])
+
+
+@pytest.mark.parametrize("fault", ["slip", "force"])
+def test_intervals_of_stiffnesses_hold_them_where_the_reference_or_the_accelerometer_is_off(fault):
+    """A sideslip angle 0.15° off, and an accelerometer that shows 5 % too much: the fit's residuals show neither."""
+    drive = rational_drive(60.0, seed=4)
+    wrong = {"slip": {"sideslip_ref": drive["sideslip_ref"] + np.radians(0.15)}, "force": {"ay": 1.05 * drive["ay"]}}[fault]
+    estimator = estimator_class("rational_ekf").from_config({})
+    record = estimator.fit(FitData([changed(drive, wrong)], []), NoiseTuningSettings(method="data"))
+    for name in ("c2_front", "c2_rear"):
+        assert abs(record.metrics[name] - CURVES[name]) < record.metrics[f"{name}_interval"]
+
+
+def test_a_search_says_how_many_levels_ended_on_a_limit():
+    train = rational_drive(30.0, seed=9)
+    estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
+    assert estimator.fit(FitData([train], []), QUICK).metrics["levels_at_limits"] == 0
 
 
 def test_curves_come_from_the_recordings_that_are_named_and_start_as_uncertain_as_they_are_told():
@@ -359,6 +407,7 @@ def test_a_drive_without_a_reference_is_one_clear_error(drive):
         ({"filter": "particle"}, "filter 'particle' is not one of: extended, unscented"),
         ({"bound": 1.0}, "bound must be more than 1"),
         ({"adapt_above": -1.0}, "adapt_above must not be negative"),
+        ({"largest_sideslip": 1.6}, r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6"),
         ({"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
         ({"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
         ({"noise": {"tyres": -1.0}}, r"estimator\.noise\.tyres must be positive"),

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 import pytest
 
+from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalSettings, TrackNoise
 from vehest.report.document import Table
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest_papers.heavy_ekf import tables, tyres, watching
+from vehest_papers.heavy_ekf import accuracy, tables, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.document import WHEELS
 from vehest_papers.heavy_ekf.subjects import Filter
 
@@ -97,3 +99,43 @@ def test_gains_are_those_of_the_figures() -> None:
     frame = tables.gains_table(rmse).frame
     assert frame["nominal_laps"].tolist() == ["50 %", "50 %", "75 %"]
     assert frame["paper"].tolist() == ["37 %", "44 %", "65 %"]
+
+
+def estimated(drive: Recording, gain: float, noise: float = 0.0) -> Estimate:
+    sideslip = gain * drive["sideslip_ref"] + noise * np.random.default_rng(1).standard_normal(len(drive))
+    return Estimate(drive.id, "scaled", drive.rate_hz, drive.start_time, {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip})
+
+
+def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim() -> None:
+    drive = short_drive(120.0)
+    drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
+    estimates = {"nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}}
+    gains = accuracy.gains_of({"nominal_laps": drive}, estimates, ["LINT", "RATT"])
+    assert gains["nominal_laps", "LINT"][0] == pytest.approx(0.8, abs=0.01)
+    gains |= {("worn_laps", name): gains["nominal_laps", name] for name in ("LINT", "RATT")}
+    assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == ["reproduced", "undecided"] * 2
+
+
+def test_laps_are_thirds_of_the_way() -> None:
+    drive = short_drive(90.0)
+    laps = accuracy.laps_of(drive)
+    assert [int(lap.sum()) for lap in laps] == [600, 600, 600]
+    assert not (laps[0] & laps[1]).any()
+
+
+def test_the_stop_is_the_last_time_that_the_truck_moved() -> None:
+    drive = short_drive(60.0)
+    speed = np.where(drive.time < 40.0, 10.0, 0.0)
+    stopped = Recording("stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated")
+    assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
+
+
+def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
+    """The truck's tracks, from wheels with the rolling radius of the AV-21."""
+    drive = short_drive(60.0)
+    wheels = {
+        name: samples * WHEELS.wheel_radius / vehicle.RADIUS for name, samples in drive.channels.items() if name.startswith("wheel_speed")
+    }
+    rolling = Recording("rolls", "truck", RATE, 0.0, {**drive.channels, **wheels}, "simulated")
+    front, rear = vehicle.tracks_of(rolling)
+    assert (front, rear) == pytest.approx((2.08, 2.08), rel=0.02)

@@ -21,7 +21,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.filtering.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
-from vehest.estimators.filtering.tyre_fit import fit_tyres
+from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
 from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
@@ -39,9 +39,13 @@ CUTOFF = 0.2  # of the Nyquist frequency, above which signals count as noise
 ROLLING = (0.05, 0.2, 1.0, 2.0)  # rad, rad/s, rad/s, rad/s²: standard deviations of a motion that is only guessed
 LOST = 1.0  # rad, standard deviation of a sideslip angle of which nothing is known any more
 LARGEST = (1.5, 5.0, 20.0, 100.0)  # the same units: what estimates are kept within
+WITHIN = 3.0  # standard deviations at the start that tyre parameters may leave their start by, whatever the bound
+FORCE_SCALE = 0.05  # of axle forces from accelerations, one standard deviation: scale of the accelerometer, and what it feels of body roll
+SLIP_OFFSET = math.radians(0.15)  # of slip angles by the reference, likewise: its mounting
 FRICTION_START = 0.1  # standard deviation of its logarithm
 GIVEN_DEVIATION = 0.1  # of the logarithms of curves that nobody fitted
-BOXES = {"ay": (0.5, 3.0), "steer": (-2.0, 2.0), "tyres": (-4.0, -1.0)}  # powers of ten: ay and steer over yaw_rate, tyres as it is
+BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}  # powers of ten: ay and steer over yaw_rate, tyres as it is
+EDGE = 0.01  # of a box's width: a search that ends nearer to its end has ended on it
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
 FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
 BAD = 1e6  # rad², instead of a cost that is not finite
@@ -107,9 +111,12 @@ class RationalSettings(SingleTrackSettings):
         tyres: ``linear`` (LINT: cornering stiffnesses are states), ``rational`` (RATT: fixed), ``rational_adaptive`` (RATTE: c₁ and c₂ of
             both axles are states) or ``rational_friction`` (beyond the paper: the friction is).
         filter: ``extended`` or ``unscented``.
-        bound: factor by which tyre parameters may leave those that the filter started with.
+        bound: factor by which tyre parameters may leave those that the filter started with; never less than three standard deviations of
+            what it knew of them at the start, since a parameter that stands on a bound inside its own band says so with false certainty.
+        largest_sideslip: sideslip angle beyond which the filter counts as lost: the motion begins anew as that of a car that rolls, and the
+            tyres as they were at the start [rad].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²]; 0: never, as in the paper. Straight ahead
-            offsets of sensors are all that there is to adapt to.
+            a crossfall and offsets of sensors are all that there is to adapt to.
         noise: levels of noise.
         curves: axle curves.
         gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
@@ -120,6 +127,7 @@ class RationalSettings(SingleTrackSettings):
     tyres: Tyres = "rational_adaptive"
     filter: Literal["extended", "unscented"] = "extended"
     bound: float = 3.0
+    largest_sideslip: float = 0.5
     adapt_above: float = 0.0
     noise: TrackNoise = TrackNoise()
     curves: AxleCurves = AxleCurves()
@@ -138,6 +146,8 @@ class RationalSettings(SingleTrackSettings):
             )
         if not self.bound > 1.0:
             raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
+        if not 0.0 < self.largest_sideslip <= LARGEST[0]:
+            raise ConfigurationError(f"estimator.largest_sideslip must lie between 0 and {LARGEST[0]} rad, not at {self.largest_sideslip}")
         if not self.adapt_above >= 0.0:
             raise ConfigurationError(f"estimator.adapt_above must not be negative, not {self.adapt_above}")
         for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
@@ -292,7 +302,9 @@ class RationalFilter(SingleTrackEstimator):
             n = len(self._searched)
             columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
             history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
-            metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
+            boxes = np.array([BOXES[name] for name in self._searched])
+            at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
+            metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
             self.levels = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
             interrupted = search.interrupted
         if data.validation and all(_has_reference(recording) for recording in data.validation):
@@ -305,16 +317,18 @@ class RationalFilter(SingleTrackEstimator):
         """Set curves and the covariance of their logarithms; returns them with half the width of their 95 % intervals."""
         linear = self.settings.tyres == "linear"
         kind: Literal["linear", "rational"] = "linear" if linear else "rational"
-        fit = fit_tyres(recordings, self.settings.car, kind, minimum_speed=self.settings.minimum_speed)
+        motion = axle_motion(recordings, self.settings.car, self.settings.minimum_speed)
+        fit = fit_motion(motion, kind)
         rows = [1, 3] if linear else [0, 1, 2, 3]
         self.curves[rows] = [*fit.front, *fit.rear]
         self.curve_covariance = np.zeros((len(CURVES), len(CURVES)))
-        for axle, (values, covariance) in enumerate(zip((fit.front, fit.rear), fit.covariance, strict=True)):
-            own = rows[axle * len(values) : (axle + 1) * len(values)]
-            spread = (self.settings.curves.deviation or 0.0) ** 2 * np.eye(len(values))
-            self.curve_covariance[np.ix_(own, own)] = covariance / np.outer(values, values) + spread
+        for axle, covariance in enumerate(_doubts(motion, kind, fit)):
+            own = rows[axle * len(covariance) : (axle + 1) * len(covariance)]
+            self.curve_covariance[np.ix_(own, own)] = covariance
         found = {CURVES[row]: float(self.curves[row]) for row in rows}
-        intervals = dict(zip((f"{CURVES[row]}_interval" for row in rows), fit.interval.ravel().tolist(), strict=True))
+        half = NORMAL_95 * self.curves * np.sqrt(np.diagonal(self.curve_covariance))
+        intervals = {f"{CURVES[row]}_interval": float(half[row]) for row in rows}
+        self.curve_covariance[np.ix_(rows, rows)] += (self.settings.curves.deviation or 0.0) ** 2 * np.eye(len(rows))
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
         return {**found, **intervals, **rms}
 
@@ -393,20 +407,23 @@ class RationalFilter(SingleTrackEstimator):
     def start(self, sample: FloatArray, initial_state: Mapping[str, float] | None = None) -> Gaussian[FloatArray]:
         """State before the first sample: at rest on its course, or what a protocol hands over; parameters as they were fitted."""
         given = dict(initial_state or {})
-        adapted = self.settings.adapted
-        mean = np.zeros(len(MOTION) + len(adapted))
+        mean = np.zeros(len(MOTION) + len(self.settings.adapted))
         covariance = np.zeros((len(mean), len(mean)))
         covariance[range(4), range(4)] = np.square(ROLLING)
         if "vy" in given:
             mean[0], covariance[0, 0] = math.atan2(given["vy"], max(sample[1], self.settings.minimum_speed)), KNOWN**2
         if "yaw_rate" in given:
             mean[1], covariance[1, 1] = given["yaw_rate"], KNOWN**2
-        if adapted == ("friction",):
-            covariance[4, 4] = FRICTION_START**2
-        elif adapted:
-            rows = [CURVES.index(name) for name in adapted]
-            covariance[4:, 4:] = self.curve_covariance[np.ix_(rows, rows)]
+        covariance[4:, 4:] = self.start_tyres()
         return Gaussian(mean, covariance)
+
+    def start_tyres(self) -> FloatArray:
+        """Covariance of the logarithms of the adapted tyre parameters at the start, (n - 4, n - 4)."""
+        adapted = self.settings.adapted
+        if adapted == ("friction",):
+            return np.array([[FRICTION_START**2]])
+        rows = [CURVES.index(name) for name in adapted]
+        return np.ascontiguousarray(self.curve_covariance[np.ix_(rows, rows)])
 
     def gate(self) -> Gate | None:
         """That of filters in use."""
@@ -414,7 +431,8 @@ class RationalFilter(SingleTrackEstimator):
 
     def bounds(self) -> FloatArray:
         """Largest absolute value of each state, (n,)."""
-        return np.array([*LARGEST, *[math.log(self.settings.bound)] * len(self.settings.adapted)])
+        spread = WITHIN * np.sqrt(np.diagonal(self.start_tyres()))
+        return np.array([*LARGEST, *np.maximum(spread, math.log(self.settings.bound)).tolist()])
 
     def filter_samples(
         self,
@@ -451,6 +469,8 @@ class RationalFilter(SingleTrackEstimator):
             -bound,
             bound,
             np.square(ROLLING),
+            self.start_tyres(),
+            self.settings.largest_sideslip,
             LOST**2,
             1.0 / self.settings.rate_hz,
             self.settings.minimum_speed,
@@ -524,11 +544,20 @@ class RationalFilter(SingleTrackEstimator):
         return FilteredDrive(*out, state)
 
     def _found_again(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
-        """The motion of a car that rolls, where the sideslip angle is lost; without measurements the model may be unstable."""
-        lost = ~((state.covariance[..., 0, 0] < LOST**2) & (state.mean[..., 0].abs() < LARGEST[0]))
+        """The motion of a car that rolls, where the sideslip angle is lost; without measurements the model may be unstable.
+
+        Where it is beyond its limit the tyres are taken to be the reason, and start anew as well.
+        """
+        diverged = ~(state.mean[..., 0].abs() < self.settings.largest_sideslip)
+        lost = diverged | ~(state.covariance[..., 0, 0] < LOST**2)
         if not bool(lost.any()):
             return state
         anew = self._rolled(state, inputs)
+        mean, covariance = anew.mean.clone(), anew.covariance.clone()
+        start = torch.as_tensor(self.start_tyres(), dtype=covariance.dtype)
+        mean[..., 4:] = torch.where(diverged[..., None], 0.0, mean[..., 4:])
+        covariance[..., 4:, 4:] = torch.where(diverged[..., None, None], start, covariance[..., 4:, 4:])
+        anew = Gaussian(mean, covariance)
         return Gaussian(
             torch.where(lost[..., None], anew.mean, state.mean), torch.where(lost[..., None, None], anew.covariance, state.covariance)
         )
@@ -622,6 +651,17 @@ def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording
     if not found:
         known = ", ".join(sorted({recording.id for recording in recordings}))
         raise ConfigurationError(f"training.curves_from '{pattern}' matches no training recording ({known})")
+    return found
+
+
+def _doubts(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit) -> list[FloatArray]:
+    """Covariance of the logarithms of each axle's parameters, least squares' own and what they cannot see: the scale of all forces, and an
+    offset of all slip angles, whose effect is that of a fit to shifted ones."""
+    shifted = fit_motion(motion._replace(slip=motion.slip + SLIP_OFFSET), kind)
+    found = []
+    for own, other, covariance in zip((fit.front, fit.rear), (shifted.front, shifted.rear), fit.covariance, strict=True):
+        effect, scale = np.log(other / own), np.eye(len(own))[-1] * FORCE_SCALE
+        found.append(covariance / np.outer(own, own) + np.outer(effect, effect) + np.outer(scale, scale))
     return found
 
 

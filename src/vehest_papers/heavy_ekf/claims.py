@@ -33,8 +33,8 @@ def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
     return {test: ranking_of(part, test, asked=asked) for test in part.split.tests}
 
 
-def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, part_titles: Sequence[str]) -> list[Block]:
-    """The table of claims, then a sentence a test on who may be called best, then what to mind."""
+def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> list[Block]:
+    """The table of claims, those of the tests before ``others``, then a sentence a test on who may be called best."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
     data = words_of_kinds(truck)
@@ -51,12 +51,17 @@ def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, part_titl
             known = f"{paper.GAINS[better, worse]:.0f} % below on its three laps" if test != FAST else _on_the_fast_lap(better, worse)
             claims.append(order_claim(ranking, variant_of[better], variant_of[worse], own, known, words))
     sentences = [verdict_sentences(ranking, own, words) for _, words, own, ranking in tests]
-    blocks: list[Block] = [claims_table(claims, "The paper's recordings are real, of another vehicle."), "\n\n".join(sentences)]
-    parts = [part for part in (truck, ferrari) if part is not None]
-    warned = [f"{as_text(title)}: {line}" for title, part in zip(part_titles, parts, strict=False) for line in warnings_of(part)]
-    if warned:
-        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
-    return blocks
+    note = (
+        "The paper's recordings are real, of another vehicle. Twin: the paper's own single track as the plant, below; its intervals are "
+        "paired over seeds."
+    )
+    return [claims_table([*claims, *others], note), "\n\n".join(sentences)]
+
+
+def warnings_in_words(parts: Sequence[tuple[str, PartArtefacts]]) -> str:
+    """What to mind, of parts with their titles; nothing to mind is no text."""
+    warned = [f"{as_text(title)}: {line}" for title, part in parts for line in warnings_of(part)]
+    return "**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned) if warned else ""
 
 
 def _on_the_fast_lap(better: str, worse: str) -> str:

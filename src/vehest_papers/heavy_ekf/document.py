@@ -12,11 +12,13 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.claims import Claim
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
-from vehest_papers.heavy_ekf import claims, laps, paper, tables, tyres, watching
+from vehest_papers.heavy_ekf import accuracy, claims, laps, paper, tables, twin_report, tyres, vehicle, watching
+from vehest_papers.heavy_ekf.factorial import every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
 
-TRUCK, FERRARI = "truck", "ferrari"
+TRUCK, FERRARI, WHEELED = "truck", "ferrari", "av21"
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.08, track_rear=2.08)  # as in conf/vehicle/heavy_truck.yaml
 NOMINAL = "nominal_laps"
 REAL_TRACE = "sideslip_ferrari"
@@ -45,16 +47,48 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     of_ferrari = _ferrari(real, real_filters, real_rmse) if real else []
     errors = {**rmse, **claims.baseline_errors(truck)}
     real_errors = {**real_rmse, **claims.baseline_errors(real)} if real else {}
+    twin = factorial()
+    twin_front, twin_claims, twin_data, twin_appendix = twin_report.twin_blocks(twin)
+    wheels, wheel_claims = vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else ([], [])
+    lap_blocks, lap_claims = _lap_by_lap(filters, drives, estimates)
+    others = [*twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
+    warned = claims.warnings_in_words([(artefacts.titles[name], part) for name, part in artefacts.parts.items() if name != WHEELED])
     blocks: list[Block] = [
         *_asked(artefacts),
-        *claims.claims_blocks(truck, real, [artefacts.titles[name] for name in (TRUCK, FERRARI)]),
+        *claims.claims_blocks(truck, real, others),
         *[block for block in of_ferrari if _is_real_trace(block)],
         tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
+        *twin_front,
+        *lap_blocks,
+        *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
+        *twin_appendix,
+        "## Appendix: the vehicle",
+        vehicle.table_2(filters[paper.RATTE].fitted.settings.car),
+        vehicle.eigenvalues_table(filters[paper.RATTE].fitted.settings.car),
+        *wheels,
         *_truck(truck, filters, rmse, drives, estimates),
         *[block for block in of_ferrari if not _is_real_trace(block)],
         *_how_it_was_made(artefacts),
     ]
-    return {REPORT: Document(artefacts.title, blocks, {})}
+    return {REPORT: Document(artefacts.title, blocks, {**twin_data, "twin_cells": every_cell(twin)})}
+
+
+def _lap_by_lap(
+    filters: Mapping[str, Filter], drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]]
+) -> tuple[list[Block], list[Claim]]:
+    """Errors a lap, underestimation and the stop, with the claims that go with them."""
+    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
+    names = [name for name in paper.ORDER if name in filters]
+    gains = accuracy.gains_of(drives, estimates, names)
+    blocks: list[Block] = [
+        "## Lap by lap, underestimation, and the stop",
+        accuracy.per_lap_table(drives, estimates, names, slowest),
+        accuracy.underestimation_table(gains, names),
+        accuracy.stop_table(drives, estimates, names),
+    ]
+    ratte, three = estimates[NOMINAL][paper.RATTE], drives[NOMINAL]
+    faster = accuracy.faster_is_better_claim(three, ratte, slowest)
+    return blocks, [faster, *accuracy.underestimation_claims(gains), accuracy.stop_claim(three, ratte)]
 
 
 def _is_real_trace(block: Block) -> bool:
@@ -101,7 +135,9 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     columns["tests"] = Column("tests")
     departures = (
         "Where we differ from the paper: tyre parameters are states as logarithms over their fitted values, so that they stay positive and "
-        "the filter is well conditioned, and are kept within a factor of three; axle forces for the fit come from accelerations instead of "
+        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 "
+        "rad of sideslip the filter begins "
+        "anew, tyres included; axle forces for the fit come from accelerations instead of "
         "TRICK, and where they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are "
         f"tuned, since no data sheet is at hand; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction "
         "are not in the paper; the unscented filter takes the levels that were found through the extended one."
@@ -132,19 +168,19 @@ def _truck(
     adaptive = [name for name in (paper.LINT, paper.RATTE, paper.HELD) if name in filters]
     errors = tables.errors_table(drives, estimates, [name for name in (*paper.ORDER, paper.HELD) if name in filters], slowest)
     blocks: list[Block] = [
-        "## Tyres",
+        "## Appendix: tyres",
         tyres.figure_3(fit, own["nominal"], "figure_3", data),
         tyres.table_1(fit, own["nominal"], "table_1", data),
-        "## Speed from the wheels",
+        "## Appendix: speed from the wheels",
         laps.figure_5(three, WHEELS, data),
-        "## Three laps",
+        "## Appendix: three laps",
         laps.figure_6(three, shown[NOMINAL], slowest, data),
         laps.speed_and_acceleration(three, "figure_7", 7, "three laps at constant speed", data),
         tables.table_3(rmse, list(filters), data),
         tables.gains_table(rmse),
         errors,
         tables.order_in_words(rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.levels["tyres"]),
-        "## Tyre parameters over time",
+        "## Appendix: tyre parameters over time",
     ]
     for name, number in ((paper.LINT, 8), (paper.RATTE, 9)):
         what = "Cornering stiffness values" if name == paper.LINT else "Rational tyre model parameters"
@@ -161,13 +197,13 @@ def _truck(
         blocks.append(tyres.parameters_figure(by_tyres, of, own, paper.HELD, "figure_9_held", caption))
     blocks += [
         tyres.convergence_table(drives, estimates, own, adaptive),
-        "## The fast lap",
+        "## Appendix: the fast lap",
         laps.figure_10(fast, shown["nominal_fast"], slowest, data),
         laps.speed_and_acceleration(fast, "figure_11", 11, "the high-speed lap", data),
     ]
     watched = {name: filters[name] for name in reversed(paper.ORDER)}
-    blocks += ["## Where the parameters can move", *watching.observability_blocks(watched, three, slowest, data)]
-    blocks += ["## Bad input", *watching.bad_input_table(watched, three, sound, WHEELS, slowest, data)]
+    blocks += ["## Appendix: where the parameters can move", *watching.observability_blocks(watched, three, slowest, data)]
+    blocks += ["## Appendix: bad input", *watching.bad_input_table(watched, three, sound, WHEELS, slowest, data)]
     return blocks
 
 
@@ -187,7 +223,7 @@ def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rm
     trace = f"Measured and estimated sideslip angle on the test range and the seconds before it, {data}, '{drive.id}'."
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
     return [
-        "## The same filters on a real car",
+        "## Appendix: the same filters on a real car",
         "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; who may be called best is "
         "said on the first page, which also shows the sideslip angle.",
         Table("ferrari", caption, rows, columns),

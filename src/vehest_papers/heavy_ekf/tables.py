@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from vehest.constants import FloatArray
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import TyreFit
@@ -55,9 +55,7 @@ def overview(rmse: Rmse, ferrari: Rmse, names: list[str]) -> Table:
         **{name: Column(f"{name} [deg]", decimals=3) for name in names},
         "order": Column("order of the three"),
     }
-    return Table(
-        "overview", "The short of it: RMSE(β) on every test; the paper's order is RATTE < RATT < LINT.", pd.DataFrame(rows), columns
-    )
+    return Table("overview", "Summary: RMSE(β) on every test; the paper's order is RATTE < RATT < LINT.", pd.DataFrame(rows), columns)
 
 
 def gains_table(rmse: Rmse) -> Table:
@@ -129,7 +127,7 @@ def order_in_words(
     )
     reasons.append(f"- **What is to be gained.** {_gained(errors)}")
     if (errors["filter"] == paper.HELD).any():
-        reasons.append(f"- **Straight ahead there is nothing to adapt to but offsets.** {_held(rmse, errors)}")
+        reasons.append(f"- **Straight ahead there is nothing to adapt to but the crossfall.** {_held(rmse, errors)}")
     worst = [test for test in other if rmse[paper.RATTE, test] > rmse[paper.RATT, test]]
     if worst:
         parts = []
@@ -142,7 +140,7 @@ def order_in_words(
         reasons.append(
             "- **Where parameters that move do harm.** RATTE against RATT, "
             + "; ".join(parts)
-            + ". A filter that may move its tyres lays errors of the sensors and of the model upon them; offsets of sensors are no states."
+            + ". A filter that may move its tyres lays the crossfall and errors of the sensors upon them; the paper has states for neither."
         )
     shared = {
         drive.id: float(np.degrees(curves.offsets[drive.id][1]))
@@ -158,10 +156,13 @@ def order_in_words(
         + f". From the nominal to the worn laps that changes by {fixed(apart, 2)}° and the mean error of RATT by "
         + f"{fixed(means[1] - means[0], 2)}°; no filter can know an offset of the reference, so it is in the errors of all."
     )
-    offsets = [f"{test.replace('_', ' ')} {fixed(_offset(drive), 2)}" for test, drive in drives.items()]
+    pulls = [f"{test.replace('_', ' ')} {fixed(_pull(drive), 2)}" for test, drive in drives.items()]
     reasons.append(
-        f"- **Offsets of the sensors.** The mean of a_y - u r - dv/dt is, in m/s²: {'; '.join(offsets)}. A filter that believes a_y turns "
-        "such an offset into β, and one whose tyres adapt into tyres."
+        f"- **Crossfall.** The mean of a_y - u r - dv/dt is, in m/s²: {'; '.join(pulls)}. The course falls by 1° to one side all along, "
+        "which makes "
+        f"{fixed(GRAVITY * math.sin(math.radians(1.0)), 2)}; the rest is the accelerometer's. A filter without a state for it turns it "
+        "into β, and one whose tyres "
+        "adapt into tyres."
     )
     return "\n\n".join([" ".join(sentences), "\n".join(reasons)])
 
@@ -204,7 +205,8 @@ def _held(rmse: Rmse, errors: pd.DataFrame) -> str:
             errors_of = [fixed(rmse[name, test], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
             words.append(f"{tyres} {drive} {', '.join(errors_of)}° (standard deviations {', '.join(spread)}°)")
     return (
-        "There a filter lays offsets of a_y, yaw rate and steering upon its tyres, which it then brings into the next bend. RMSE(β) of "
+        "There a filter lays the crossfall, and offsets of yaw rate and steering, upon its tyres, which it then brings into the next "
+        "bend. RMSE(β) of "
         f"{paper.HELD}, whose parameters are held there, of RATTE and of RATT: {'; '.join(words)}."
     )
 
@@ -230,8 +232,8 @@ def _starts(own: Mapping[str, OwnCurves], fit: TyreFit) -> str:
     )
 
 
-def _offset(drive: Recording) -> float:
-    """Mean of a_y - u r - dv/dt [m/s²] while driving."""
+def _pull(drive: Recording) -> float:
+    """Mean of a_y - u r - dv/dt [m/s²] while driving: the gravity of a crossfall, and an accelerometer's offset."""
     driven = drive["vx"] > 5.0
     slope = np.gradient(drive["vy_ref"]) * drive.rate_hz
     return float(np.mean((drive["ay"] - drive["vx_ref"] * drive["yaw_rate"] - slope)[driven]))

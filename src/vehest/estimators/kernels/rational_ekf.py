@@ -27,6 +27,8 @@ def scan(  # type: ignore[no-untyped-def]
     lower,
     upper,
     rolling,
+    start_tyres,
+    largest,
     lost,
     step,
     minimum_speed,
@@ -56,8 +58,10 @@ def scan(  # type: ignore[no-untyped-def]
         lower: of states, (n,).
         upper: of states, (n,).
         rolling: variances of the first four states of a car that rolls, (4,).
-        lost: variance of β [rad²] from which on, as from β's limit on, the motion is guessed anew: that of a car that rolls. Without
-            measurements the model may be unstable.
+        start_tyres: covariance of the logarithms of the adapted parameters at the start, (n - 4, n - 4).
+        largest: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well: they
+            are taken to be the reason.
+        lost: variance of β [rad²] from which on the motion alone is guessed anew; without measurements the model may be unstable.
         step: Δt [s].
         minimum_speed: [m/s].
         adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
@@ -93,7 +97,10 @@ def scan(  # type: ignore[no-untyped-def]
             _spread(cov, per_rate, per_turn, step, left)
             _add_noise(cov, front, car, speed, step, variances, abs(speed * mean[1]) >= adapt_above)
             _clip(mean, lower, upper)
-            if not (cov[0, 0] < lost and abs(mean[0]) < upper[0]):
+            if not abs(mean[0]) < largest:
+                _roll(mean, cov, rolling, car, vx, steer)
+                mean[4:], cov[4:, 4:] = 0.0, start_tyres
+            elif not cov[0, 0] < lost:
                 _roll(mean, cov, rolling, car, vx, steer)
         held = abs(vx * mean[1]) < adapt_above
         _innovate(mean, cov, samples[k], variances, limit, patience, refused, cross, innovation[k], innovation_cov[k], measured[k])

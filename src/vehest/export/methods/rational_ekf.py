@@ -45,6 +45,7 @@ def rational_ekf(estimator: RationalFilter, precision: Precision) -> MethodTempl
         "tyre_spread": math.sqrt(step) * estimator.levels["tyres"],
         "bounds": estimator.bounds(),
         "rolling": ROLLING,
+        "largest_sideslip": s.largest_sideslip,
         "lost": LOST,
         "tyre_root": _root(first.covariance[4:, 4:]),
     }

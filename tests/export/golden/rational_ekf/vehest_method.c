@@ -17,8 +17,9 @@ static const vehest_real SLOWEST = 3.0; /* wheels roll without slip below it [m/
 static const vehest_real SENSORS[M] = {0.5, 0.3}; /* standard deviations of r [rad/s] and a_y [m/s^2] */
 static const vehest_real STEER_SPREAD = 0.022360679774997897; /* standard deviation of the steering angle over a step [rad] */
 static const vehest_real TYRE_SPREAD = 0.10062305898749054; /* of logarithms of tyre parameters [1] */
-static const vehest_real LARGEST[N] = {1.5, 5.0, 20.0, 100.0, 1.0986122886681098, 1.0986122886681098, 1.0986122886681098, 1.0986122886681098}; /* what states are kept within */
+static const vehest_real LARGEST[N] = {1.5, 5.0, 20.0, 100.0, 2.0124611797498106, 2.224859546128699, 1.0986122886681098, 1.3416407864998738}; /* what states are kept within */
 static const vehest_real ROLLING[4] = {0.05, 0.2, 1.0, 2.0}; /* standard deviations of a motion that is only guessed */
+static const vehest_real LARGEST_SIDESLIP = 0.5; /* beta from which on motion and tyres start anew [rad] */
 static const vehest_real LOST = 1.0; /* standard deviation of beta from which on the motion is guessed anew [rad] */
 
 /* Lateral force of an axle [N], and what it changes by: per slip [N/rad], per logarithm of a parameter [N]. */
@@ -99,6 +100,24 @@ static void roll(vehest_method *m, vehest_real vx, vehest_real steer)
     }
     for (int i = 0; i < 4; i++) {
         m->root[i][i] = ROLLING[i];
+    }
+}
+
+/* Logarithms of tyre parameters as they were before the first sample. */
+static void start_tyres(vehest_method *m)
+{
+    static const vehest_real TYRES[N - 4][N - 4] = {
+    {0.7007997784655192, 0.0, 0.0, 0.0},
+    {0.315995843674501, -0.6792169090853265, 0.0, 0.0},
+    {0.5683849361650071, -0.0991655918140022, -0.13606349479533722, 0.0},
+    {0.43033445220237176, 0.08698081432435043, -0.26822112840914913, -3.2959746043559335e-16}
+}; /* root of their covariance */
+
+    for (int i = 4; i < N; i++) {
+        m->mean[i] = 0.0;
+        for (int j = 4; j < N; j++) {
+            m->root[i][j] = TYRES[i - 4][j - 4];
+        }
     }
 }
 
@@ -204,13 +223,6 @@ static void update(vehest_method *m, const vehest_real y[M], vehest_real vx)
 
 void vehest_method_start(vehest_method *m)
 {
-    static const vehest_real TYRES[N - 4][N - 4] = {
-    {0.7007997784655192, 0.0, 0.0, 0.0},
-    {0.315995843674501, -0.6792169090853265, 0.0, 0.0},
-    {0.5683849361650071, -0.0991655918140022, -0.13606349479533722, 0.0},
-    {0.43033445220237176, 0.08698081432435043, -0.26822112840914913, -3.2959746043559335e-16}
-}; /* root of the covariance of logarithms of tyre parameters */
-
     for (int i = 0; i < N; i++) {
         m->mean[i] = 0.0;
         for (int j = 0; j < N; j++) {
@@ -220,11 +232,7 @@ void vehest_method_start(vehest_method *m)
     for (int i = 0; i < 4; i++) {
         m->root[i][i] = ROLLING[i];
     }
-    for (int i = 4; i < N; i++) {
-        for (int j = 4; j < N; j++) {
-            m->root[i][j] = TYRES[i - 4][j - 4];
-        }
-    }
+    start_tyres(m);
     m->vx = 0.0;
     m->steer = 0.0;
     m->started = false;
@@ -256,7 +264,10 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     } else {
         if (m->started) {
             predict(m);
-            if (!(VEHEST_ABS(m->root[0][0]) < LOST && VEHEST_ABS(m->mean[0]) < LARGEST[0])) {
+            if (!(VEHEST_ABS(m->mean[0]) < LARGEST_SIDESLIP)) { /* the tyres are taken to be the reason */
+                roll(m, vx, steer);
+                start_tyres(m);
+            } else if (!(VEHEST_ABS(m->root[0][0]) < LOST)) {
                 roll(m, vx, steer);
             }
         }

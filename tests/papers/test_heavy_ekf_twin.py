@@ -1,0 +1,225 @@
+"""The twin of the heavy vehicle: plant, tyres, driver, the filter with a state of crossfall, oracle tyres, and how cells are compared."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import integrate
+
+from vehest.constants import GRAVITY
+from vehest.vehicle.rational_tyres import rational_axle
+from vehest_papers.heavy_ekf import crossfall_filter, factorial, paper, vehicle
+from vehest_papers.heavy_ekf.candidates import (
+    BOX,
+    FIRST_TUNING_SEED,
+    ORACLE,
+    TUNED_MISMATCHES,
+    TUNED_SLIPS,
+    Levels,
+    estimator_of,
+    mistaken,
+    oracle,
+    rmse,
+    states_of,
+    tuning_drives,
+)
+from vehest_papers.heavy_ekf.twin import CURVES, FINER, RATE, TRUCK, Conditions, Drive, Plant, course, drive, driven
+
+LEVELS = Levels(ay=0.1, steer=0.005, tyres=0.003)
+SECONDS = 30.0
+
+
+@pytest.fixture(scope="module")
+def dry() -> list[Drive]:
+    return [drive(Conditions(5.0), seed, SECONDS) for seed in range(6)]
+
+
+# The plant
+
+
+@pytest.mark.parametrize("conditions", [Conditions(3.0), Conditions(8.0, payload=True, wet_patches=True, crossfall=True)], ids=str)
+def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditions: Conditions) -> None:
+    """Steered as it was: SciPy's Dormand and Prince at 1e-10, with slips and forces written out here."""
+    plant, own = Plant.of(payload=conditions.payload), course(conditions, np.random.default_rng(3), 12.0)
+    states, steer, lateral = driven(plant, own)
+    car, step = plant.car, 1.0 / (RATE * FINER)
+    front_load, rear_load = plant.load_front, plant.load_rear
+
+    def slope(time: float, state: np.ndarray, k: int) -> list[float]:
+        beta, r = state
+        u, mu = own.speed[k], own.friction[k]
+        slips = steer[k] - beta - car.cg_to_front_axle * r / u, -beta + car.cg_to_rear_axle * r / u
+        front, rear = (
+            c2 * mu * load * slip * c1 * (mu + 1.0) / (slip**2 + c1 * (mu + 1.0))
+            for slip, c1, c2, load in zip(slips, CURVES[::2], CURVES[1::2], (front_load, rear_load), strict=True)
+        )
+        turning = (car.cg_to_front_axle * front - car.cg_to_rear_axle * rear) / car.yaw_inertia
+        return [(front + rear) / (car.mass * u) - r + own.road[k] / u, turning]
+
+    state = np.zeros(2)
+    for k in range(len(steer) - 1):
+        if k % 20 == 0:
+            np.testing.assert_allclose(states[k], state, rtol=0.0, atol=2e-7)
+            beta_rate = slope(0.0, states[k], k)[0]
+            assert lateral[k] == pytest.approx(own.speed[k] * (beta_rate + states[k, 1]) - own.road[k], abs=1e-9)
+        found = integrate.solve_ivp(slope, (0.0, step), state, method="DOP853", rtol=1e-10, atol=1e-13, args=(k,))
+        state = found.y[:, -1]
+
+
+def test_axles_make_no_more_than_the_paper_s_largest_forces() -> None:
+    """F_max = c₂ √(2c₁)/2: 39.0 kN front and 38.6 kN rear, the weight of about 8 t."""
+    slip = np.linspace(0.0, 0.5, 50001)
+    largest = [rational_axle(slip, c1, c2, 1.0).force.max() for c1, c2 in CURVES.reshape(2, 2)]
+    np.testing.assert_allclose(largest, [39.03e3, 38.59e3], rtol=2e-4)
+    assert sum(largest) / GRAVITY == pytest.approx(TRUCK.mass, rel=2e-3)
+
+
+@pytest.mark.parametrize("payload", [False, True])
+def test_the_truck_slides_before_it_rolls_over(payload: bool) -> None:
+    plant = Plant.of(payload=payload)
+    assert plant.slides_at < plant.roll_over
+    own = drive(Conditions(8.0, payload=payload), 0, SECONDS)
+    assert np.abs(own.lateral).max() <= plant.slides_at
+
+
+@pytest.mark.parametrize("slip", factorial.SLIPS)
+def test_the_driver_reaches_the_slip_and_does_not_spin(slip: float) -> None:
+    for seed in range(3):
+        own = drive(Conditions(slip), seed)
+        assert np.degrees(np.abs(own.rear_slip)).max() == pytest.approx(slip, rel=0.05)
+        assert np.degrees(np.abs(own.sideslip)).max() < 15.0
+
+
+def test_payload_keeps_the_sum_of_loads_and_moments() -> None:
+    plant = Plant.of(payload=True)
+    empty = np.array([TRUCK.cg_to_rear_axle, TRUCK.cg_to_front_axle]) / 3.5 * TRUCK.mass
+    loads = np.array([plant.load_front, plant.load_rear]) * empty
+    assert loads.sum() == pytest.approx(plant.car.mass)
+    assert loads[0] * plant.car.cg_to_front_axle == pytest.approx(loads[1] * plant.car.cg_to_rear_axle)
+
+
+def test_curves_under_friction_are_those_that_a_filter_at_friction_1_would_need() -> None:
+    plant, slip = Plant.of(payload=False), np.linspace(-0.2, 0.2, 41)
+    c1, c2 = plant.curves(0.6)[:2]
+    np.testing.assert_allclose(rational_axle(slip, c1, c2, 1.0).force, rational_axle(slip, CURVES[0], CURVES[1], 0.6).force, rtol=1e-12)
+
+
+def test_the_seed_decides_course_and_sensors_whatever_the_plant() -> None:
+    one, other = drive(Conditions(4.0), 5, SECONDS), drive(Conditions(4.0, crossfall=True), 5, SECONDS)
+    np.testing.assert_array_equal(one.samples[:, 1], other.samples[:, 1])
+    noise = [own.samples[:, 0] - own.yaw_rate for own in (one, other)]
+    np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
+
+
+# The filters
+
+
+@pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
+def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name: str, dry: list[Drive]) -> None:
+    estimator = estimator_of(name, LEVELS, mistaken(-0.2))
+    ours = crossfall_filter.filtered(estimator, dry[0].samples, deviation=0.0, wander=0.0)
+    theirs = estimator.filter_samples(dry[0].samples).mean
+    np.testing.assert_allclose(ours[:, [0, 1, 2, 3]], theirs[:, :4], atol=1e-11)
+    np.testing.assert_allclose(ours[:, 5:], theirs[:, 4:], atol=1e-11)
+    np.testing.assert_allclose(states_of(name, LEVELS, dry[0], mistaken(-0.2)), theirs, atol=1e-11)
+    assert (ours[:, 4] == 0.0).all()
+
+
+def test_its_guard_against_divergence_is_the_paper_s_filter_s_too(dry: list[Drive]) -> None:
+    """A limit of 1.5° on a drive that goes beyond."""
+    estimator = estimator_of(paper.RATTE, LEVELS, mistaken(-0.2))
+    estimator.settings = replace(estimator.settings, largest_sideslip=math.radians(1.5))
+    assert np.abs(dry[0].sideslip).max() > math.radians(1.5)
+    ours, theirs = crossfall_filter.filtered(estimator, dry[0].samples, 0.0, 0.0), estimator.filter_samples(dry[0].samples).mean
+    np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=1e-9)
+
+
+def test_the_crossfall_is_found_and_its_filter_is_the_better_one_for_it() -> None:
+    own = drive(Conditions(5.0, crossfall=True), 1, 60.0)
+    without = states_of(paper.RATT, LEVELS, own, CURVES)
+    state = states_of(f"{paper.RATT}, crossfall state", LEVELS, own, CURVES)
+    assert state[-400:, 4].mean() == pytest.approx(GRAVITY * math.sin(math.radians(1.0)), abs=0.02)
+    assert rmse(state[:, 0], own) < rmse(without[:, 0], own)
+
+
+def test_oracle_tyres_are_not_worse_than_mistaken_ones_on_average(dry: list[Drive]) -> None:
+    told = np.mean([rmse(oracle(LEVELS, own), own) for own in dry])
+    for mismatch in (-0.3, -0.1, 0.1, 0.2):
+        assert told <= np.mean([rmse(states_of(paper.RATT, LEVELS, own, mistaken(mismatch))[:, 0], own) for own in dry])
+
+
+def test_an_oracle_on_a_dry_road_is_the_filter_with_the_right_curves(dry: list[Drive]) -> None:
+    np.testing.assert_allclose(oracle(LEVELS, dry[0]), states_of(ORACLE, LEVELS, dry[0], CURVES)[:, 0], atol=1e-12)
+
+
+def test_an_oracle_goes_on_where_the_friction_steps() -> None:
+    """Steps between frictions that are nearly the same change nothing that is seen."""
+    own = drive(Conditions(4.0, wet_patches=True), 2, 60.0)
+    assert len(set(own.friction.tolist())) == 2
+    same = replace(own, friction=np.where(own.friction < 1.0, 1.0 - 1e-9, 1.0))
+    np.testing.assert_allclose(oracle(LEVELS, same), oracle(LEVELS, replace(own, friction=np.ones(len(own.friction)))), atol=1e-7)
+
+
+# The experiment
+
+
+def test_levels_are_tuned_in_cells_and_on_seeds_that_are_not_scored() -> None:
+    assert not set(TUNED_SLIPS) & set(factorial.SLIPS)
+    assert not set(TUNED_MISMATCHES) & set(factorial.MISMATCHES)
+    assert factorial.SEEDS <= FIRST_TUNING_SEED
+    tuned_on = {factorial.plant_of(own.conditions) for _, own in tuning_drives()}
+    assert tuned_on == set(factorial.PLANTS)
+    assert all(high - low >= 8.0 for low, high in BOX.values())
+
+
+def cell(name: str, squared: dict[str, np.ndarray]) -> factorial.Cell:
+    return factorial.Cell(name, Conditions(4.0), 0.0, squared, {}, (0.0, 0.0, 0.0))
+
+
+def test_a_change_is_paired_over_seeds() -> None:
+    """Seeds that differ a hundredfold, one filter 20 % below the other on each: told apart, and 20 %."""
+    generator = np.random.default_rng(0)
+    hard = 10.0 ** generator.uniform(-2.0, 0.0, factorial.SEEDS)
+    noise = 1.0 + 0.02 * generator.standard_normal((2, factorial.SEEDS))
+    cells = [cell("one", {"A": 0.64 * hard * noise[0], "B": hard * noise[1]}), cell("other", {"A": hard * noise[0], "B": hard * noise[1]})]
+    found = factorial.changes(cells, [("A", "B")])
+    assert found[0, ("A", "B")].percent == pytest.approx(-20.0, abs=1.0)
+    assert found[0, ("A", "B")].told_apart
+    assert not found[1, ("A", "B")].told_apart
+
+
+def test_holm_asks_more_of_a_table_with_more_cells() -> None:
+    generator = np.random.default_rng(1)
+    one = {
+        "A": np.exp(0.5 * generator.standard_normal(factorial.SEEDS)),
+        "B": np.exp(0.5 * generator.standard_normal(factorial.SEEDS)) + 0.9,
+    }
+    alone = factorial.changes([cell("one", one)], [("A", "B")])[0, ("A", "B")]
+    among = factorial.changes([cell(str(at), one) for at in range(20)], [("A", "B")])[0, ("A", "B")]
+    assert among.low < alone.low < alone.high < among.high
+
+
+# The vehicle
+
+
+def test_eigenvalues_have_the_paper_s_ratios() -> None:
+    """1 above 6 m/s and at most about 1.3 below, with Table 1's stiffnesses."""
+    stiff = replace(TRUCK, cornering_stiffness_front=CURVES[1], cornering_stiffness_rear=CURVES[3])
+    fast, slow = vehicle.ratios(stiff, np.array([6.5, 10.0, 30.0])), vehicle.ratios(stiff, np.array([0.5, 2.0, 4.0]))
+    np.testing.assert_allclose(fast, 1.0, atol=1e-9)
+    assert 1.0 < slow.max() < 1.35
+
+
+def test_tracks_are_found_from_wheels_that_roll() -> None:
+    from vehest.data.recording import Recording
+
+    time = np.arange(2000) / 20.0
+    turn, u = 0.3 * np.sin(0.3 * time), np.full(2000, 20.0)
+    wheels = {
+        f"wheel_speed_{name}": (u - side * turn) / vehicle.RADIUS for name, side in {"fl": 0.8, "fr": -0.8, "rl": 0.75, "rr": -0.75}.items()
+    }
+    channels = {"vx_ref": u, "yaw_rate": turn, "steer": np.zeros(2000), **wheels}
+    assert vehicle.tracks_of(Recording("rolls", "race car", 20.0, 0.0, channels, "simulated")) == pytest.approx((1.6, 1.5))
