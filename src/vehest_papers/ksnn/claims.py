@@ -68,7 +68,7 @@ def on_accuracy(schemes: Sequence[Scheme]) -> list[Statement | Claim]:
         ),
         Statement("not in the paper: below the static map", "–", data, _pairs(schemes, (paper.NONLINEAR,), paper.STATIC_MAP, "lower")),
         *[_few_parameters(scheme) for scheme in schemes],
-        Statement("best linear within 2 % RMSE(v) of best nonlinear", "+2; +1 %", data, _linear(schemes)),
+        Statement("best linear at most 2 % above best nonlinear in RMSE(v)", "+2; +1 %", data, _linear(schemes)),
         _most_specialised(schemes),
         _third_car(schemes),
     ]
