@@ -50,7 +50,7 @@ MOST_LOST = 10  # of machines under one group
 POLL_SECONDS = 0.2
 LOOK_SECONDS = 2.0  # between two looks at which machines are there
 SILENT = 4  # exchanges that fail one after another, half a minute each at most, after which the parent is gone
-BEATS_A_SECOND = 400.0  # of all workers together, which the board takes with ease
+BEATS_A_SECOND = 200.0  # of all workers together, which the board takes with ease
 OWN_RAY = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
