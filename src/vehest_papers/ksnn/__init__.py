@@ -1,11 +1,12 @@
 """Every table and figure of Da Lio, Piccinini and Biral 2023, on the parts of a pipeline such as ``ksnn``.
 
-Parts it knows: ``scheme_1`` and ``scheme_2``, which it needs; ``one_vehicle``, ``ferrari_drive``, ``ferrari_whole``, ``devbot_ferrari`` and
-``ferrari_devbot``, which it goes on without. Test sets of the schemes are called ``c2`` and ``f2``.
+It needs parts ``scheme_1`` and ``scheme_2``, whose test sets are called ``c2`` and ``f2``, and goes on without all others of that
+pipeline: ablations, fewer minutes, with and without the steering angle, real cars, pairs of small cars.
 """
 
 from vehest_papers.ksnn.document import documents
 
 TAKES = "parts"
+METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
 
 __all__ = ["TAKES", "documents"]
