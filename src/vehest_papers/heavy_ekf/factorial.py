@@ -167,7 +167,7 @@ def changes(cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]) -> dict[tup
         factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(asked))
         low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
         other = math.sqrt(float(cells[key[0]].squared[key[1][1]].mean()))
-        found[key] = Change(100.0 * own.value / other, 100.0 * low / other, 100.0 * high / other, p_value < 1.0 - CONFIDENCE)
+        found[key] = Change(100.0 * own.value / other, max(100.0 * low / other, -100.0), 100.0 * high / other, p_value < 1.0 - CONFIDENCE)
     return found
 
 

@@ -164,7 +164,7 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
             level = -paper.GAINS[pair]
             if values[pair].min() < level < values[pair].max():
                 lines = axes.contour(values[pair], levels=[level], colors="black", linewidths=1.4)
-                axes.clabel(lines, fmt=f"{level:.0f} %", fontsize=6.5)
+                axes.clabel(lines, fmt=lambda at: f"{at:.0f} %", fontsize=6.5)
             axes.set_title(f"{pair[0]} against {pair[1]}; paper −{paper.GAINS[pair]:.0f} %", loc="left")
             axes.set_xticks(range(len(SLIPS)), [f"{slip:g}" for slip in SLIPS])
             axes.set_xlabel("largest rear slip [deg]")
