@@ -108,7 +108,7 @@ learned_ukf: $(INSTALLED) ## the tables and figures of the learned UKF's paper, 
 learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with smaller budgets
 	$(BIN)/vehest run pipelines/learned_ukf_sim.yaml
 
-heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA: below an hour
+heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
 cnn_ukf: $(INSTALLED) ## the tables and figures of the UKF-informed network's paper, simulated, and the real Ferrari with VEHEST_DATA: hours

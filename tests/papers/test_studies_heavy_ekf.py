@@ -139,3 +139,8 @@ def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
     rolling = Recording("rolls", "truck", RATE, 0.0, {**drive.channels, **wheels}, "simulated")
     front, rear = vehicle.tracks_of(rolling)
     assert (front, rear) == pytest.approx((2.08, 2.08), rel=0.02)
+
+
+def test_an_axle_whose_wheels_turn_alike_is_named_and_not_corrected() -> None:
+    assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
+    assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""

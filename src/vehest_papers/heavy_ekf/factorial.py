@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ from vehest_papers.heavy_ekf.twin import CURVES, TRUCK, Conditions, Drive, drive
 SLIPS = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)  # deg
 MISMATCHES = (-0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2)
 SEEDS = 20
-PLANTS = tuple(itertools.product((False, True), repeat=3))
+PLANTS = tuple((payload, wet, crossfall) for payload in (False, True) for wet in (False, True) for crossfall in (False, True))
 """Payload, wet patches, crossfall: each without and with."""
 PLAIN = PLANTS[0]
 ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"
@@ -160,14 +159,15 @@ def changes(cells: Sequence[Cell], pairs: Sequence[tuple[str, str]]) -> dict[tup
     asked = [(at, pair) for at in range(len(cells)) for pair in pairs]
     size = np.ones(SEEDS)
     differences = [
-        difference_of_blocks(*(cells[at].squared[name][None] for name in pair), sizes=size, n_resamples=2000).root for at, pair in asked
+        difference_of_blocks(cells[at].squared[first][None], cells[at].squared[second][None], size, n_resamples=2000).root
+        for at, (first, second) in asked
     ]
     found = {}
     for key, own, p_value in zip(asked, differences, holm([own.p_value for own in differences]), strict=True):
         factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(asked))
         low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
         other = math.sqrt(float(cells[key[0]].squared[key[1][1]].mean()))
-        found[key] = Change(100.0 * own.value / other, 100.0 * low / other, 100.0 * high / other, p_value < 1.0 - CONFIDENCE)
+        found[key] = Change(100.0 * own.value / other, max(100.0 * low / other, -100.0), 100.0 * high / other, p_value < 1.0 - CONFIDENCE)
     return found
 
 

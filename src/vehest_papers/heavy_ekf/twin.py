@@ -81,8 +81,9 @@ class Plant:
         inertia = TRUCK.yaw_inertia + TRUCK.mass * behind**2 + PAYLOAD * (PAYLOAD_BEHIND - behind) ** 2
         front, rear = TRUCK.cg_to_front_axle + behind, TRUCK.cg_to_rear_axle - behind
         height = (TRUCK.mass * CG_HEIGHT + PAYLOAD * PAYLOAD_HEIGHT) / mass
-        loads = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle), mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
-        return cls(replace(TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear), *loads, height)
+        at_front, at_rear = mass * rear / (TRUCK.mass * TRUCK.cg_to_rear_axle), mass * front / (TRUCK.mass * TRUCK.cg_to_front_axle)
+        car = replace(TRUCK, mass=mass, yaw_inertia=inertia, cg_to_front_axle=front, cg_to_rear_axle=rear)
+        return cls(car, float(at_front), float(at_rear), float(height))
 
     @property
     def roll_over(self) -> float:

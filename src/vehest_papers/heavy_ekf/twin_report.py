@@ -150,19 +150,21 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.1)
         panels = figure.subplots(1, 2, sharey=True)
-        colours = ScalarMappable(Normalize(-LIMIT, LIMIT), "RdBu_r")
+        colours: Any = ScalarMappable(Normalize(-LIMIT, LIMIT), "RdBu_r")
         for axes, pair in zip(panels, CLAIMED, strict=True):
             for (row, column), value in np.ndenumerate(values[pair]):
                 colour = colours.to_rgba(float(np.clip(value, -LIMIT, LIMIT)))
                 told = bool(apart[pair][row, column])
-                box = {"facecolor": colour, "edgecolor": "white" if told else "#333333", "linewidth": 0.8 if told else 0.0}
-                axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, hatch=None if told else "////", **box))
+                box = Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8)
+                if not told:
+                    box.set(hatch="////", edgecolor="#333333", linewidth=0.0)
+                axes.add_patch(box)
                 ink = "white" if abs(value) > 65.0 else "#111111"
                 axes.text(column, row, fixed(float(value), 0), ha="center", va="center", fontsize=6.5, color=ink)
             level = -paper.GAINS[pair]
             if values[pair].min() < level < values[pair].max():
                 lines = axes.contour(values[pair], levels=[level], colors="black", linewidths=1.4)
-                axes.clabel(lines, fmt=f"{level:.0f} %", fontsize=6.5)
+                axes.clabel(lines, fmt=lambda at: f"{at:.0f} %", fontsize=6.5)
             axes.set_title(f"{pair[0]} against {pair[1]}; paper −{paper.GAINS[pair]:.0f} %", loc="left")
             axes.set_xticks(range(len(SLIPS)), [f"{slip:g}" for slip in SLIPS])
             axes.set_xlabel("largest rear slip [deg]")

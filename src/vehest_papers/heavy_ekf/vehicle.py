@@ -25,6 +25,7 @@ WHEELS = ("fl", "fr", "rl", "rr")
 RADIUS = 0.2972  # m, of the AV-21, as in conf/dataset/av21.yaml
 BLOCK_SECONDS = 10.0
 SLOWEST = 5.0  # m/s
+LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns as one
 
 
 def table_2(car: SingleTrackParameters) -> Table:
@@ -94,7 +95,8 @@ def tracks_of(drive: Recording) -> tuple[float, float]:
 def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
     """Eqs. 61 to 64 on the AV-21's wheel speeds: tracks from the training range, then the test ranges."""
     tracks = np.mean([tracks_of(drive) for drive in recordings_of(part, part.split.train)], axis=0)
-    wheels = SpeedFromWheels(wheel_radius=RADIUS, track_front=float(tracks[0]), track_rear=float(tracks[1]))
+    turning = np.where(tracks > LOCKED, tracks, 0.0)
+    wheels = SpeedFromWheels(wheel_radius=RADIUS, track_front=float(turning[0]), track_rear=float(turning[1]))
     rows, claims = [], []
     for test, spans in part.split.tests.items():
         parts = [drive for drive in recordings_of(part, spans) if (drive["vx_ref"] > SLOWEST).any()]
@@ -130,9 +132,18 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         "about their mean, and their mean against "
         "the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by least squares, "
         f"{fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
-        "Its yaw rate is low-passed by 0.4 s."
+        f"{_locked_in_words(tracks)}Its yaw rate is low-passed by 0.4 s."
     )
     return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)], claims
+
+
+def _locked_in_words(tracks: FloatArray) -> str:
+    """Which axles turn as one, where the equations would add a difference that is not there."""
+    axles = zip(("front", "rear"), ("61, 62", "63, 64"), tracks, strict=True)
+    locked = [f"{name} (Eqs. {which})" for name, which, track in axles if track <= LOCKED]
+    return (
+        f"The wheels of the {' and '.join(locked)} axle turn alike, as with a locked differential: it is left as it is. " if locked else ""
+    )
 
 
 def block_sums(drive: Recording, wheels: SpeedFromWheels) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
