@@ -157,7 +157,7 @@ def _of_table_one(page: str, drives: Mapping[str, Mapping[str, Sequence[Recordin
             wanted = published[name]
             room = within * abs(wanted) if how == "relative" else within
             values = {dataset: own[name] for dataset, own in ours.items()}
-            found.append(Gate(paper.name, title, f"{wanted:.3g}", wanted - room, wanted + room, values))
+            found.append(Gate(paper.name, title, f"{wanted:.3g}".replace("-", "−"), wanted - room, wanted + room, values))
     return found
 
 

@@ -122,6 +122,7 @@ PROFILES: Mapping[str, Profile] = {
         limit_label="paper, 99 % of F-2",
         counterpart="ferrari_250lm",
     ),
+    "jaguar_e_type": Profile(title="Jaguar E-type-like race car", rate_hz=20.0),
     "bmw_545i": Profile(
         title="BMW 545i-like car",
         source="Bertipaglia, Alirezaei, Happee and Shyrokau 2024",
