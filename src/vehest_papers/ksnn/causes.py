@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 
 from vehest.report.document import Column, Table
@@ -19,6 +20,7 @@ CAUSES = {"same_sensors": "the same sensors", "same_tyres": "the same tyres", "s
 
 ORDER = tuple((name, paper.LUENBERGER) for name in paper.WITHOUT_BIAS) + tuple((paper.LUENBERGER, name) for name in paper.PLAIN)
 """Lower and higher FVU on the other car, as in both of the paper's schemes."""
+NETWORKS = (*paper.WITHOUT_BIAS, *paper.WITH_BIAS, *paper.PLAIN)
 IN_WORDS = "KS-NN without biases before Luenberger before GRU and LSTM"
 
 
@@ -91,8 +93,9 @@ def causes_in_words(schemes: Sequence[Scheme], found: Mapping[str, Order], ablat
         states = {cause: order for cause, own in without.items() for name, order in own.items() if name.endswith(number)}
         if not states:
             continue
-        listing = "; ".join(f"with {CAUSES[cause]} it {order}" for cause, order in states.items())
-        sentence = f"{scheme.title}: with all differences the order {found[scheme.name]}; {listing}."
+        same = {order: [CAUSES[cause] for cause, own in states.items() if own == order] for order in dict.fromkeys(states.values())}
+        listing = "; ".join(f"with {listed(own)} it {order}" for order, own in same.items())
+        sentence = f"{scheme.title}: the order {found[scheme.name]}; {listing}."
         if found[scheme.name] == "comes out":
             lost = [CAUSES[cause] for cause, order in states.items() if order != "comes out"]
             sentence += (
@@ -104,7 +107,27 @@ def causes_in_words(schemes: Sequence[Scheme], found: Mapping[str, Order], ablat
             gained = [CAUSES[cause] for cause, order in states.items() if order == "comes out"]
             sentence += f" What stands against it is the difference that {listed(gained)} take away."
         sentences.append(sentence)
-    return "**Causes, one taken away at a time.** " + " ".join(sentences)
+    return "**Causes, one taken away at a time.** " + " ".join([*sentences, *_what_is_left(schemes, ablations)])
+
+
+def _what_is_left(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Scheme]]) -> list[str]:
+    """How far networks' FVU on the other car changes with each cause taken away, the median over families and schemes."""
+    numbered = {scheme.name[-1]: scheme for scheme in schemes}
+    shares: dict[str, float] = {}
+    for cause, own in ablations.items():
+        pairs = [(scheme, numbered[scheme.name[-1]]) for scheme in own if scheme.name[-1] in numbered]
+        ratios = [
+            scheme.errors(scheme.other).value(scheme.name_of(name), "fvu") / whole.errors(whole.other).value(whole.name_of(name), "fvu")
+            for scheme, whole in pairs
+            for name in NETWORKS
+            if name in scheme.chosen and name in whole.chosen
+        ]
+        if ratios:
+            shares[cause] = float(np.median(ratios))
+    if not shares:
+        return []
+    listing = ", ".join(f"{100.0 * share:.0f} % with {CAUSES[cause]}" for cause, share in sorted(shares.items(), key=lambda item: item[1]))
+    return [f"Of the networks' FVU on the other car there remains, median over families and schemes: {listing}."]
 
 
 def causes_table(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Scheme]]) -> Table:

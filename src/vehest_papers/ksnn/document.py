@@ -123,7 +123,8 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
     words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
     others = {kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind] for kind in kinds.values() if kind != schemes}
     if others:
-        words += " " + " ".join(f"{kind.capitalize()}: {'; '.join(titles)}." for kind, titles in others.items())
+        counts = listed([f"{len(titles)} {kind}" for kind, titles in others.items()])
+        words += f" Of the other parts {counts}; the table of parts in the appendix says which."
     if artefacts.absent:
         absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
         words += f" Not in this report, since the recordings were not at hand: {absent}."
