@@ -123,8 +123,8 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
     words = f"**{schemes.upper()}:** the cars of both schemes are {schemes}; the paper's are real."
     others = {kind: [artefacts.titles[name] for name in kinds if kinds[name] == kind] for kind in kinds.values() if kind != schemes}
     if others:
-        counts = listed([f"{len(titles)} {kind}" for kind, titles in others.items()])
-        words += f" Of the other parts {counts}; the table of parts in the appendix says which."
+        counts = listed([f"{len(titles)} are {kind}" for kind, titles in others.items()])
+        words += f" Of the other parts {counts}: see the appendix."
     if artefacts.absent:
         absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
         words += f" Not in this report, since the recordings were not at hand: {absent}."
@@ -135,8 +135,7 @@ def _note(schemes: Sequence[Scheme]) -> str:
     seeds = max(len(scheme.models(category)) for scheme in schemes for category in scheme.chosen)
     return (
         f"Changes are relative, from the second to the first. Of each category the structure that validation chooses, over all its seeds "
-        f"(up to {seeds}); S1, S2: schemes. Own car: learnt on; other: stopped on. Here each statement is corrected for its own "
-        f"comparisons."
+        f"(up to {seeds}); S1, S2: schemes. Own car: learnt on; other: stopped on."
     )
 
 
