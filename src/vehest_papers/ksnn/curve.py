@@ -10,14 +10,16 @@ import pandas as pd
 
 from vehest.evaluation.blocks import Segments
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, legend_above, line_of, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure, paper_style
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.kit.reference_minutes import minutes_of
+from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 from vehest_papers.ksnn.comparing import Errors
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
 NAMED = re.compile(r"minutes_([\d.]+)(?:_[a-z])?")
+MAP_LINE = Line("#222222", "dotted", "")
 TESTS = {"own": "own car", "other": "other car"}
 
 
@@ -78,7 +80,7 @@ def curve_table(curve: Curve) -> Table:
 
 
 def curve_figure(curve: Curve) -> Figure:
-    """Figure ``minutes``: FVU over minutes, a panel a car."""
+    """Figure ``minutes``: FVU over minutes, a panel a car; of the baselines the static map, as a level that has no colour of its own."""
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 2.6)
         panels = figure.subplots(1, 2, sharey=True)
@@ -88,9 +90,9 @@ def curve_figure(curve: Curve) -> Figure:
                 points = [
                     (float(minutes), own) for minutes in curve.minutes if (own := errors.get(f"{category}@{minutes}", "fvu")) is not None
                 ]
-                if not points:
+                if not points or category in (paper.ZERO, paper.KINEMATIC):
                     continue
-                line = line_of(*name)
+                line = line_of(*name) if category != paper.STATIC_MAP else MAP_LINE
                 values = [own.value for _, own in points]
                 ends = [own.interval for _, own in points]
                 bars = [
@@ -116,5 +118,5 @@ def curve_figure(curve: Curve) -> Figure:
             axes.minorticks_off()
         panels[0].set_ylabel("FVU")
         legend_above(figure, panels[0], columns=4)
-    caption = "FVU by the minutes of recordings learnt and stopped on, scheme 2, with 95 % intervals; logarithmic axes."
+    caption = "FVU by the minutes of recordings learnt and stopped on, scheme 2, with 95 % intervals; v = 0 leaves 1. Logarithmic axes."
     return Figure("minutes", caption, figure)
