@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from vehest.evaluation.ranking import Name, Ranking
-from vehest.report.document import Block, as_text
+from vehest.report.document import Table, as_text
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.claims import Claim, bound_claim, claims_table, order_claim
 from vehest.studies.kit.reading import words_of_kinds
@@ -33,8 +33,8 @@ def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
     return {test: ranking_of(part, test, asked=asked) for test in part.split.tests}
 
 
-def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> list[Block]:
-    """The table of claims, those of the tests before ``others``, then a sentence a test on who may be called best."""
+def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> tuple[Table, str]:
+    """The table of claims, those of the tests before ``others``, and a sentence a test on who may be called best."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
     data = words_of_kinds(truck)
@@ -55,7 +55,7 @@ def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: S
         "The paper's recordings are real, of another vehicle. Twin: the paper's own single track as the plant, below; its intervals are "
         "paired over seeds."
     )
-    return [claims_table([*claims, *others], note), "\n\n".join(sentences)]
+    return claims_table([*claims, *others], note), "\n\n".join(sentences)
 
 
 def warnings_in_words(parts: Sequence[tuple[str, PartArtefacts]]) -> str:

@@ -53,15 +53,17 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     lap_blocks, lap_claims = _lap_by_lap(filters, drives, estimates)
     others = [*twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
     warned = claims.warnings_in_words([(artefacts.titles[name], part) for name, part in artefacts.parts.items() if name != WHEELED])
+    claimed, best = claims.claims_blocks(truck, real, others)
     blocks: list[Block] = [
         *_asked(artefacts),
-        *claims.claims_blocks(truck, real, others),
+        claimed,
         *[block for block in of_ferrari if _is_real_trace(block)],
         tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
         *twin_front,
-        *lap_blocks,
+        f"## Appendix: who may be called best\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
         *twin_appendix,
+        *lap_blocks,
         "## Appendix: the vehicle",
         vehicle.table_2(filters[paper.RATTE].fitted.settings.car),
         vehicle.eigenvalues_table(filters[paper.RATTE].fitted.settings.car),
@@ -81,7 +83,7 @@ def _lap_by_lap(
     names = [name for name in paper.ORDER if name in filters]
     gains = accuracy.gains_of(drives, estimates, names)
     blocks: list[Block] = [
-        "## Lap by lap, underestimation, and the stop",
+        "## Appendix: lap by lap, underestimation, and the stop",
         accuracy.per_lap_table(drives, estimates, names, slowest),
         accuracy.underestimation_table(gains, names),
         accuracy.stop_table(drives, estimates, names),
@@ -117,6 +119,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         "Axle curves are fitted by least squares to training drives, the truck's to those on nominal tyres; levels of noise are those with "
         "the smallest error on all training drives, the truck's on nominal and on worn tyres, since a filter that is to adapt has to be "
         "tuned where there is something to adapt to. The tests are other drives, and choose nothing.",
+        _limits_in_words(artefacts),
         *facts,
     ]
     rows = pd.DataFrame(
@@ -147,6 +150,17 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         departures,
         Table("ranges", "What was used for what.", rows, columns),
     ]
+
+
+def _limits_in_words(artefacts: StudyArtefacts) -> str:
+    """Which searches for levels of noise ended on a limit of their box."""
+    found = [
+        f"{artefacts.titles[name]}, {paper.VARIANTS.get(model.variant, model.variant)} ({model.fit_metrics()['levels_at_limits']:g} level)"
+        for name, part in artefacts.parts.items()
+        for model in part.models
+        if model.fit_metrics().get("levels_at_limits", 0.0) > 0.0
+    ]
+    return f"Searches for levels of noise that ended on a limit of their box, six to nine decades wide: {'; '.join(found) or 'none'}."
 
 
 def _truck(

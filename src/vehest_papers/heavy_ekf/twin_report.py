@@ -78,21 +78,22 @@ def twin_blocks(own: Factorial) -> tuple[list[Block], list[Claim], dict[str, pd.
     """What stands in front, the claims, tables that are written alone, and the appendix."""
     cells = _flat(own.grid())
     found = changes(cells, PAIRS)
+    absorbed_table, absorbed_words = _absorbed_blocks(own)
     front: list[Block] = [
         "## Where RATTE beats RATT and LINT",
         ASKED_BEFOREHAND,
         _map(cells, found, "twin_map", ONCE),
         _in_words(found),
-        _rows(own),
-        _regions(own),
         _crossfall_in_words(own),
-        "## What RATTE absorbs",
-        *_absorbed_blocks(own),
+        absorbed_words,
+        _rows(own),
     ]
     plain = _flat(own.grid(PLAIN, PLAIN_ONLY))
     appendix: list[Block] = [
         "## Appendix: the twin",
         _plant_in_words(own),
+        _regions(own),
+        absorbed_table,
         _tuning(own),
         _map(plain, changes(plain, PAIRS), "twin_map_plain", PLAIN_ONLY),
     ]
@@ -265,6 +266,13 @@ def _plant_name(plant: tuple[bool, bool, bool]) -> str:
 
 
 def _crossfall_in_words(own: Factorial) -> str:
+    """Where the region goes with the road, and what a state of crossfall does."""
+    moved = []
+    for plant in ((False, False, True), (False, True, False), (True, False, False)):
+        cells = _flat(own.grid(plant))
+        found = changes(cells, CLAIMED)
+        better = [_counts(cells, found, pair)[:2] for pair in CLAIMED]
+        moved.append(f"{_plant_name(plant)}: {better[0][0]} and {better[1][0]} (above in {better[0][1]} and {better[1][1]})")
     parts = []
     for plant in ((False, False, True), (True, True, True)):
         cells = _flat(own.grid(plant))
@@ -277,13 +285,14 @@ def _crossfall_in_words(own: Factorial) -> str:
             f"{fixed(medians[2], 2)}°"
         )
     return (
+        f"Cells of {len(SLIPS) * len(MISMATCHES)} in which RATTE lies below RATT and below LINT on other roads: " + "; ".join(moved) + ". "
         "One state for the pull of the crossfall does more than the curve of the tyre: medians of RMSE(β) over the cells, "
         + "; ".join(parts)
         + "."
     )
 
 
-def _absorbed_blocks(own: Factorial) -> list[Block]:
+def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
     levels = {name: tuned.levels for name, tuned in own.tuned[ONCE].items()}
     frame = absorbed(levels)
     frame["interval"] = [f"{fixed(row['change'], 0)} [{fixed(row['low'], 0)}, {fixed(row['high'], 0)}]" for row in frame.to_dict("records")]
@@ -318,7 +327,7 @@ def _absorbed_blocks(own: Factorial) -> list[Block]:
         )
     if harmed:
         words += "Adapting harms under: " + "; ".join(harmed) + "."
-    return [Table("twin_absorbed", caption, frame, columns), words or "Neither gain nor harm is told apart."]
+    return Table("twin_absorbed", caption, frame, columns), "**What RATTE absorbs.** " + (words or "Neither gain nor harm is told apart.")
 
 
 def _plant_in_words(own: Factorial) -> str:
