@@ -453,7 +453,7 @@ def test_everything_switched_off_shows_the_motion() -> None:
     assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
 
 
-@pytest.mark.parametrize("name", ["az", "ay.bias", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""])
+@pytest.mark.parametrize("name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""])
 def test_switching_off_what_there_is_not_names_what_there_is(name: str) -> None:
     with pytest.raises(ConfigurationError, match="cannot switch off") as error:
         switched_off(SensorLevels(), name)
@@ -517,7 +517,7 @@ def test_reference_kinds_are_different() -> None:
         ("[race]", "sensors is the name of a preset"),
         ("{preset: perfect}", "sensors 'perfect' is not one of"),
         ("{az: {noise: 0}}", "sensors: 'az' is not one of: vx, yaw_rate"),
-        ("{ay: {bias: 0}}", "sensors: ay: 'bias' is not one of: noise, offset"),
+        ("{ay: {slope: 0}}", "sensors: ay: 'slope' is not one of: noise, offset"),
         ("{ay: {noise: loud}}", "sensors: ay.noise is a number, not 'loud'"),
         ("{ay: {noise: true}}", "sensors: ay.noise is a number, not True"),
         ("{ay: {noise: -1}}", "sensors: ay: noise must be zero or positive, not -1.0"),
@@ -532,7 +532,7 @@ def test_reference_kinds_are_different() -> None:
         ("{reference: {kind: [radar]}}", "is not one of: optical, gnss, motion_capture, ideal"),
         ("{reference: {vz: {noise: 1}}}", "sensors: reference: 'vz' is not one of"),
         ("{reference: {heading: {delay: 1}}}", "sensors: reference: heading has noise, offset and drift only"),
-        ("{switched_off: [ay.bias]}", "sensors: cannot switch off 'ay.bias': 'bias' is not one of: noise, offset"),
+        ("{switched_off: [ay.slope]}", "sensors: cannot switch off 'ay.slope': 'slope' is not one of: noise, offset"),
         ("{switched_off: 3}", "switched_off is a list of names"),
     ],
 )

@@ -20,8 +20,8 @@ from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
-OURS = ("corvette_grand_sport", "ferrari_250_lm", "jaguar_e_type", "bmw_545i", "heavy_truck")
-ALL = (*OURS, "bmw_320i_low")
+OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")
+ALL = (*OURS, "bmw_320i_low", "jaguar_e_type")
 
 each_vehicle = pytest.mark.parametrize("name", ALL)
 each_of_ours = pytest.mark.parametrize("name", OURS)
@@ -78,7 +78,8 @@ def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_track
 def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name: str) -> None:
     ramp, plant = ramp_of(name), plant_of(name)
     angle, limit = understeer_angle(ramp, plant.wheelbase), int(np.argmax(ramp.ay))
-    wanted = np.arange(0.5, 0.99 * ramp.ay[limit], 0.25)
+    share = 0.95 if name == "jaguar_e_type" else 0.99  # its rear bends as early as its front: at the limit it turns neutral
+    wanted = np.arange(0.5, share * ramp.ay[limit], 0.25)
     at_wanted = np.interp(wanted, np.maximum.accumulate(ramp.ay[:limit]), angle[:limit])
     assert at_wanted[0] > 0.0
     assert (np.diff(at_wanted) > 0.0).all()
@@ -121,6 +122,23 @@ def test_understeer_and_roll_gradients_are_a_cars_usual_ones(name: str) -> None:
     for angle, smallest, largest in ((understeer_angle(ramp, plant.wheelbase), 0.5, 1.5), (ramp.roll, 1.5, 4.5)):
         gradient = np.polyfit(ramp.ay[low], angle[low], 1)[0]
         assert smallest < math.degrees(gradient) * GRAVITY < largest  # degrees at 1 g
+
+
+def test_the_third_race_car_hardly_understeers_and_has_a_race_cars_springs() -> None:
+    ramp, plant = ramp_of("jaguar_e_type"), plant_of("jaguar_e_type")
+    low = (ramp.ay > 1.0) & (ramp.ay < 3.0)
+    gradient = np.polyfit(ramp.ay[low], understeer_angle(ramp, plant.wheelbase)[low], 1)[0]
+    others = [
+        np.polyfit(ramp_of(name).ay[part], understeer_angle(ramp_of(name), plant_of(name).wheelbase)[part], 1)[0]
+        for name in ("corvette_grand_sport", "ferrari_250_lm")
+        for part in [(ramp_of(name).ay > 1.0) & (ramp_of(name).ay < 3.0)]
+    ]
+    assert 0.0 < gradient < min(others)
+    front, rear = cornering_stiffnesses(plant)
+    mass, a, b = plant.parameters.m, plant.parameters.a, plant.parameters.b
+    assert gradient == pytest.approx(mass / (a + b) * (b / front - a / rear), rel=0.5)  # of tyres alone, without load transfer and camber
+    bounce = [mode for mode in suspension_modes(plant) if abs(mode) < 2.0 * math.pi * 5.0 and mode.imag > 0.0][:2]
+    assert all(2.0 < abs(mode) / (2.0 * math.pi) < 4.0 for mode in bounce)
 
 
 # --- loads
@@ -183,7 +201,7 @@ def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name: str) ->
 @each_vehicle
 def test_body_bounces_at_a_plausible_frequency_and_damping(name: str) -> None:
     plant = plant_of(name)
-    low, high = (2.0, 4.0) if name in ("corvette_grand_sport", "ferrari_250_lm") else (1.0, 2.0)
+    low, high = (2.0, 4.0) if name in ("corvette_grand_sport", "ferrari_250_lm", "jaguar_e_type") else (1.0, 2.0)
     bounce = [mode for mode in suspension_modes(plant) if abs(mode) < 2.0 * math.pi * 5.0 and mode.imag > 0.0][:2]
     assert len(bounce) == 2  # heave and pitch
     for mode in bounce:
