@@ -379,11 +379,11 @@ def test_a_static_map_explains_all_of_a_car_that_is_one() -> None:
     own = _set("f1", 1)
     exact = own["yaw_rate"] * (1.07 - 0.005 * own["vx"] ** 2)
     mapped = replace(own, channels={**own.channels, "vy_ref": exact})
-    assert gates.static_map_left([mapped]) < 1e-20
+    assert gates.left_by(gates.static_map_of([mapped]), [mapped]) < 1e-20
     noisy = replace(
         own, channels={**own.channels, "vy_ref": exact + 0.3 * np.std(exact) * np.random.default_rng(0).standard_normal(len(exact))}
     )
-    assert gates.static_map_left([noisy]) == pytest.approx(0.09 / 1.09, rel=0.1)
+    assert gates.left_by(gates.static_map_of([noisy]), [noisy]) == pytest.approx(0.09 / 1.09, rel=0.1)
 
 
 def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path) -> None:

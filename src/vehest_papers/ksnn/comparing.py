@@ -12,7 +12,7 @@ from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.evaluation.blocks import LEAST_BLOCKS, SEGMENT_SECONDS, Segments, block_labels, block_sums
+from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest.report.style import fixed
 
@@ -218,25 +218,18 @@ def masked_segments(parts: Sequence[Scored], masks: Sequence[FloatArray], rate_h
         masks: of each, which samples count, (K,), 0 or 1.
         rate_hz: of the scored samples [Hz].
     """
-    steps = max(round(SEGMENT_SECONDS * rate_hz), 1)
-    columns: dict[str, list[FloatArray]] = {}
-    for position, (part, mask) in enumerate(zip(parts, masks, strict=True)):
-        starts = np.arange(0, len(part.time), steps)
-        turn = np.remainder(part.sideslip - part.sideslip_ref + math.pi, 2.0 * math.pi) - math.pi
-        error = part.vy - part.vy_ref
-        summed = {
-            "samples": np.ones_like(error),
-            "squared_error_vy": np.square(error),
-            "squared_error_sideslip": np.square(np.degrees(turn)),
-            "error_vy": error,
-            "vy_ref": part.vy_ref,
-            "squared_vy_ref": np.square(part.vy_ref),
-        }
-        own = {name: np.add.reduceat(values * mask, starts) for name, values in summed.items()}
-        own |= {"piece": np.full(len(starts), float(position)), "start": part.time[starts]}
-        for name, values in own.items():
-            columns.setdefault(name, []).append(values)
-    return Segments(**{name: np.concatenate(values) for name, values in columns.items()})
+    marked = list(zip(parts, masks, strict=True))
+    chosen = segments_of(
+        [
+            replace(
+                part, vy=part.vy * mask, vy_ref=part.vy_ref * mask, sideslip=part.sideslip * mask, sideslip_ref=part.sideslip_ref * mask
+            )
+            for part, mask in marked
+        ],
+        rate_hz,
+    )
+    counts = segments_of([replace(part, vy_ref=np.asarray(mask, dtype=np.float64)) for part, mask in marked], rate_hz).vy_ref
+    return replace(chosen, samples=counts)
 
 
 def yaw_rates(parts: Sequence[Scored], recordings: Sequence[Recording]) -> list[FloatArray]:

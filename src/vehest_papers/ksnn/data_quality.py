@@ -92,7 +92,7 @@ def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[B
     for recording in (recording for recordings in sets.values() for recording in recordings):
         groups.setdefault((recording.vehicle, recording.kind), []).append(recording)
     ordered = dict(sorted(groups.items(), key=lambda item: (item[0][1], "ferrari" not in item[0][0].lower(), item[0][0])))
-    spectra = {group: _spectra(recordings) for group, recordings in ordered.items()}
+    spectra = {group: spectra_of(recordings) for group, recordings in ordered.items()}
     return [
         _table(sets, source),
         _figure_4(ordered, spectra, source),
@@ -142,8 +142,8 @@ def _row(name: str, data: str, vehicle: str, own: Statistics) -> dict[str, objec
     }
 
 
-def _spectra(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
-    """Of the rate of v and of the process noise."""
+def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
+    """Periodograms of dv/dt and of the process noise dv/dt - (a_y - ωu) [(m/s²)²/Hz] of recordings at one rate."""
     rate_hz = recordings[0].rate_hz
     return (
         periodogram([lateral_velocity_rate(own) for own in recordings], rate_hz),

@@ -6,19 +6,21 @@ error is among them but that of the static map on its own car, which says how mu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import pandas as pd
 
-from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
-from vehest.evaluation.spectra import SEGMENT_SECONDS, Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest.estimators.static_map import StaticMap, StaticMapSettings
+from vehest.evaluation.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import StoredDataset
+from vehest_papers.ksnn.data_quality import PUBLISHED, PUBLISHED_BIAS, Statistics, spectra_of, statistics
 from vehest_papers.proving_ground.papers import PROFILES
 from vehest_papers.proving_ground.tally import MOVING
 
@@ -32,24 +34,22 @@ SPECTRUM_DB = 3.0
 MAP_RANGE = (0.08, 0.13)
 """FVU of a static map fitted on the car itself; the real Ferrari: 0.10."""
 BIAS_WITHIN = 0.03
-BIASES = {"c": 0.10, "f": -0.03}
-"""Mean of dv/dt - (ay - ωu) by car [m/s²] (Section VII-A1)."""
 CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}
 """First letter of a drive -> the car that it is like."""
 
 READ_AT_HZ = (0.1, 0.3, 1.0)
 
 QUANTITIES = {
-    "vy_q01": ("v, 1 % quantile [m/s]", "relative", 0.20),
-    "vy_q99": ("v, 99 % quantile [m/s]", "relative", 0.20),
-    "ay_abs_q99": ("|ay|, 99 % quantile [m/s²]", "relative", 0.05),
+    "v_low": ("v, 1 % quantile [m/s]", "relative", 0.20),
+    "v_high": ("v, 99 % quantile [m/s]", "relative", 0.20),
+    "ay": ("|ay|, 99 % quantile [m/s²]", "relative", 0.05),
     "ratio": ("v over ay, 1 to 99 % [s]", "relative", 0.20),
-    "vx_min": ("lowest speed [m/s]", "absolute", 4.0),
-    "vx_max": ("highest speed [m/s]", "absolute", 5.0),
+    "u_min": ("lowest speed [m/s]", "absolute", 4.0),
+    "u_max": ("highest speed [m/s]", "absolute", 5.0),
     "yaw_rate_min": ("lowest yaw rate [rad/s]", "relative", 0.15),
     "yaw_rate_max": ("highest yaw rate [rad/s]", "relative", 0.15),
-    "distance": ("length [km]", "relative", 0.05),
-    "duration": ("duration [min]", "relative", 0.05),
+    "length_km": ("length [km]", "relative", 0.05),
+    "minutes": ("duration [min]", "relative", 0.05),
 }
 """Quantity of Table I -> its name, and how far from the paper's value it may lie: the paper's own two sets of a car are up to
 24 % apart in v, 2.4 % in ay, 30 % in the lowest speed and 7 % in the yaw rate."""
@@ -79,39 +79,23 @@ class Gate:
         return dataset in self.values and self.low <= self.values[dataset] <= self.high
 
 
-def static_map_left(recordings: Sequence[Recording]) -> float:
-    """FVU of v = r (b - k u²) with both numbers fitted by least squares on the very recordings."""
-    u, r, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "vy_ref"))
-    basis = np.stack([r, -r * u**2], axis=1)
-    left = v - basis @ np.linalg.lstsq(basis, v, rcond=None)[0]
-    return float(np.var(left) / np.var(v))
+def static_map_of(recordings: Sequence[Recording]) -> StaticMap:
+    """The baseline v = r (b - k u²) with both numbers fitted to recordings with vx, yaw_rate and vy_ref."""
+    fitted = StaticMap(StaticMapSettings(rate_hz=RATE_HZ))
+    fitted.values = fitted.best_numbers(recordings)
+    return fitted
 
 
-def table_one(recordings: Sequence[Recording]) -> dict[str, float]:
-    """The paper's Table I of some recordings at `RATE_HZ`, by the names of `QUANTITIES`."""
-    u, r, ay, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "ay", "vy_ref"))
-    low, high = np.quantile(v, [0.01, 0.99])
-    most = float(np.quantile(np.abs(ay), 0.99))
-    return {
-        "vy_q01": float(low),
-        "vy_q99": float(high),
-        "ay_abs_q99": most,
-        "ratio": float(high - low) / (2.0 * most),
-        "vx_min": float(u.min()),
-        "vx_max": float(u.max()),
-        "yaw_rate_min": float(r.min()),
-        "yaw_rate_max": float(r.max()),
-        "distance": sum(float(own["vx"].sum() / own.rate_hz) for own in recordings) / 1000.0,
-        "duration": sum(own.duration for own in recordings) / 60.0,
-    }
+def left_by(fitted: StaticMap, recordings: Sequence[Recording]) -> float:
+    """FVU of a static map on recordings [1]."""
+    vy = np.concatenate([own["vy_ref"] for own in recordings])
+    mapped = np.concatenate([fitted.lateral_velocity({name: own[name] for name in fitted.channels}) for own in recordings])
+    return float(np.var(vy - mapped) / np.var(vy))
 
 
-def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
-    """Of dv/dt, and of the process noise dv/dt - (ay - ωu)."""
-    rate = recordings[0].rate_hz
-    return periodogram([lateral_velocity_rate(own) for own in recordings], rate), periodogram(
-        [process_noise(own) for own in recordings], rate
-    )
+def _quantities(own: Statistics) -> dict[str, float]:
+    """A row of Table I by the names of `QUANTITIES`."""
+    return {**asdict(own), "ratio": (own.v_high - own.v_low) / (2.0 * own.ay)}
 
 
 def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> list[Gate]:
@@ -121,43 +105,44 @@ def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequenc
         drives: data set -> set of drives, ``c1`` say -> its recordings at `RATE_HZ`.
         real: the real Ferrari's, at the same rate; empty where it is not at hand, and the gate on its spectrum is then left out.
     """
-    found = [gate for page in ("corvette_grand_sport", "ferrari_250_lm") for gate in _of_table_one(page, drives)]
-    by_car = {
-        name: {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
-        for name, sets in drives.items()
-    }
+    found = [gate for name, published in PUBLISHED.items() for gate in _of_table_one(name, published, drives)]
+    by_car = {name: _by_car(sets) for name, sets in drives.items()}
+    real_map = f"{left_by(static_map_of(real), real):.2f} (real Ferrari)" if real else "–"
     for letter, car in CARS.items():
-        own = {name: cars[letter] for name, cars in by_car.items() if cars[letter]}
-        if letter in BIASES:
-            wanted = BIASES[letter]
-            values = {name: mean_bias(recordings) for name, recordings in own.items()}
-            found.append(
-                Gate(car, "mean bias of ay − ωu [m/s²]", f"{fixed(wanted, 2)}", wanted - BIAS_WITHIN, wanted + BIAS_WITHIN, values)
-            )
-        left = {name: static_map_left(recordings) for name, recordings in own.items()}
-        found.append(Gate(car, "FVU of the car's own static map", "0.10 (real Ferrari)", *MAP_RANGE, left))
+        own = {name: cars[letter] for name, cars in by_car.items() if letter in cars}
+        wanted = PUBLISHED_BIAS.get(car.lower())
+        if wanted is not None:
+            biases = {name: mean_bias(recordings) for name, recordings in own.items()}
+            found.append(Gate(car, "mean bias of ay − ωu [m/s²]", fixed(wanted, 2), wanted - BIAS_WITHIN, wanted + BIAS_WITHIN, biases))
+        left = {name: left_by(static_map_of(recordings), recordings) for name, recordings in own.items()}
+        found.append(Gate(car, "FVU of the car's own static map", real_map, *MAP_RANGE, left))
     if real:
         noise = spectra_of(real)[1]
+        own_noise = {name: spectra_of(cars["f"])[1] for name, cars in by_car.items() if "f" in cars}
         for hz in BANDS_HZ:
-            values = {name: decibels(spectra_of(cars["f"])[1].level(hz), noise.level(hz)) for name, cars in by_car.items() if cars["f"]}
-            found.append(
-                Gate("Ferrari", f"process noise at {hz:.2g} Hz, against the real one [dB]", "0", -SPECTRUM_DB, SPECTRUM_DB, values)
-            )
+            levels = {name: decibels(own.level(hz), noise.level(hz)) for name, own in own_noise.items()}
+            title = f"process noise at {hz:.2g} Hz, against the real one [dB]"
+            found.append(Gate("Ferrari", title, "0", -SPECTRUM_DB, SPECTRUM_DB, levels))
     return found
 
 
-def _of_table_one(page: str, drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> list[Gate]:
+def _by_car(sets: Mapping[str, Sequence[Recording]]) -> dict[str, list[Recording]]:
+    """First letter of `CARS` -> all recordings of that car, if it has any."""
+    cars = {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
+    return {letter: recordings for letter, recordings in cars.items() if recordings}
+
+
+def _of_table_one(name: str, published: Statistics, drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> list[Gate]:
+    """Gates on one row of Table I, ``C-1`` say, whose drives begin with ``c1``."""
+    key = name.replace("-", "").lower()
+    paper = _quantities(published)
+    ours = {dataset: _quantities(statistics(sets[key])) for dataset, sets in drives.items() if sets.get(key)}
     found = []
-    for paper in PROFILES[page].sets:
-        published = {name: value for name, value in paper.values.items() if name in QUANTITIES}
-        published["ratio"] = (published["vy_q99"] - published["vy_q01"]) / (2.0 * published["ay_abs_q99"])
-        published["distance"], published["duration"] = published["distance"] / 1000.0, published["duration"] / 60.0
-        ours = {name: table_one(sets[paper.drives]) for name, sets in drives.items() if sets.get(paper.drives)}
-        for name, (title, how, within) in QUANTITIES.items():
-            wanted = published[name]
-            room = within * abs(wanted) if how == "relative" else within
-            values = {dataset: own[name] for dataset, own in ours.items()}
-            found.append(Gate(paper.name, title, f"{wanted:.3g}".replace("-", "−"), wanted - room, wanted + room, values))
+    for quantity, (title, how, within) in QUANTITIES.items():
+        wanted = paper[quantity]
+        room = within * abs(wanted) if how == "relative" else within
+        values = {dataset: own[quantity] for dataset, own in ours.items()}
+        found.append(Gate(name, title, f"{wanted:.3g}".replace("-", "−"), wanted - room, wanted + room, values))
     return found
 
 
@@ -223,7 +208,7 @@ def blocks(datasets: Sequence[StoredDataset]) -> list[Block]:
         f"{verdict}{absent} No error of a network or an observer is a gate.",
         table,
         _figure(drives, real),
-        _differ(drives[AFTER]),
+        _differ(drives),
         excitation(datasets),
     ]
 
@@ -252,7 +237,7 @@ def excitation(datasets: Sequence[StoredDataset]) -> Table:
                 "drives": len(recordings),
                 "ay": float(np.quantile(np.abs(ay[moving]), 0.99)),
                 "sideslip": float(np.degrees(np.quantile(np.abs(np.arctan2(v[moving], u[moving])), 0.99))),
-                "map": static_map_left(recordings),
+                "map": left_by(static_map_of(recordings), recordings),
             }
             if long:
                 rate, noise = spectra_of(long)
@@ -277,40 +262,28 @@ def excitation(datasets: Sequence[StoredDataset]) -> Table:
     )
 
 
-def _differ(sets: Mapping[str, Sequence[Recording]]) -> Block:
-    """How much of v a static map of one car leaves on another."""
-    by_car = {letter: [own for key, part in sets.items() if key[:1] == letter for own in part] for letter in CARS}
-    present = {letter: recordings for letter, recordings in by_car.items() if recordings}
+def _differ(drives: Mapping[str, Mapping[str, Sequence[Recording]]]) -> Table:
+    """How much of v a static map of one car leaves on another, data set by data set."""
     rows = []
-    for fitted, source in present.items():
-        row: dict[str, object] = {"fitted": CARS[fitted]}
-        weights = _map_of(source)
-        for tested, target in present.items():
-            basis, v = _basis(target)
-            row[tested] = float(np.var(v - basis @ weights) / np.var(v))
-        rows.append({**row, "b": float(weights[0]), "k": 1000.0 * float(weights[1])})
+    for dataset in (name for name in (BEFORE, AFTER) if name in drives):
+        cars = _by_car(drives[dataset])
+        for letter, source in cars.items():
+            fitted = static_map_of(source)
+            errors = {other: left_by(fitted, target) for other, target in cars.items()}
+            numbers = {"b": fitted.values["b"], "k": 1000.0 * fitted.values["k"]}
+            rows.append({"dataset": dataset, "fitted": CARS[letter], **dict.fromkeys(CARS, math.nan), **errors, **numbers})
     return Table(
         "static_maps",
-        f"FVU that the static map v = r·(b − k·u²) of one car leaves on another, `{AFTER}` (simulated): how far the cars differ. The first "
-        "two cars' maps left 0.06 on each other.",
+        "FVU that the static map v = r·(b − k·u²) of one simulated car leaves on another: how far the cars differ.",
         pd.DataFrame(rows),
         {
+            "dataset": Column("data set"),
             "fitted": Column("fitted on"),
-            **{letter: Column(f"FVU on the {CARS[letter]}", decimals=3) for letter in present},
+            **{letter: Column(f"FVU on the {car}", decimals=3) for letter, car in CARS.items()},
             "b": Column("b [m]", decimals=2),
             "k": Column("k [10⁻³ s²/m]", decimals=2),
         },
     )
-
-
-def _basis(recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
-    u, r, v = (np.concatenate([own[name] for own in recordings]) for name in ("vx", "yaw_rate", "vy_ref"))
-    return np.stack([r, -r * u**2], axis=1), v
-
-
-def _map_of(recordings: Sequence[Recording]) -> FloatArray:
-    basis, v = _basis(recordings)
-    return np.asarray(np.linalg.lstsq(basis, v, rcond=None)[0])
 
 
 def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> Figure:
@@ -318,7 +291,7 @@ def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Seque
     panels: list[tuple[str, Sequence[Recording]]] = [("Ferrari, real", real)] if real else []
     for letter, car in CARS.items():
         for name, when in ((BEFORE, "simulated, before"), (AFTER, "simulated, after")):
-            own = [recording for key, part in drives.get(name, {}).items() if key[:1] == letter for recording in part]
+            own = _by_car(drives.get(name, {})).get(letter)
             if own:
                 panels.append((f"{car}, {when}", own))
     with paper_style():
