@@ -53,7 +53,7 @@ test-docs test-fuzz test-wheel test-processes: $(INSTALLED) ## one kind of them
 test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rules and emulators, as far as these are installed (15 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -rs -m "export and not slow" tests/export
 
-test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, workers and a node killed in the middle (4 minutes); installs Ray
+test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, workers and a node killed in the middle, and as SLURM jobs (10 minutes); installs Ray and submitit
 	$(BIN)/python -m pip install -q -e ".[cluster-tests]"
 	$(BIN)/python -m pytest -rs -m "cluster and not slow" tests/cluster
 

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -19,6 +19,7 @@ import typer
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError, is_printable, printable
 from vehest.stages.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
+from vehest.stages.launchers.where import LAUNCHERS, Where
 from vehest.version import __version__
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ LONGEST_LINE = 4_000
 MOST_ATTEMPTS = 5  # at an answer
 MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
-LAUNCHERS = ("local", "ray")
 
 
 def _offered(*groups: str) -> str:
@@ -115,7 +115,7 @@ LauncherName = Annotated[
     str,
     typer.Option(
         "--launcher",
-        help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster (docs/many_machines.md).",
+        help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, as SLURM jobs (docs/many_machines.md).",
         autocompletion=lambda incomplete: [name for name in LAUNCHERS if name.startswith(incomplete)],
     ),
 ]
@@ -124,7 +124,7 @@ Address = Annotated[
     typer.Option(
         "--address",
         help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is part of. "
-        "By default RAY_ADDRESS, else a Ray of its own on this machine.",
+        "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: local, to try it here.",
         show_default=False,
     ),
 ]
@@ -133,6 +133,15 @@ StoreAddress = Annotated[
     typer.Option(
         "--store",
         help="With --launcher ray, where machines share no folder: file:///FOLDER or s3://BUCKET/FOLDER to keep artefacts in.",
+        show_default=False,
+    ),
+]
+Slurm = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--slurm",
+        help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, constraint, minutes (60), memory_gb (2). "
+        "Repeatable.",
         show_default=False,
     ),
 ]
@@ -673,6 +682,7 @@ def run(
     launcher: LauncherName = "local",
     address: Address = None,
     store: StoreAddress = None,
+    slurm: Slurm = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
@@ -690,7 +700,7 @@ def run(
         jobs=jobs,
         only_report=False,
         minutes=minutes,
-        where=_Where(launcher, address, store),
+        where=Where(launcher, address, store, tuple(slurm or ())),
     )
 
 
@@ -759,6 +769,7 @@ def sweep(
     launcher: LauncherName = "local",
     address: Address = None,
     store: StoreAddress = None,
+    slurm: Slurm = None,
 ) -> None:
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
 
@@ -785,7 +796,7 @@ def sweep(
         return workshop.outcome(swept.folder, shown_of_sweep(swept), None, planned.first["tracking"], raw), swept
 
     forced = {"train", "calibrate", "evaluate", "sweep"} if force else set()
-    where = _Where(launcher, address, store)
+    where = Where(launcher, address, store, tuple(slurm or ()))
     with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True, where=where) as workshop:
         outcome, swept = whole_way(workshop)
         _print_sweep(outcome.shown, as_json, outcome.report.folder, skipped=swept.folder.skipped)
@@ -1195,7 +1206,7 @@ def _run_pipeline(
     jobs: int | None,
     only_report: bool,
     minutes: float | None = None,
-    where: _Where | None = None,
+    where: Where | None = None,
 ) -> None:
     begun = time.monotonic()
     from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
@@ -1302,15 +1313,6 @@ def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
     return config, plan_training(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
 
 
-@dataclass(frozen=True)
-class _Where:
-    """Where trainings run, as options say it."""
-
-    launcher: str
-    address: str | None
-    store: str | None
-
-
 @contextmanager
 def _workshop(
     config: Config,
@@ -1320,7 +1322,7 @@ def _workshop(
     quiet: bool,
     jobs: int | None = None,
     track: bool = False,
-    where: _Where | None = None,
+    where: Where | None = None,
 ) -> Iterator[Workshop]:
     """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
     from vehest.data.limits import limits_from_config, use_limits
@@ -1335,7 +1337,7 @@ def _workshop(
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if track else None
     workshop = Workshop(output, messages, stop, jobs or default_jobs(), frozenset(force), dry_run, tracker)
     if where is not None:
-        workshop.launcher = chosen_launcher(where.launcher, where.address, where.store, jobs, output, messages)
+        workshop.launcher = chosen_launcher(where, jobs, output, messages)
     with use_limits(limits_from_config(config["limits"])), stop.installed():
         try:
             yield workshop

@@ -21,10 +21,12 @@ from vehest.stages.console import Messages
 from vehest.stages.failures import Failure
 from vehest.stages.group import Group
 from vehest.stages.launchers.base import LocalLauncher, chosen_launcher
+from vehest.stages.launchers.on_slurm import slurm_parameters
 from vehest.stages.launchers.plan import StudyCost, Unit, makespan
 from vehest.stages.launchers.standing import Standing
 from vehest.stages.launchers.store import Store
 from vehest.stages.launchers.times import Cost, Times, next_lot
+from vehest.stages.launchers.where import Where
 from vehest.stages.launchers.worker import World, moved
 from vehest.stages.signals import StopSignals
 from vehest.stages.train import TrainJob
@@ -265,11 +267,10 @@ def test_other_code_or_libraries_are_named():
 
 
 def test_options_of_a_cluster_are_refused_elsewhere(place):
-    for option in (("--address", "auto"), ("--store", "file:///somewhere")):
-        code, line = place.refused("run", "small", *option)
-        assert code == 2
-        assert f"{option[0]} is for --launcher ray" in line
-    assert "--launcher must be local or ray" in place.refused("sweep", "split=mine", "--launcher", "dask")[1]
+    code, line = place.refused("run", "small", "--slurm", "minutes=5")
+    assert code == 2
+    assert "--slurm is for --launcher slurm, not for local" in line
+    assert "--launcher must be one of local, ray, slurm" in place.refused("sweep", "split=mine", "--launcher", "dask")[1]
 
 
 def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
@@ -281,8 +282,42 @@ def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
 
 
 def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
-    launcher = chosen_launcher("local", None, None, 1, tmp_path, FINE)
+    launcher = chosen_launcher(Where(), 1, tmp_path, FINE)
     assert isinstance(launcher, LocalLauncher)
     group = Group([job(tmp_path)])
     (done,) = launcher.launch([group], StopSignals(), lambda *_: None)
     assert isinstance(done.outcome, Failure)
+
+
+# Options of launchers
+
+
+@pytest.mark.parametrize(
+    ("where", "says"),
+    [
+        (Where("cloud"), "--launcher must be one of local, ray, slurm, not 'cloud'"),
+        (Where("local", address="auto"), "--address is for --launcher ray and slurm, not for local"),
+        (Where("slurm", store="file:///x"), "--store is for --launcher ray, not for slurm"),
+        (Where("ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
+        (Where("slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
+        (Where("slurm", "local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
+        (Where("slurm", "local", slurm=("nodes=4",)), "--slurm 'nodes=4' must be NAME=VALUE with one of the names account"),
+    ],
+)
+def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path):
+    with pytest.raises(ConfigurationError) as told:
+        chosen_launcher(where, None, tmp_path, FINE)
+    assert says in str(told.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_jobs_ask_of_slurm_has_the_names_of_submitit():
+    asked = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
+    assert asked == {"slurm_partition": "long", "timeout_min": 90, "mem_gb": 1.5, "cpus_per_task": 1, "name": "vehest"}
+
+
+def test_without_slurm_a_line_says_where_to_run(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MissingError, match="there is no SLURM here"):
+        chosen_launcher(Where("slurm"), None, tmp_path, FINE)

@@ -21,6 +21,7 @@ EXTRAS = {
     "bus": ("cantools", "CAN logs and replays"),
     "tuning": ("optuna", "noise levels tuned by Optuna"),
     "ray": ("ray", "trainings on many machines"),
+    "slurm": ("submitit", "trainings as SLURM jobs"),
 }
 """Extra -> the package it brings, and what needs it."""
 

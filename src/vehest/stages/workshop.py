@@ -283,7 +283,9 @@ class Workshop:
                     failures.append((group.name, outcome))
                     self.messages.line("fail", "train", group.name, outcome.message)
                     continue
-                for member in outcome:
+                planned = {job.plan.key: job for job in group.jobs}
+                for made_elsewhere in outcome:
+                    member = replace(made_elsewhere, job=planned[made_elsewhere.job.plan.key])  # not one more copy of its job
                     members.append(member)
                     self._say_made(member)
                     if member.evaluation is not None:

@@ -11,6 +11,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.stages.console import Messages
 from vehest.stages.group import Group, Member, run_group
 from vehest.stages.launcher import Done, Reporter, Task, default_jobs, launch
+from vehest.stages.launchers.where import LAUNCHERS, Where
 from vehest.stages.signals import StopSignals, TimeLimit
 
 
@@ -55,13 +56,11 @@ class LocalLauncher:
         """Nothing is kept."""
 
 
-def chosen_launcher(name: str, address: str | None, store: str | None, jobs: int | None, output: Path, messages: Messages) -> Launcher:
+def chosen_launcher(where: Where, jobs: int | None, output: Path, messages: Messages) -> Launcher:
     """The launcher of a command.
 
     Args:
-        name: ``local`` or ``ray``.
-        address: of the cluster, for ``ray``.
-        store: where artefacts are kept where machines share no folder, for ``ray``.
+        where: what its options say.
         jobs: most groups at a time; none for as many as there are cores.
         output: the output root.
         messages: where the launcher says what happens.
@@ -70,14 +69,21 @@ def chosen_launcher(name: str, address: str | None, store: str | None, jobs: int
         ConfigurationError: there is no such launcher, or it takes no such option.
         MissingError: what it needs is not installed.
     """
-    if name not in ("local", "ray"):
-        raise ConfigurationError(f"--launcher must be local or ray, not '{name}'")
-    if name == "local":
-        for option, value in (("--address", address), ("--store", store)):
-            if value is not None:
-                raise ConfigurationError(f"{option} is for --launcher ray; the local launcher works in the output root of this machine")
+    if where.launcher not in LAUNCHERS:
+        raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{where.launcher}'")
+    given = {"--address": where.address, "--store": where.store, "--slurm": where.slurm}
+    takes = {"local": (), "ray": ("--address", "--store"), "slurm": ("--address", "--slurm")}
+    for option, value in given.items():
+        if value and option not in takes[where.launcher]:
+            own = " and ".join(name for name, options in takes.items() if option in options)
+            raise ConfigurationError(f"{option} is for --launcher {own}, not for {where.launcher}")
+    if where.launcher == "local":
         return LocalLauncher(jobs or default_jobs())
+    if where.launcher == "slurm":
+        from vehest.stages.launchers.on_slurm import SlurmLauncher
+
+        return SlurmLauncher(where.address, jobs, where.slurm, output, messages)
     from vehest.stages.launchers.on_ray import RayLauncher
     from vehest.stages.launchers.store import Store
 
-    return RayLauncher(address, jobs, None if store is None else Store(store), output, messages)
+    return RayLauncher(where.address, jobs, None if where.store is None else Store(where.store), output, messages)

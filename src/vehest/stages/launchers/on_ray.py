@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import MissingError, VehestError
-from vehest.data.files import writing_error
 from vehest.data.limits import current_limits
 from vehest.stages.console import Messages
 from vehest.stages.failures import Failure, failure_of
@@ -31,17 +30,7 @@ from vehest.stages.launcher import Done, Reporter
 from vehest.stages.launchers.board import Board
 from vehest.stages.launchers.store import Store
 from vehest.stages.launchers.times import Times, next_lot
-from vehest.stages.launchers.worker import (
-    JOURNAL,
-    SHARED,
-    Order,
-    Report,
-    find_like,
-    inputs_of,
-    moved,
-    run_order,
-    this_world,
-)
+from vehest.stages.launchers.worker import Order, Report, find_like, inputs_of, mark_shared, moved, run_order, this_world
 from vehest.stages.signals import StopSignals, TimeLimit
 
 LEAST_SECONDS = 10.0  # that a task should last; what it costs to hand one over is a thousandth of that
@@ -189,13 +178,7 @@ class RayLauncher:
         self._board = ray.remote(Board).options(num_cpus=0, max_restarts=-1, max_task_retries=3, scheduling_strategy=here).remote()
         self._task = ray.remote(num_cpus=1, max_retries=0)(_run_on_ray)
         if self._store is None:
-            self._token = uuid.uuid4().hex
-            mark = self._output.resolve() / JOURNAL / self._run / SHARED
-            try:
-                mark.parent.mkdir(parents=True, exist_ok=True)
-                mark.write_text(self._token, encoding="utf-8")
-            except OSError as error:
-                raise writing_error(mark, error) from error
+            self._token = mark_shared(self._output, self._run)
 
     def _nodes(self) -> list[Any]:
         return [node for node in self._ray.nodes() if node["Alive"] and node["NodeID"] not in self._shunned]

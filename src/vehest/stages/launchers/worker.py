@@ -15,6 +15,7 @@ import socket
 import tempfile
 import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -24,7 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from vehest.data.errors import MissingError, VehestError
-from vehest.data.files import no_room
+from vehest.data.files import no_room, writing_error
 from vehest.data.limits import Limits, use_limits
 from vehest.estimators.registry import estimator_module
 from vehest.stages.artefacts import Artefact, find, library_versions, read_artefact
@@ -145,6 +146,22 @@ def _cpu() -> str:
     import llvmlite.binding
 
     return str(llvmlite.binding.get_host_cpu_name())
+
+
+def mark_shared(output: Path, run: str) -> str:
+    """Leave a mark in an output root by which other machines know that they see the same folder; returns what it says.
+
+    Raises:
+        MissingError: the folder cannot be written to.
+    """
+    token = uuid.uuid4().hex
+    mark = output.resolve() / JOURNAL / run / SHARED
+    try:
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.write_text(token, encoding="utf-8")
+    except OSError as error:
+        raise writing_error(mark, error) from error
+    return token
 
 
 def run_order(order: Order, exchange: Exchange, node: str = "") -> Report:

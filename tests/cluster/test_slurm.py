@@ -1,0 +1,81 @@
+"""SLURM jobs against the local launcher: by processes that submitit starts itself, and by a queue that answers to SLURM's commands."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from pretended_slurm import install, states
+from test_two_nodes import FORTY, LONGER, Alone, alone, folder  # noqa: F401
+from two_nodes import Driver, begun, journal, metrics, trained, under_way, weights, with_recordings
+
+pytestmark = [
+    pytest.mark.cluster,
+    pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="submitit is not installed: pip install 'vehest[slurm]'"),
+]
+
+
+def with_a_checkpoint(output: Path, but: dict | None = None) -> dict | None:
+    """A group under way, another than that of an entry, of which checkpoints of all members are kept."""
+    for entry in under_way(output):
+        kept = [file for key in entry["keys"] for file in output.glob(f"checkpoints/*-{key[:12]}/checkpoint.safetensors")]
+        if len(kept) == len(entry["keys"]) and (but is None or entry["keys"] != but["keys"]):
+            return entry
+    return None
+
+
+def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, alone, tmp_path):  # noqa: F811
+    output = with_recordings(alone["forty"], tmp_path / "out")
+    driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2")
+    assert driver.ended() == 0, driver.said
+    assert metrics(output) == metrics(alone["forty"])
+    assert weights(output) == weights(alone["forty"])
+    assert set(trained(output).values()) == {1}
+    assert not list(output.glob("journal/*/slurm")), "what was handed over is forgotten"
+
+
+def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(folder, alone, tmp_path):  # noqa: F811
+    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
+    environment = install(queue)
+    driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", "--slurm", "minutes=10", **environment)
+    lost = driver.sees(lambda: with_a_checkpoint(output))
+    os.kill(lost["pid"], signal.SIGKILL)
+    put_back = driver.sees(lambda: with_a_checkpoint(output, but=lost))
+    os.kill(put_back["pid"], signal.SIGUSR2)
+    assert driver.ended() == 0, driver.said
+    assert metrics(output) == metrics(alone["longer"])
+    assert weights(output) == weights(alone["longer"])
+    assert "its job ended without an outcome" in driver.said
+    assert set(trained(output).values()) == {1}
+    twice = {key for key, times in begun(output).items() if times > 1}
+    assert {*lost["keys"], *put_back["keys"]} <= twice
+    assert {entry["run"] for entry in journal(output)} == {lost["run"]}
+    assert set(states(queue).values()) <= {"COMPLETED", "FAILED"}
+
+
+def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, tmp_path):  # noqa: F811
+    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
+    environment = install(queue)
+    driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
+    driver.sees(lambda: with_a_checkpoint(output))
+    driver.process.send_signal(signal.SIGINT)
+    assert driver.ended() == 130, driver.said
+    again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
+    assert again.ended() == 0, again.said
+    assert metrics(output) == metrics(alone["longer"])
+    assert set(trained(output).values()) == {1}
+
+
+def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, tmp_path):  # noqa: F811
+    output = with_recordings(alone["forty"], tmp_path / "out")
+    environment = install(tmp_path / "queue")
+    (tmp_path / "queue" / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: invalid partition specified: none' >&2\nexit 1\n")
+    driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--slurm", "partition=none", **environment)
+    assert driver.ended() == 4, driver.said
+    assert "error: SLURM takes no jobs" in driver.said
+    assert "invalid partition" in driver.said
+    assert "Traceback" not in driver.said
+    assert not trained(output)
