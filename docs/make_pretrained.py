@@ -1,12 +1,15 @@
 """Write src/vehest/pretrained, the model for cars that nobody has trained on: the seed that the study sim_to_real has chosen.
 
-Run by ``make pretrained``, after the study, with the study's output root.
+Run by ``make pretrained``, after the study, with the study's output root. Its bands and its health are learnt from the simulated drives
+that it was trained on and from the other simulated cars on which its training was stopped; ``--trust`` makes them anew for the model
+as it is.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -14,7 +17,13 @@ import pandas as pd
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description, save_model
 from vehest.report.style import fixed
-from vehest.stages.estimate import find_model, preparation_of
+from vehest.stages.calibrate import plan_calibrate, write_calibration
+from vehest.stages.config import compose_config
+from vehest.stages.console import Messages
+from vehest.stages.estimate import find_model, model_artefact, preparation_of
+from vehest.stages.signals import StopSignals
+from vehest.stages.workshop import Workshop
+from vehest.trust.record import read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = ROOT / "results" / "sim_to_real" / "tables" / "overview.csv"
@@ -57,12 +66,30 @@ def write(row: pd.Series, model: Path, target: Path = TARGET) -> None:
     save_model(estimator, target, about)
 
 
+def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
+    """Learn from a step's training and validation ranges, all of them simulated, how far the model can be trusted."""
+    words = [f"split=sim_to_real_{step}", f"estimator={read_description(target).estimator}", f"output={output}", "tracking=none"]
+    config = compose_config("eval", words)
+    workshop = Workshop(output, Messages(), StopSignals())
+    whole = workshop.split(config)
+    split = replace(whole, tests={})
+    job = plan_calibrate(model_artefact(target), split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
+    if job is None:
+        raise SystemExit(f"split '{split.name}' has no validation range")
+    write_calibration(job, target)
+    write_trust(replace(read_trust(target), guard=None), target)  # samples are held to what any car's sensors do, not to simulated ones
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="the study's output root")
+    parser.add_argument("--trust", action="store_true", help="only bands and health, of the model that is there")
+    given = parser.parse_args()
     row = chosen_step()
-    write(row, find_model(str(row["model"]), parser.parse_args().output))
+    if not given.trust:
+        write(row, find_model(str(row["model"]), given.output))
+    write_its_trust(str(row["part"]), given.output)
     print(TARGET)
 
 

@@ -43,7 +43,13 @@ def test_wheel_holds_configuration_pipelines_and_templates(installed):
         for file in (ROOT / folder).rglob("*.yaml")
     }
     assert shipped <= names
-    assert {"report/templates/page.css", "py.typed", "pretrained/model.safetensors", "pretrained/model.yaml"} <= names
+    assert {
+        "report/templates/page.css",
+        "py.typed",
+        "pretrained/model.safetensors",
+        "pretrained/model.yaml",
+        "pretrained/trust.yaml",
+    } <= names
     assert not any("tests" in name or name.endswith(".parquet") for name in names)
 
 

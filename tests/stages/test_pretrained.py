@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import yaml
 
 import vehest
@@ -18,6 +19,7 @@ from vehest.estimators.registry import estimator_class
 from vehest.sources.base import kind_of
 from vehest.stages.config import compose_config
 from vehest.stages.estimate import pretrained_folder
+from vehest.trust.record import read_trust
 
 ROOT = Path(__file__).parents[2]
 
@@ -33,6 +35,9 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
         assert what in said["note"]
     assert place("estimate", "pretrained", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
     assert Path("default.csv").read_bytes() == Path("named.csv").read_bytes()
+    bands = pd.read_csv("default.csv")["band_sideslip"].dropna()
+    assert len(bands) > 50
+    assert (bands > 0.0).all()
 
 
 def test_completion_of_the_first_word_offers_models_and_recordings(place: Place):
@@ -67,7 +72,7 @@ def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place: Place
 
 def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
     folder = pretrained_folder()
-    assert sum(file.stat().st_size for file in folder.iterdir()) < 20_000
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
     spec = importlib.util.spec_from_file_location("make_pretrained", ROOT / "docs" / "make_pretrained.py")
     assert spec is not None
     assert spec.loader is not None
@@ -77,6 +82,17 @@ def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
     assert about["note"] == maker.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
     assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in about["datasets"])
+
+
+def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the_yardstick():
+    trust = read_trust(pretrained_folder())
+    assert trust.about.note == ""
+    assert trust.bands is not None
+    assert trust.guard is None, "simulated sensors say nothing of the range and resolution of real ones"
+    assert trust.health is not None
+    assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in trust.bands.datasets)
+    assert trust.bands.n_blocks >= 34
+    assert "ferrari_250_lm" not in trust.bands.vehicles
 
 
 def test_python_interface_loads_the_pretrained_model_by_default():
