@@ -15,7 +15,7 @@ from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalS
 from vehest.report.document import Table
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest_papers.heavy_ekf import accuracy, tables, tyres, vehicle, watching
+from vehest_papers.heavy_ekf import accuracy, draws, tables, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.document import WHEELS
 from vehest_papers.heavy_ekf.subjects import Filter
 
@@ -144,3 +144,16 @@ def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
 def test_an_axle_whose_wheels_turn_alike_is_named_and_not_corrected() -> None:
     assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
     assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""
+
+
+def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is_not() -> None:
+    samples = np.full(5, 1000.0)
+    level = np.array([1.0, 1.1, 0.9, 1.05, 0.95]) * 0.04 * 1000.0
+    jumps = np.array([1.5, 0.6, 1.4, 0.5, 1.0])
+    sums = {"worn_fast": {"LINT": (level, samples), "RATT": (1.5 * level, samples), "RATTE": (jumps * level, samples)}}
+    found = draws.compared(sums)
+    own, told_apart = found["worn_fast", ("RATT", "LINT")]
+    assert told_apart
+    assert 0.0 < own.low < own.value < own.high
+    assert own.value == pytest.approx(0.2 * (math.sqrt(1.5) - 1.0), rel=1e-6)
+    assert not found["worn_fast", ("RATTE", "LINT")][1]

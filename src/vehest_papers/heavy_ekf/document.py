@@ -14,11 +14,11 @@ from vehest.report.document import REPORT, Block, Column, Document, Figure, Tabl
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
-from vehest_papers.heavy_ekf import accuracy, claims, laps, paper, tables, twin_report, tyres, vehicle, watching
+from vehest_papers.heavy_ekf import accuracy, claims, draws, laps, paper, tables, twin_report, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.factorial import every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
 
-TRUCK, FERRARI, WHEELED = "truck", "ferrari", "av21"
+TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.08, track_rear=2.08)  # as in conf/vehicle/heavy_truck.yaml
 NOMINAL = "nominal_laps"
 REAL_TRACE = "sideslip_ferrari"
@@ -51,8 +51,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     twin_front, twin_claims, twin_data, twin_appendix = twin_report.twin_blocks(twin)
     wheels, wheel_claims = vehicle.wheels_blocks(artefacts.parts[WHEELED]) if WHEELED in artefacts.parts else ([], [])
     lap_blocks, lap_claims = _lap_by_lap(filters, drives, estimates)
-    others = [*twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
-    warned = claims.warnings_in_words([(artefacts.titles[name], part) for name, part in artefacts.parts.items() if name != WHEELED])
+    rear = float(filters[paper.RATTE].fitted.settings.car.cg_to_rear_axle)
+    drawn, drawn_claims = draws.draws_blocks(artefacts.parts[DRAWS], rear) if DRAWS in artefacts.parts else ([], [])
+    others = [*drawn_claims, *twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
+    warned = claims.warnings_in_words(
+        [(artefacts.titles[name], part) for name, part in artefacts.parts.items() if name not in (WHEELED, DRAWS)]
+    )
     claimed, best = claims.claims_blocks(truck, real, others)
     blocks: list[Block] = [
         *_asked(artefacts),
@@ -63,6 +67,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         f"## Appendix: who may be called best\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
         *twin_appendix,
+        *drawn,
         *lap_blocks,
         "## Appendix: the vehicle",
         vehicle.table_2(filters[paper.RATTE].fitted.settings.car),
