@@ -91,8 +91,6 @@ def _result(title: str, name: str, runs: pd.DataFrame) -> str:
         if paper.NNTF_UH in middle:
             words += "" if best == paper.NNTF_UH else f"; {paper.NNTF_UH} has {fixed(middle[paper.NNTF_UH], 4)}"
             beside = [f"{fixed(paper.TABLES[test][paper.NNTF_UH].mse, 4)} in the paper{', on tyre C' if test == 'tyre_d' else ''}"]
-            if name == "real":
-                beside.append(f"{fixed(paper.AUTHORS_CODE[test].mse, 4)} by the authors' public code on these files")
             words += f" ({paper.NNTF_UH}: {', '.join(beside)})"
         sentences.append(words + ".")
     return f"{title}. {' '.join(sentences)} Medians of seeds."
@@ -148,9 +146,9 @@ def _part(title: str, name: str, part: PartArtefacts, runs: pd.DataFrame, data: 
     where = f"{kind}, {listed([as_text(part.data_titles.get(dataset, dataset)) for dataset in part.split.datasets])}"
     blocks: list[Block] = [f"## {title}\n\nAll that follows in this section is {kind}.", *_slips(part, name, where, data)]
     for test, tyre in SETS.items():
-        table, sequence = losses(part, test)
+        errors = losses(part, test)
         published = {candidate: own.mse for candidate, own in paper.TABLES[test].items()}
-        pairs = differences(table, sequence, published, part.protocol.rate_hz)
+        pairs = differences(errors.squared, errors.sequence, published, part.protocol.rate_hz)
         data[f"pairs_{test}_{name}"] = pairs
         unseen = " The paper's unseen tyre is C, ours is D: the numbers stand beside each other, they do not measure the same." * (
             test == "tyre_d"
@@ -158,18 +156,9 @@ def _part(title: str, name: str, part: PartArtefacts, runs: pd.DataFrame, data: 
         caption = (
             f"{'On the tyre that was learnt on' if test == 'tyre_a' else 'On the unseen tyre'} (Table {ROMAN[test]} of the paper): {tyre}."
         )
-        code = f" Authors' public code: {paper.NNTF_UH} of the authors' own implementation, same files, as printed when it was run." * (
-            name == "real"
-        )
         blocks += [
             f"### {tyre[0].upper()}{tyre[1:]}, {'learnt on' if test == 'tyre_a' else 'unseen'}",
-            tables.accuracy(
-                runs,
-                test,
-                f"table_{1 if test == 'tyre_a' else 2}_{name}",
-                f"{caption}{unseen}{code} Ours: {kind}.",
-                authors_code=name == "real",
-            ),
+            tables.accuracy(errors, test, f"table_{1 if test == 'tyre_a' else 2}_{name}", f"{caption}{unseen} Ours: {kind}."),
             order_in_words(pairs, tables.medians(runs, f"mse_weighted.{test}"), f"on {tyre}"),
             pairs_table(
                 pairs[pairs["neighbours"]],
@@ -203,8 +192,7 @@ def _slips(part: PartArtefacts, name: str, where: str, data: dict[str, pd.DataFr
 
 
 def _errors_and_consistency(name: str, runs: pd.DataFrame, kind: str) -> list[Block]:
-    known = ", on its own files, and what the authors' public code reached on these" if name == "real" else ", of a real car"
-    state = f"Root mean square errors by state; in brackets what the paper reports{known}. Data: {kind}."
+    state = f"Root mean square errors by state; in brackets what the paper reports, on its own files. Data: {kind}."
     consistent = (
         f"Consistency of the filters, which the paper does not report: normalised estimation errors squared over vx, vy and yaw rate "
         f"(NEES) and normalised innovations squared (NIS), 1 for a consistent filter and above 1 for one too sure of itself; share of "
@@ -212,7 +200,7 @@ def _errors_and_consistency(name: str, runs: pd.DataFrame, kind: str) -> list[Bl
     )
     return [
         "### Errors by state, and whether filters know them",
-        tables.by_state(runs, list(SETS), f"by_state_{name}", state, authors_code=name == "real"),
+        tables.by_state(runs, list(SETS), f"by_state_{name}", state),
         tables.consistency(runs, list(SETS), f"consistency_{name}", consistent),
     ]
 
