@@ -4,7 +4,8 @@ All claims and rules below were fixed before any test figure of this study was c
 
 - **A pair** (`PAIRS`): one method has the lower weighted MSE of two. Difference of the mean losses over all seeds and sequences, paired
   block bootstrap over whole sequences and over seeds, corrected by Holm within the pairs of a test. Reproduced if the corrected interval
-  lies on the paper's side of zero, not reproduced if it lies on the other side, undecided if it holds zero.
+  lies on the paper's side of zero, not reproduced if it lies on the other side, undecided if it holds zero. NNTF_UH* and NNTF_UH
+  have the same weights: their difference is taken seed by seed.
 - **A factor** (`FACTORS`): the loss is at most so many times the other's; the 95 % interval of the ratio against the factor.
 - **A percentile** (`PERCENTILES`): the same of the 99th percentile of the weighted absolute error, its interval by the same resampling.
 - **A state** of Figure 5 counts as lower or higher where the 95 % interval of the difference of mean squares leaves zero out; a claim about
@@ -81,7 +82,7 @@ def verdict_of(low: float, high: float, limit: float = 0.0) -> tuple[Verdict, st
 def pair_claims(errors: Errors, test: str, data: str) -> list[Claim]:
     """Those of `PAIRS` on a test, corrected by Holm among themselves."""
     pairs = [pair for pair in PAIRS[test] if all(name in errors.squared for name in pair)]
-    found = [errors.difference(errors.squared[first], errors.squared[second]) for first, second in pairs]
+    found = [errors.of_pair(first, second) for first, second in pairs]
     claims = []
     for (first, second), own, adjusted in zip(pairs, found, holm([one.p_value for one in found]), strict=True):
         factor = max(adjusted / own.p_value, 1.0) if own.p_value > 0 else float(len(pairs))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from vehest.constants import FloatArray
+from vehest.evaluation.metrics import WEIGHTS
 from vehest.evaluation.significance import CONFIDENCE, Interval, paired_difference
 from vehest.report.style import fixed
+from vehest_papers.learned_ukf import paper
 
 N_RESAMPLES = 500
+SAME_WEIGHTS = {paper.NNTF_UH, paper.NNTF_UH_LOW}
 
 
 @dataclass(frozen=True)
@@ -28,14 +31,27 @@ class Errors:
         rate_hz: of the samples.
     """
 
-    squared: Mapping[str, FloatArray]
-    absolute: Mapping[str, FloatArray]
+    squared: dict[str, FloatArray]
+    absolute: dict[str, FloatArray]
     sequence: NDArray[np.int64]
     rate_hz: float
+
+    def add(self, method: str, errors: FloatArray) -> None:
+        """Take in one more method of one seed: its errors of vx, vy and yaw rate, (K, 3)."""
+        weights = np.array(list(WEIGHTS.values()))
+        self.squared[method] = (np.square(errors) @ weights)[None]
+        self.absolute[method] = (np.abs(errors) @ weights)[None]
 
     def difference(self, first: FloatArray, second: FloatArray) -> Interval:
         """Of mean losses (S, K), over sequences and seeds."""
         return paired_difference(first, second, self.sequence, rate_hz=self.rate_hz).mean
+
+    def of_pair(self, first: str, second: str) -> Interval:
+        """Difference of the mean squared losses of two methods; seed by seed where both have the same weights."""
+        one, other = self.squared[first], self.squared[second]
+        if {first, second} == SAME_WEIGHTS:
+            return self.mean(one - other)
+        return self.difference(one, other)
 
     def mean(self, losses: FloatArray) -> Interval:
         """Of losses (S, K), over sequences and seeds."""
