@@ -110,7 +110,7 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Er
     for test, own in errors.items():
         estimator = loaded(chosen(part, runs, paper.NNTF_UH))
         drives = drives_of(part, estimator, test)
-        means = filtered(train_on(estimator, drives), drives).steps.filtered.mean
+        means = filtered(train_on(estimator, drives, skip), drives).steps.filtered.mean
         error = (means - drives.states)[:, skip:, :3].double().numpy().reshape(-1, 3)
         own.add(paper.ORACLE, error)
 

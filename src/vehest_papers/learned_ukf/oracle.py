@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from vehest.estimators.learned_ukf import WEIGHTS, LearnedUkf
@@ -18,8 +20,17 @@ TRAINING = ThroughFilterSettings(
 )
 
 
-def train_on(estimator: LearnedUkf, drives: Drive, training: ThroughFilterSettings = TRAINING) -> LearnedUkf:
-    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free."""
+def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughFilterSettings = TRAINING) -> LearnedUkf:
+    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free.
+
+    Args:
+        estimator: with a trained filter.
+        drives: the sequences.
+        skip: first samples of each that are not scored.
+        training: how.
+    """
+    length = drives.states.shape[1]
+    training = replace(training, steps=min(training.steps, length), validation_steps=length, validation_drop_steps=skip)
     own = [Drive(*(part[row] for part in drives)) for row in range(len(drives.states))]
     weights = torch.tensor(WEIGHTS, dtype=drives.states.dtype)
     nothing = torch.zeros(1, dtype=drives.states.dtype)
