@@ -169,6 +169,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {
         "claims",
+        "overview",
         "sequence_length",
         *(f"{name}_simulated" for name in ("table_1", "table_2", "by_state", "consistency", "budget", "friction", "start", "coverage")),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
@@ -129,19 +129,19 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
     for name, part in main.items():
         row: dict[str, object] = {"part": artefacts.titles[name], "kind": words_of_kinds(part).upper()}
         for label, spans in (("train", part.split.train), ("validation", part.split.validation), *part.split.tests.items()):
-            row[label] = f"{spans_in_words(spans)}; {fixed(_minutes(part, spans), 1)} min{_sequences(part, label)}"
+            row[label] = f"{spans_in_words(spans)}; {fixed(minutes(part, spans), 1)} min{_sequences(part, label)}"
         rows.append(row)
     columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
     columns |= {test: Column(f"test, {tyre}") for test, tyre in SETS.items()}
-    learnt = paper.MINUTES * paper.SHARE_OF_TYRE_A * paper.SHARE_LEARNT
     caption = (
         f"What was used for what, with minutes of driving. The paper has {paper.MINUTES:g} min in all and learns on about "
-        f"{fixed(learnt, 1)} min of tyre A ({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
+        f"{fixed(paper.MINUTES_LEARNT, 1)} min of tyre A ({100 * paper.SHARE_LEARNT:g} % of {100 * paper.SHARE_OF_TYRE_A:g} %)."
     )
     return Table("data", caption, pd.DataFrame(rows), columns)
 
 
-def _minutes(part: PartArtefacts, spans: tuple[Span, ...]) -> float:
+def minutes(part: PartArtefacts, spans: Sequence[Span]) -> float:
+    """Of driving in ranges."""
     total = 0.0
     for span in spans:
         recording = read_recording(part.references[span.dataset, span.recording])

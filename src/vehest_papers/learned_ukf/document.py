@@ -10,12 +10,12 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.evaluation.significance import CONFIDENCE, holm
 from vehest.report.document import REPORT, Block, Document, as_text
-from vehest.report.style import listed
+from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import words_of_kinds
 from vehest_papers.learned_ukf import claims, coverage, friction, lengths, paper, prediction, tables, traces
-from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made
+from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
 from vehest_papers.learned_ukf.candidates import SETS, chosen, losses, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.errors import Errors, in_words
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded
@@ -57,7 +57,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     data: dict[str, pd.DataFrame] = {}
     found = {name: _outcome(name, part, artefacts, data) for name, part in main.items()}
     every = [claim for own in found.values() for claim in own.claims] + claims.not_testable()
-    blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE)]
+    blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE), _left_out(artefacts)]
     for own in found.values():
         blocks += [*own.picture, *own.front]
     for own in found.values():
@@ -72,7 +72,17 @@ def _asked(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> list
     if artefacts.absent:
         absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
         words += f" Not in this report, since the recordings were not at hand: {absent}."
+    learnt = "; ".join(f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})" for part in main.values())
+    words += f" Learnt on: {learnt}; in the paper about {fixed(paper.MINUTES_LEARNT, 1)} min of the same tyre."
     return [words, artefacts.about]
+
+
+def _left_out(artefacts: StudyArtefacts) -> str:
+    """What the paper has and this run does not."""
+    absent = ["training through the filter from scratch (Section III-B)"] if SCRATCH not in artefacts.parts else []
+    absent += ["the length of training sequences (Figure 7)"] if not any(name.startswith(LENGTH) for name in artefacts.parts) else []
+    absent += ["the E terms of Equation 3", "diagonal noise, which the paper leaves out as well"]
+    return f"Not run here, for their budget: {listed(absent)}."
 
 
 def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: dict[str, pd.DataFrame]) -> Outcome:
@@ -85,7 +95,7 @@ def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: di
     for test in SETS:
         own.claims += claims.pair_claims(errors[test], test, kind)
     own.claims += [*claims.factor_claims(errors, kind), *claims.percentile_claims(errors, kind)]
-    own.front += _accuracy(name, errors, kind)
+    own.front += _accuracy(name, errors, kind, real=MAIN[0] in artefacts.parts)
     _friction(own, name, part, where, kind)
     _instability(own, part, kind)
     beside = {title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind}
@@ -115,9 +125,11 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Er
         own.add(paper.ORACLE, error)
 
 
-def _accuracy(name: str, errors: Mapping[str, Errors], kind: str) -> list[Block]:
+def _accuracy(name: str, errors: Mapping[str, Errors], kind: str, *, real: bool) -> list[Block]:
     """Tables I and II and who may be called best."""
     blocks: list[Block] = ["## Tables I and II\n\n" + "\n\n".join(_standing(own, SETS[test]) for test, own in errors.items())]
+    if name == MAIN[0] or not real:
+        blocks.append(tables.overview(errors, kind))
     for test, tyre in SETS.items():
         learnt = "which was learnt on" if test == "tyre_a" else "unseen; the paper's are of tyre C and do not compare"
         caption = (

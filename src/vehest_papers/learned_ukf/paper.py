@@ -74,6 +74,7 @@ MINUTES = 52.0
 """Of driving in the paper's data set (Section III-C), of which ..."""
 SHARE_OF_TYRE_A, SHARE_LEARNT = 0.201, 0.7
 """... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)."""
+MINUTES_LEARNT = MINUTES * SHARE_OF_TYRE_A * SHARE_LEARNT
 
 NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}
 """Friction of the tyres (Section III-C)."""

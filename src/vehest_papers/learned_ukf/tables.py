@@ -55,6 +55,28 @@ def accuracy(errors: Errors, test: str, name: str, caption: str) -> Table:
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
+def overview(errors: Mapping[str, Errors], kind: str) -> Table:
+    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, beside the paper's."""
+    rows = []
+    for candidate in next(iter(errors.values())).squared:
+        row: dict[str, object] = {"candidate": candidate}
+        for test, own in errors.items():
+            known = paper.TABLES[test].get(candidate)
+            mse = own.mean(own.squared[candidate])
+            row |= {f"paper_{test}": known.mse if known else math.nan, f"ours_{test}": mse.value}
+            row |= {f"low_{test}": mse.low, f"high_{test}": mse.high}
+            row[f"words_{test}"] = in_words(mse.value, max(mse.low, 0.0), mse.high, 4)
+            row["n_seeds"] = len(own.squared[candidate])
+        rows.append(row)
+    columns = {"candidate": Column("method")}
+    for test in errors:
+        columns[f"paper_{test}"] = Column(f"paper, {'tyre A' if test == 'tyre_a' else 'tyre C'}", decimals=4)
+        columns[f"words_{test}"] = Column(f"ours, {SETS[test]}")
+    columns["n_seeds"] = Column("seeds", decimals=0)
+    caption = f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over sequences and seeds."
+    return Table("overview", caption, pd.DataFrame(rows), columns)
+
+
 def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
     """Root mean square error of each velocity on each test set."""
     rows = []
