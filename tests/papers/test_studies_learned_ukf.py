@@ -365,6 +365,8 @@ def test_friction_starts_where_it_is_told_and_with_the_deviation_it_is_told(part
     low, high = (friction.tracks_of([estimator], drives, start) for start in (0.3, 0.9))
     assert low.mean.shape == (1, 3, 100)
     assert float(low.mean[..., 0].mean()) < float(high.mean[..., 0].mean())
+    assert not low.apart(low).any()
+    assert (low.apart(high) > 0.0).all()
     sure = filtered(estimator, drives, friction=0.3, deviation=1e-4).steps.filtered.mean[..., 0, -1]
     np.testing.assert_allclose(sure.numpy(), 0.3, atol=1e-3)
 
