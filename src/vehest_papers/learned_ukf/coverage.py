@@ -29,12 +29,15 @@ def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedMode
         for words, (part, models) in trained.items():
             errors = losses(part, test)
             mse = errors.mean(errors.squared[candidate])
-            row: dict[str, object] = {"tyre": tyre, "training": words, "mse_words": in_words(mse.value, mse.low, mse.high, 4)}
+            row: dict[str, object] = {"tyre": tyre, "training": words, "mse_words": in_words(mse.value, max(mse.low, 0.0), mse.high, 4)}
             scored = [scored_of(part, model, test) for model in models]
             for sigma, expected in COVERAGE.items():
                 inside = np.stack([np.concatenate([_within(piece, sigma) for piece in own]) for own in scored])
                 share = errors.mean(inside)
-                row |= {f"inside_{sigma}": share.value, f"words_{sigma}": in_words(share.value, share.low, min(share.high, 1.0), 3)}
+                row |= {
+                    f"inside_{sigma}": share.value,
+                    f"words_{sigma}": in_words(share.value, max(share.low, 0.0), min(share.high, 1.0), 3),
+                }
                 row[f"expected_{sigma}"] = expected
             row["width"] = float(np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own]))
             rows.append(row)
