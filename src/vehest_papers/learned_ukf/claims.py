@@ -73,10 +73,10 @@ PERCENTILES: Sequence[tuple[str, str, str]] = ((A, paper.NNTF_UH, paper.GRU), (A
 def verdict_of(low: float, high: float, limit: float = 0.0) -> tuple[Verdict, str]:
     """Of a figure that the paper has below a limit."""
     if high < limit:
-        return "reproduced", "the interval lies below" + (" zero" if not limit else "")
+        return "reproduced", "interval below" + (" zero" if not limit else "")
     if low > limit:
-        return "not reproduced", "the interval lies above" + (" zero" if not limit else "")
-    return "undecided", "the interval holds " + ("zero" if not limit else "the limit")
+        return "not reproduced", "interval above" + (" zero" if not limit else "")
+    return "undecided", "interval holds " + ("zero" if not limit else "the limit")
 
 
 def pair_claims(errors: Errors, test: str, data: str) -> list[Claim]:
@@ -135,9 +135,9 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
     elif final.high < low or final.low > high:
         near = "not reproduced"
     words = {
-        "reproduced": "the interval lies within",
-        "not reproduced": "the interval lies beyond",
-        "undecided": "the interval holds a limit",
+        "reproduced": "interval within",
+        "not reproduced": "interval beyond",
+        "undecided": "interval holds a limit",
     }
     time = f"{in_words(median.value, median.low, median.high, 2)} s"
     end = in_words(final.value, final.low, final.high, 2)

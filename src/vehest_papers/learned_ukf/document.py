@@ -117,7 +117,7 @@ def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: di
     for test in SETS:
         own.claims += claims.pair_claims(errors[test], test, kind)
     own.claims += [*claims.factor_claims(errors, kind), *claims.percentile_claims(errors, kind)]
-    own.front += _accuracy(name, errors, kind, real=MAIN[0] in artefacts.parts)
+    _accuracy(own, name, errors, kind, summary=name == MAIN[0] or MAIN[0] not in artefacts.parts)
     _friction(own, name, part, where, kind)
     _instability(own, part, kind)
     beside = {title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind}
@@ -147,11 +147,12 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Er
         own.add(paper.ORACLE, error)
 
 
-def _accuracy(name: str, errors: Mapping[str, Errors], kind: str, *, real: bool) -> list[Block]:
-    """Tables I and II and who may be called best."""
-    blocks: list[Block] = ["## Tables I and II\n\n" + "\n\n".join(_standing(own, SETS[test]) for test, own in errors.items())]
-    if name == MAIN[0] or not real:
-        blocks.append(tables.overview(errors, kind))
+def _accuracy(own: Outcome, name: str, errors: Mapping[str, Errors], kind: str, *, summary: bool) -> None:
+    """Who may be called best, the summary, and Tables I and II."""
+    own.front.append("## Tables I and II\n\n" + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items()))
+    if summary:
+        own.front.append(tables.overview(errors, kind))
+    own.appendix.append(f"## Appendix: Tables I and II, {kind}")
     for test, tyre in SETS.items():
         learnt = "which was learnt on" if test == "tyre_a" else "unseen; the paper's are of tyre C and do not compare"
         caption = (
@@ -159,8 +160,7 @@ def _accuracy(name: str, errors: Mapping[str, Errors], kind: str, *, real: bool)
             f"and seeds. {paper.ORACLE}: {paper.NNTF_UH} trained on, {EPOCHS} epochs, on the test itself. Baselines take vx from "
             f"the rims and the yaw rate from the gyroscope."
         )
-        blocks.append(tables.accuracy(errors[test], test, f"table_{1 if test == 'tyre_a' else 2}_{name}", caption))
-    return blocks
+        own.appendix.append(tables.accuracy(errors[test], test, f"table_{1 if test == 'tyre_a' else 2}_{name}", caption))
 
 
 def _standing(errors: Errors, tyre: str) -> str:
@@ -255,8 +255,8 @@ def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: 
     found = prediction.compared(pairs, drives, part.protocol)
     states, swaps = prediction.frames(found, seeds)
     data |= {f"figure_5_{name}": states, f"figure_6_{name}": swaps}
-    own.front += [
-        "## What learning through the filter changes",
+    own.appendix += [
+        "## Appendix: what learning through the filter changes",
         prediction.figure_5(states, name, where)[0],
         prediction.figure_6(swaps, name, where)[0],
     ]
