@@ -100,6 +100,8 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
             for name in (paper.GRU, paper.LSTM)
             if name in groups and groups[name][0].training
         ]
+        if paper.NN in groups and groups[paper.NN][0].training:
+            words.append(f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it")
         if words:
             sentences.append(
                 f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; what more of them does, docs/learned_ukf.md says."
@@ -209,6 +211,9 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
         "## Friction",
         friction.figure(tracks, skip, name, where),
         friction.convergence_table(tracks, skip, name, kind.upper()),
+    ]
+    own.appendix += [
+        f"## Appendix: what the start of the friction is worth, {kind}",
         friction.start_table(filters, drives, part.protocol, name, kind.upper()),
     ]
 

@@ -129,7 +129,6 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
         "within": Column(f"converged within {skip_seconds:g} s [%]", decimals=0),
         "forgotten_words": Column(f"median time to the track from {TRAINED_FROM:g} [s]"),
         "final_words": Column("final value"),
-        "spread": Column("its deviation over sequences and seeds", decimals=3),
         "deviation": Column("deviation that the filter gives", decimals=3),
         "nominal": Column("nominal, paper", decimals=2),
     }
