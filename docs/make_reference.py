@@ -327,7 +327,7 @@ def _in_study(study: str, root: Path) -> list[str]:
             {"part": "learnt on", "candidate": "method", "ours_mse": "MSE", "ours_mse_nonlinear": "MSE_nl", "n_seeds": "seeds"},
         ),
         "learned_ukf": (
-            "Weighted squared error of the states, **real** recordings, medians of seeds; D is a tyre that none has seen",
+            "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
             {"candidate": "method", "ours_tyre_a": "tyre A", "ours_tyre_d": "tyre D", "n_seeds": "seeds"},
         ),
     }

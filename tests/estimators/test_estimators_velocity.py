@@ -139,6 +139,63 @@ def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean() -> Non
     assert float(masks.mean()) == pytest.approx(1.0, abs=0.03)
 
 
+def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch() -> None:
+    """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
+    training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, validation_dropped_steps=20, truncate_steps=25, batch_size=3)
+    estimator = _estimator("velocity_gru")
+    drives = [estimator._drive(recording) for recording in (_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4))]
+    phase = velocity_recurrent._phase(estimator.network, estimator.settings, training, drives, drives[:1])
+    expected = sorted(tuple(row) for drive in drives for row in torch.as_tensor(drive.inputs, dtype=torch.float32).tolist())
+    lengths = set()
+    for seed in range(2):
+        batches = list(phase.batches(torch.Generator().manual_seed(seed)))
+        found = [tuple(row) for batch in batches for row in batch.inputs[batch.counted > 0].tolist()]
+        assert sorted(found) == expected
+        assert not batches[0].goes_on
+        assert any(batch.goes_on for batch in batches)
+        lengths |= {batch.inputs.shape[1] for batch in batches}
+    assert max(lengths) == 25
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_truncated_training_carries_the_state_and_stops_gradients_there(name: str) -> None:
+    """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
+    training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1)
+    estimator = _estimator(name)
+    drive = estimator._drive(_drive(0.6, 1))
+    network, settings = estimator.network, estimator.settings
+    phase = velocity_recurrent._phase(network, settings, training, [drive], [estimator._drive(DATA.validation[0])])
+    whole = velocity_recurrent._Cutter([drive], torch.float32).padded(torch.tensor([[0, 60]]), 0)
+    parts = [whole.stretch(0, 30), whole.stretch(30, 60)]
+    together, apart = phase.loss(whole).detach(), [phase.loss(part) for part in parts]
+    assert float(together) == pytest.approx(float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4)
+    gradients = torch.autograd.grad(apart[1], list(network.parameters()), allow_unused=True)
+    with torch.no_grad():
+        _, state = network(parts[0].inputs, network.start(parts[0].starts))
+    outputs, _ = network(parts[1].inputs, state)
+    weights = torch.tensor([0.2225, 0.5064, 0.1566])
+    alone = ((outputs - parts[1].targets).square() @ weights).mean()
+    for one, other in zip(gradients, torch.autograd.grad(alone, list(network.parameters()), allow_unused=True), strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-6)
+
+
+def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns() -> None:
+    training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
+    estimator = _estimator("velocity_lstm")
+    drives = [estimator._drive(DATA.train[0])]
+    turned = next(
+        iter(velocity_recurrent._phase(estimator.network, estimator.settings, training, drives, drives).batches(torch.Generator()))
+    )
+    signs = {"yaw_rate": -1.0, "ax": 1.0, "ay": -1.0}
+    known = {tuple(row) for row in torch.as_tensor(drives[0].inputs, dtype=torch.float32).tolist()}
+    own = (turned.inputs * torch.tensor([signs[name] for name in INPUTS])).reshape(-1, 3).tolist()
+    assert {tuple(row) for row in own} <= known
+    row = turned.inputs[0, 0] * torch.tensor([-1.0, 1.0, -1.0])
+    place = next(k for k, values in enumerate(torch.as_tensor(drives[0].inputs, dtype=torch.float32)) if torch.equal(values, row))
+    expected = torch.as_tensor(drives[0].targets[place], dtype=torch.float32) * torch.tensor([1.0, -1.0, -1.0])
+    assert torch.equal(turned.targets[0, 0], expected)
+
+
 def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not() -> None:
     drive = _drive(seed=5).without_references()
     given = {"vx": 10.0, "vy": 3.0, "yaw_rate": 1.0}

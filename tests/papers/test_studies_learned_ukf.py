@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,18 +19,21 @@ from vehest.data.store import read_estimate, write_estimate, write_recording
 from vehest.estimators.learned_ukf import LearnedUkf, LearnedUkfSettings
 from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
+from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
-from vehest.studies.kit.reading import median_and_range
 from vehest.training.through_filter import Drive
-from vehest_papers.learned_ukf import documents, paper, tables
-from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of
+from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
+from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
 from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, swapped
+from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, squares_of, swapped, weighted
 from vehest_papers.learned_ukf.lengths import lengths
+from vehest_papers.learned_ukf.oracle import TRAINING, train_on
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
+from vehest_papers.learned_ukf.trials import trials_table
 
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
 SPANS = {name: Span("car", name) for name in ("learnt", "judged", "a", "d")}
@@ -154,25 +158,35 @@ def test_two_variants_under_one_name_are_refused(part):
 
 
 def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path):
-    titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "length_500": "Sequences of 500"}
-    length = PartArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
-    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, {"simulated": part, "length_500": length}, ["real"])
+    titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "likelihood": "With likelihood"}
+    parts = {"simulated": part, **{f"length_{steps}": of_length(part, steps) for steps in (50, 500)}, "likelihood": part, "scratch": part}
+    artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, ["real"])
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
     text = (tmp_path / "report.md").read_text()
     figures = {block.name for block in document.blocks if isinstance(block, Figure)}
-    assert figures == {*(f"figure_{number}_simulated" for number in (3, 4, 5, 6)), "figure_7"}
+    assert figures == {*(f"figure_{number}_simulated" for number in (3, 4, 5, 6)), "figure_7", "friction_simulated"}
     names = {block.name for block in document.blocks if isinstance(block, Table)}
     assert names >= {
+        "claims",
         "overview",
-        *(f"{name}_simulated" for name in ("table_1", "table_2", "by_state", "consistency", "definiteness", "budget")),
+        "sequence_length",
+        *(f"{name}_simulated" for name in ("table_1", "table_2", "by_state", "consistency", "budget", "friction", "start", "coverage")),
     }
+    table = next(block for block in document.blocks if isinstance(block, Table) and block.name == "claims")
+    assert set(table.frame["verdict"]) <= {"reproduced", "not reproduced", "undecided", "not testable on this data"}
+    assert (table.frame["verdict"] == "not testable on this data").sum() == len(claims.not_testable())
     assert set(document.data) >= {f"{name}_simulated" for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")}
     assert "Simulated tyre sets: SIMULATED data" in text
     assert "Not in this report, since the recordings were not at hand: Real tyre sets" in text
-    assert "authors' public code on these files" not in text
+    assert "authors' public code" not in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
+
+
+def of_length(part: PartArtefacts, steps: int) -> PartArtefacts:
+    own = model(part, "NNTF_U")
+    return PartArtefacts(**{**vars(part), "models": [replace(own, training={**own.training, "steps": steps, "batch_size": 2})]})
 
 
 def test_study_without_its_parts_or_test_sets_is_refused(part):
@@ -227,7 +241,7 @@ def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
     drives = Drive(torch.stack(states)[None], inputs[None], torch.zeros(1, 6, 4))
     assert one_step_squares(estimator, drives).max() == 0.0
     drives.states[0, -1, 1] += 0.5
-    np.testing.assert_allclose(one_step_squares(estimator, drives), [0.0, 0.05, 0.0, 0.0], rtol=1e-5)
+    np.testing.assert_allclose(one_step_squares(estimator, drives), [[0.0, 0.05, 0.0, 0.0]], rtol=1e-5)
 
 
 def test_protocol_without_sequences_is_refused(part):
@@ -250,13 +264,151 @@ def test_a_metric_that_is_missing_is_said(part):
         runs_of(PartArtefacts(**{**vars(part), "metrics": metrics}))
 
 
-def test_tables_show_median_and_range_beside_the_paper():
-    assert median_and_range(np.array([0.3, 0.1, 0.2]), 2) == "0.20 [0.10, 0.30]"
-    assert median_and_range(np.array([0.3, math.nan]), 2) == "0.30"
-    runs = pd.DataFrame({"candidate": ["NNTF_UH"] * 3, **{f"{m}_weighted.tyre_a": [0.3, 0.1, 0.2] for m in ("mse", "mae", "ae99")}})
-    row = tables.accuracy(runs, "tyre_a", "t", "c", authors_code=True).frame.iloc[0]
-    assert (row["paper_mse"], row["median_mse"], row["code_mse"], row["n_seeds"]) == (0.0063, 0.2, 0.0158, 3)
-    assert math.isnan(tables.accuracy(runs, "tyre_a", "t", "c", authors_code=False).frame.iloc[0]["code_mse"])
+def errors_of(**levels: float) -> Errors:
+    """Twelve sequences of 50 samples, three seeds; losses around a level, in sequences of different difficulty."""
+    generator = np.random.default_rng(0)
+    hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
+    squared = {name: np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)]) for name, level in levels.items()}
+    return Errors(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
+
+
+def test_tables_show_means_with_intervals_beside_the_paper():
+    errors = errors_of(NNTF_UH=1.0, GRU=2.0)
+    errors.add("oracle", np.ones((600, 3)))
+    frame = tables.accuracy(errors, "tyre_a", "t", "c").frame.set_index("candidate")
+    row = frame.loc["NNTF_UH"]
+    assert (row["paper_mse"], row["n_seeds"]) == (0.0063, 3)
+    assert row["mse_low"] < row["mse"] < row["mse_high"]
+    assert row["mse"] == pytest.approx(errors.squared["NNTF_UH"].mean())
+    assert frame.loc["oracle", "mse"] == pytest.approx(0.2225 + 0.5064 + 0.1566)
+    assert math.isnan(frame.loc["oracle", "paper_mse"])
+
+
+def test_pairs_that_are_planted_get_their_verdicts():
+    errors = errors_of(NNTF_UH=1.0, GRU=2.0, LSTM=1.0, NN=1.0, NN_U=1.5)
+    found = {own.claim: own.verdict for own in claims.pair_claims(errors, "tyre_a", "simulated")}
+    assert found == {
+        "NNTF_UH below GRU": "reproduced",
+        "NNTF_UH below LSTM": "undecided",
+        "NN_U below NN": "not reproduced",
+        "NN_U below NNTF_UH": "not reproduced",
+    }
+
+
+def test_a_ratio_has_the_interval_of_fieller_and_a_factor_its_verdict():
+    errors = errors_of(NNTF_UH=1.0, GRU=2.0)
+    value, low, high = errors.ratio("NNTF_UH", "GRU")
+    assert value == pytest.approx(0.5, rel=0.01)
+    assert 0.45 < low < value < high < 0.55
+    first, second = claims.factor_claims({"tyre_a": errors, "tyre_d": errors}, "simulated")
+    assert (first.verdict, second.verdict) == ("reproduced", "not reproduced")
+
+
+def test_percentiles_are_compared_over_sequences_and_seeds():
+    own = errors_of(NNTF_UH=1.0, GRU=4.0).percentile("NNTF_UH", "GRU")
+    assert own.high < 0.0
+    same = errors_of(NNTF_UH=1.0, GRU=1.0).percentile("NNTF_UH", "GRU")
+    assert same.low < 0.0 < same.high
+
+
+def test_same_weights_are_compared_seed_by_seed():
+    errors = errors_of(NNTF_UH=1.0)
+    seeds = np.array([1.0, 5.0, 9.0])[:, None]
+    errors.squared["NNTF_UH"] = errors.squared["NNTF_UH"] * seeds
+    errors.squared["NNTF_UH*"] = 0.99 * errors.squared["NNTF_UH"]
+    errors.squared["GRU"] = 0.99 * errors.squared["NNTF_UH"]
+    paired, free = errors.of_pair("NNTF_UH*", "NNTF_UH"), errors.of_pair("GRU", "NNTF_UH")
+    assert paired.value == pytest.approx(free.value)
+    assert paired.error < 0.2 * free.error
+
+
+def interval(low: float, high: float) -> Interval:
+    return Interval(0.5 * (low + high), low, high, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("median", "final", "verdicts"),
+    [
+        (interval(0.5, 1.5), interval(0.40, 0.50), ["reproduced", "reproduced"]),
+        (interval(1.5, 2.5), interval(0.30, 0.50), ["undecided", "undecided"]),
+        (interval(2.5, 3.5), interval(0.56, 0.60), ["not reproduced", "not reproduced"]),
+    ],
+)
+def test_friction_is_judged_by_its_time_and_its_end(median, final, verdicts):
+    assert [own.verdict for own in claims.friction_claims(median, final, "real")] == verdicts
+
+
+def test_instability_counts_seeds_that_lose_a_sequence():
+    found = claims.instability_claims({"NNT": [(0, 9), (0, 9)], "NNT_U": [(1, 9), (0, 9)]}, "real")
+    assert [own.verdict for own in found] == ["not reproduced", "reproduced"]
+    assert claims.instability_claims({"NNT": [(1, 9), (0, 9), (0, 9)]}, "real")[0].verdict == "undecided"
+
+
+def test_a_claim_on_several_states_needs_all_of_them():
+    lower, level, higher = interval(-2.0, -1.0), interval(-1.0, 1.0), interval(1.0, 2.0)
+
+    def verdict(*states):
+        return claims.states_claim("c", "w", {str(k): (own, 1.0, True) for k, own in enumerate(states)}, "real").verdict
+
+    assert [verdict(lower, lower), verdict(lower, level), verdict(lower, higher)] == ["reproduced", "undecided", "not reproduced"]
+    assert claims.states_claim("c", "w", {"vx": (higher, 1.0, False)}, "real").verdict == "reproduced"
+
+
+def test_friction_settles_after_the_last_sample_outside():
+    outside = np.array([[True, True, False, True, False, False], [False] * 6, [False] * 5 + [True]])
+    np.testing.assert_allclose(friction.settled(outside, 10.0), [0.4, 0.0, 0.6])
+
+
+def test_friction_starts_where_it_is_told_and_with_the_deviation_it_is_told(part):
+    estimator = loaded(model(part, "NNTF_UH"))
+    drives = drives_of(part, estimator, "tyre_d")
+    low, high = (friction.tracks_of([estimator], drives, start) for start in (0.3, 0.9))
+    assert low.mean.shape == (1, 3, 100)
+    assert float(low.mean[..., 0].mean()) < float(high.mean[..., 0].mean())
+    assert not low.apart(low).any()
+    assert (low.apart(high) > 0.0).all()
+    sure = filtered(estimator, drives, friction=0.3, deviation=1e-4).steps.filtered.mean[..., 0, -1]
+    np.testing.assert_allclose(sure.numpy(), 0.3, atol=1e-3)
+
+
+def test_oracle_is_no_worse_on_what_it_learns_from(part):
+    estimator = loaded(model(part, "NNTF_UH"))
+    drives = drives_of(part, estimator, "tyre_d")
+
+    def mse():
+        return float(weighted(squares_of(filtered(estimator, drives).steps.filtered.mean, drives, 20)).mean())
+
+    before = mse()
+    quick = replace(TRAINING, through=replace(TRAINING.through, max_epochs=3, validate_every=1))
+    train_on(estimator, drives, 20, quick)
+    assert mse() < before
+
+
+def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
+    own = model(part, "GRU")
+    for test in ("tyre_a",):
+        for position in range(3):
+            estimate = own.estimate(test, position)
+            channels = {"vy": np.zeros(len(estimate.channels["vy"])), "sideslip": np.zeros(len(estimate.channels["vy"]))}
+            write_estimate(replace(estimate, channels=channels), tmp_path / test / f"{position}.parquet")
+    zero = EvaluatedModel("zero", "zero", "Zero", 0, tmp_path, tmp_path, {})
+    scored = scored_of(part, zero, "tyre_a")
+    reference = recording("a", seed=2)
+    expected = reference["yaw_rate"][20:100] - reference["yaw_rate_ref"][20:100]
+    np.testing.assert_allclose(scored[0].errors["yaw_rate"], expected, atol=1e-12)
+    assert not scored[0].errors["vx"].any(), "the measured speed of the test is the true one"
+
+
+def test_trials_show_what_validation_chose_and_what_the_tables_use_instead(part):
+    def trial(size: float, validation: float) -> PartArtefacts:
+        own = replace(model(part, "NNTF_UH"), training={"through": {"learning_rate": size}})
+        metrics = part.metrics.copy()
+        metrics.loc[(metrics["test_set"] == "validation") & (metrics["metric"] == "mse_weighted"), "value"] = validation
+        return PartArtefacts(**{**vars(part), "models": [own], "metrics": metrics})
+
+    table, other = trials_table({"trial_1": trial(1e-3, 0.2), "trial_2": trial(2e-3, 0.1)}, {"NNTF_UH": 1e-3})
+    assert table.frame["chosen"].tolist() == ["", "chosen"]
+    assert other == ["NNTF_UH"]
 
 
 def test_differences_that_are_planted_are_told_from_those_that_are_not():
@@ -321,8 +473,8 @@ def test_only_what_departs_from_the_paper_is_said(part):
 
 def test_lengths_are_those_of_trainings_through_the_filter(part):
     own = PartArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
-    row = lengths({"length_500": own}).iloc[0]
-    assert (row["steps"], row["epochs"]) == (500, 1000)
+    (row,) = lengths({"length_500": own})
+    assert (row.steps, row.epochs) == (500, 1000)
     with pytest.raises(DataError, match="was not trained through the filter"):
         lengths({"length_500": PartArtefacts(**{**vars(part), "models": [model(part, "GRU")]})})
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
@@ -14,7 +15,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseSettings
-from vehest.training.through_filter import Drive, ThroughFilterSettings, filter_phases, placed, sequences_of
+from vehest.training.through_filter import Drive, ThroughFilterSettings, filter_phases, gaussian_surprise, placed, sequences_of
 
 DATA = FitData([small_car_drive(1.5, 0), small_car_drive(1.2, 1)], [small_car_drive(1.2, 2)])
 ONE_STEP = PhaseSettings(learning_rate=5e-3, max_epochs=3)
@@ -165,6 +166,28 @@ def test_truncated_gradients_do_not_reach_the_start() -> None:
 
 
 # Noise
+
+
+def test_surprise_is_the_log_density_of_errors_under_the_covariance() -> None:
+    generator = np.random.default_rng(0)
+    errors, factors = generator.standard_normal((7, 3)), generator.standard_normal((7, 3, 3))
+    covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
+    expected = -np.mean([stats.multivariate_normal(cov=own).logpdf(error) for error, own in zip(errors, covariances, strict=True)])
+    assert float(gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))) == pytest.approx(expected, rel=1e-9)
+
+
+def test_likelihood_teaches_the_filter_how_sure_to_be() -> None:
+    """With the term the filter's own variances come nearer to its squared errors in training; without it they are left where they are."""
+    ratios = {}
+    for weight in (0.0, 0.05):
+        made = estimator(noise="constant")
+        made.fit(DATA, settings(through=PhaseSettings(learning_rate=5e-3, max_epochs=15), likelihood=weight))
+        own = sequences_of([made.drive(recording, torch.float64) for recording in DATA.train], 40)
+        with torch.no_grad():
+            mean, covariance = made.filter.believed(own, own.states[:, 0], None)
+        error = (mean - own.states)[..., :3]
+        ratios[weight] = float(gaussian_surprise(error, covariance[..., :3, :3]))
+    assert ratios[0.05] < ratios[0.0] - 0.1
 
 
 def test_noise_starts_where_the_models_residuals_say() -> None:

@@ -7,6 +7,7 @@ Source: Węgrzynowski et al. 2024, Section III-B.4.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -53,6 +54,10 @@ class Filtering(Protocol):
         """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
         ...
 
+    def believed(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+        """The same with their covariances, (B, T, n, n), both differentiable."""
+        ...
+
     def judged(self, drives: Drive) -> Tensor:
         """Estimated states, (B, T, n), as in use: without gradients, and without knowing any true state but the first."""
         ...
@@ -78,6 +83,8 @@ class ThroughFilterSettings:
         validation_drop_steps: first samples of it that do not count.
         start_spread: by how much the last state (friction) is off at the start of a training sequence, at most, up or down.
         mirrored: share of sequences and pairs that are seen in a mirror, left for right.
+        likelihood: weight of a second term of the loss through the filter: the mean negative log-likelihood of the errors of those states
+            that epochs are judged by, under the filter's own covariance [nat]; 0 leaves it out. It is what teaches a filter how sure to be.
         start_noise: ``residuals`` starts the noise from what the pre-trained model leaves unexplained and learns it in units of that;
             ``given`` from the authors' values, in SI units.
         dtype: ``float32`` or ``float64``.
@@ -99,6 +106,7 @@ class ThroughFilterSettings:
     validation_drop_steps: int = 200
     start_spread: float = 0.2
     mirrored: float = 0.5
+    likelihood: float = 0.0
     start_noise: str = "residuals"
     dtype: str = "float32"
     checkpoint_seconds: float = 15.0
@@ -107,7 +115,7 @@ class ThroughFilterSettings:
         for name in ("one_step_batch", "steps", "batch_size", "curriculum_epochs", "validation_steps"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("drop_steps", "validation_drop_steps", "truncate_steps", "start_spread"):
+        for name in ("drop_steps", "validation_drop_steps", "truncate_steps", "start_spread", "likelihood"):
             if getattr(self, name) < 0:
                 raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
@@ -186,6 +194,7 @@ def filter_phases(
         DataError: no training or validation drive is long enough.
     """
     judged = sequences_of(validation, settings.validation_steps)
+    judged_by = torch.nonzero(weights.validation).flatten()
 
     def judge() -> float:
         estimated = filtering.judged(judged)
@@ -218,8 +227,13 @@ def filter_phases(
 
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
             drives, start = batch
-            estimated = filtering.estimated(drives, start, settings.truncate_steps or None)
-            return _weighted((estimated - drives.states)[:, settings.drop_steps :], weights.training)
+            truncated, kept = settings.truncate_steps or None, slice(settings.drop_steps, None)
+            if not settings.likelihood:
+                return _weighted((filtering.estimated(drives, start, truncated) - drives.states)[:, kept], weights.training)
+            estimated, covariance = filtering.believed(drives, start, truncated)
+            error = (estimated - drives.states)[:, kept]
+            surprise = gaussian_surprise(error[..., judged_by], covariance[:, kept][..., judged_by, :][..., judged_by])
+            return _weighted(error, weights.training) + settings.likelihood * surprise
 
         own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
         return Phase(label, own, module, batches, loss, judge, trainable, prepare if first else None)
@@ -262,6 +276,17 @@ def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
 
 def _pairs(drive: Drive) -> tuple[Tensor, Tensor, Tensor]:
     return drive.states[:-1], drive.inputs[:-1], drive.states[1:]
+
+
+def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:
+    """Mean negative log-likelihood of errors, (..., k), under normal distributions of these covariances, (..., k, k) [nat], scalar.
+
+    ½ (eᵀ P⁻¹ e + ln det P + k ln 2π), by the Cholesky factor of P.
+    """
+    factor = torch.linalg.cholesky_ex(covariance).L
+    whitened = torch.linalg.solve_triangular(factor, error.unsqueeze(-1), upper=False).squeeze(-1)
+    logarithms = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return (0.5 * whitened.square().sum(-1) + logarithms + 0.5 * error.shape[-1] * math.log(2.0 * math.pi)).mean()
 
 
 def _weighted(error: Tensor, weights: Tensor) -> Tensor:

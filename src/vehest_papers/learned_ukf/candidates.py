@@ -4,19 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
-from vehest.evaluation.metrics import weighted_squared_errors
+from vehest.data.store import read_recording
+from vehest.evaluation.metrics import (
+    REFERENCES,
+    Scored,
+    accuracy,
+    pieces_of,
+    scored_range,
+    weighted_absolute_errors,
+    weighted_squared_errors,
+)
 from vehest.evaluation.significance import sequence_labels
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
+from vehest_papers.learned_ukf.errors import Errors
 
 SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}
 """Test set -> tyre."""
@@ -38,13 +48,14 @@ _FILTERS = {
     "nntf_uh_mu0.4": paper.NNTF_UH_LOW,
 }
 _NETWORKS = {"velocity_gru": paper.GRU, "velocity_lstm": paper.LSTM}
+_BASELINES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP, "data_sheet": paper.DATA_SHEET}
 
 
 def candidate_of(model: EvaluatedModel) -> str:
     """What the paper calls a model; its own title if the paper has none like it."""
     if model.estimator == "learned_ukf":
         return _FILTERS.get(model.variant, model.title)
-    return _NETWORKS.get(model.estimator, model.title)
+    return (_NETWORKS | _BASELINES).get(model.estimator, model.title)
 
 
 def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
@@ -59,7 +70,8 @@ def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
     for name, models in groups.items():
         if len({model.seed for model in models}) != len(models):
             raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
+    known = (*paper.CANDIDATES, *paper.BASELINES)
+    order = [*(name for name in known if name in groups), *(name for name in groups if name not in known)]
     return {name: sorted(groups[name], key=lambda model: model.seed) for name in order}
 
 
@@ -80,6 +92,11 @@ def runs_of(part: PartArtefacts) -> pd.DataFrame:
             needed = {f"{metric}.{test}": (*own, test, metric) for test in part.split.tests for metric in ACCURACY}
             needed |= {f"mse_weighted.{VALIDATION}": (*own, VALIDATION, "mse_weighted")}
             needed |= {metric: (*own, next(iter(part.split.tests)), metric) for metric in OF_MODEL}
+            if candidate in paper.BASELINES:
+                for test in (*part.split.tests, VALIDATION):
+                    figures = accuracy(scored_of(part, model, test))
+                    known |= {(*own, test, metric): figures[metric] for metric in ACCURACY}
+                known |= {(*own, next(iter(part.split.tests)), "epochs"): math.nan}
             missing = [column for column, key in needed.items() if key not in known]
             if missing:
                 raise DataError(f"study '{part.study}': {own[0]}-{own[1]}-seed{own[2]} has no {missing[0]}; evaluate it again")
@@ -87,6 +104,24 @@ def runs_of(part: PartArtefacts) -> pd.DataFrame:
             row = {"candidate": candidate, "estimator": own[0], "variant": own[1], "seed": own[2]}
             rows.append(row | {column: known.get(key, math.nan) for column, key in wanted.items()})
     return pd.DataFrame(rows)
+
+
+def scored_of(part: PartArtefacts, model: EvaluatedModel, test: str) -> list[Scored]:
+    """Estimate and reference of a model on each sequence of a test set, or of ``validation``.
+
+    Baselines estimate the lateral velocity alone; their forward velocity is the measured rim speed, their yaw rate the gyroscope's.
+    """
+    scored = part.scored(model, test)
+    if model.estimator not in _BASELINES:
+        return scored
+    spans = part.split.validation if test == VALIDATION else part.split.tests[test]
+    pieces = pieces_of(spans, lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol)
+    completed = []
+    for own, (reference, piece) in zip(scored, pieces, strict=True):
+        first, end = scored_range(reference, piece, part.protocol)
+        others = {name: (reference[name][first:end], reference[REFERENCES[name]][first:end]) for name in ("vx", "yaw_rate")}
+        completed.append(replace(own, others=others))
+    return completed
 
 
 def of_candidate(runs: pd.DataFrame, candidate: str, column: str) -> FloatArray:
@@ -100,18 +135,14 @@ def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> Evaluated
     return models_by_candidate(part)[candidate][int(np.argmin(np.where(np.isfinite(own), own, np.inf)))]
 
 
-def losses(part: PartArtefacts, test: str) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
-    """Weighted squared errors of every seed at every scored sample, and the sequence that each sample belongs to.
-
-    Returns:
-        Candidate -> (seeds, K); and (K,).
-    """
-    table, lengths = {}, [0]
+def losses(part: PartArtefacts, test: str) -> Errors:
+    """Weighted squared and absolute errors of every seed at every scored sample, and the sequence that each sample belongs to."""
+    squared: dict[str, FloatArray] = {}
+    absolute: dict[str, FloatArray] = {}
+    lengths = [0]
     for candidate, models in models_by_candidate(part).items():
-        seeds = []
-        for model in models:
-            pieces = [weighted_squared_errors(scored) for scored in part.scored(model, test)]
-            lengths = [len(piece) for piece in pieces]
-            seeds.append(np.concatenate(pieces))
-        table[candidate] = np.stack(seeds)
-    return table, sequence_labels(lengths)
+        scored = [scored_of(part, model, test) for model in models]
+        lengths = [len(piece.vy) for piece in scored[0]]
+        squared[candidate] = np.stack([np.concatenate([weighted_squared_errors(piece) for piece in own]) for own in scored])
+        absolute[candidate] = np.stack([np.concatenate([weighted_absolute_errors(piece) for piece in own]) for own in scored])
+    return Errors(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)

@@ -44,6 +44,7 @@ def departures(parts: Mapping[str, PartArtefacts]) -> list[str]:
     if absent:
         lines.append(f"Not part of this run: {listed(absent)}, which the paper compares as well.")
     networks = [model for part in parts.values() for model in part.models if model.estimator.startswith("velocity_")]
+    lines += _of_networks(networks)
     if networks:
         lines.append("GRU and LSTM: what their papers leave open (the LSTM's sizes, the leaky rectifier's slope) is assumed.")
     return lines
@@ -98,6 +99,29 @@ def _of_training(models: list[EvaluatedModel]) -> list[str]:
         lines.append(
             f"In training the first {_either(values('drop_steps'))} samples of a sequence do not count (paper: {PAPER_DROPPED}; the "
             f"authors' code drops them in evaluation only)."
+        )
+    return lines
+
+
+def _of_networks(models: list[EvaluatedModel]) -> list[str]:
+    """Where GRU and LSTM learn in another way than in their papers, which is how the filters learn."""
+    trainings: list[Any] = [model.training for model in models if model.training]
+    lines = []
+    if any(own.get("truncate_steps") for own in trainings):
+        steps = _either(sorted({own["sequence_steps"] for own in trainings}))
+        reach = _either(sorted({own["truncate_steps"] for own in trainings}))
+        lines.append(
+            f"GRU and LSTM learn from every sample, in sequences of {steps} by gradients that reach {reach} samples back, the hidden state "
+            f"carried on (their papers: sequences of 300, the first 200 of which do not count)."
+        )
+    if any(own.get("mirrored") for own in trainings):
+        lines.append("GRU and LSTM see as many sequences in a mirror as the filters do (their papers: none).")
+    if any(own["phase"]["schedule"] == "cosine" for own in trainings):
+        epochs = _either(sorted({own["phase"]["max_epochs"] for own in trainings}))
+        sizes = _either(sorted({own["phase"]["learning_rate"] for own in trainings}))
+        lines.append(
+            f"GRU and LSTM: {epochs} epochs at a step size of {sizes} that falls to zero along a cosine, like the filters' (paper of the "
+            f"GRU: {PAPER_STEP_SIZE:g}, constant)."
         )
     return lines
 

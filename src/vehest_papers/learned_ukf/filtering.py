@@ -104,7 +104,15 @@ def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
     return Drive(*(torch.stack([drive[position] for drive in drives]) for position in range(3)))
 
 
-def filtered(estimator: LearnedUkf, drives: Drive, model: PointModel | None = None, *, repair: bool = True) -> NonlinearFiltered:
+def filtered(
+    estimator: LearnedUkf,
+    drives: Drive,
+    model: PointModel | None = None,
+    *,
+    repair: bool = True,
+    friction: float | None = None,
+    deviation: float | None = None,
+) -> NonlinearFiltered:
     """All sequences filtered together from the true state of their first sample, as the protocol has it.
 
     Args:
@@ -112,15 +120,21 @@ def filtered(estimator: LearnedUkf, drives: Drive, model: PointModel | None = No
         drives: from `drives_of`.
         model: that moves and observes points instead.
         repair: whether covariances that lose definiteness are repaired; otherwise their sequences become NaN.
+        friction: that the filter starts from; none: as its settings say.
+        deviation: standard deviation of the friction at the start; none: what was learnt.
     """
     s = estimator.settings
     start = drives.states[:, 0].clone()
-    start[:, -1] = s.friction if s.start_friction is None else s.start_friction
+    start[:, -1] = friction or (s.friction if s.start_friction is None else s.start_friction)
     own = estimator.filter
     kept, own.repair = own.repair, repair
     try:
         with torch.no_grad():
-            return own.filtered(drives.measurements, drives.inputs, Gaussian(start, own.initial_covariance()), model=model)
+            covariance = own.initial_covariance().clone()
+            if deviation is not None:
+                covariance[-1, :] = covariance[:, -1] = 0.0
+                covariance[-1, -1] = deviation**2
+            return own.filtered(drives.measurements, drives.inputs, Gaussian(start, covariance), model=model)
     finally:
         own.repair = kept
 
@@ -140,21 +154,21 @@ def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> Non
     return filtered(predicting, drives, model)
 
 
-def mean_squares(means: torch.Tensor, drives: Drive, skip: int) -> FloatArray:
-    """Mean squared error of each of `MOVING`, the first steps of each sequence left out; (4,)."""
+def squares_of(means: torch.Tensor, drives: Drive, skip: int) -> FloatArray:
+    """Mean squared error of each of `MOVING` in each sequence, the first steps of it left out; (B, 4)."""
     errors = (means - drives.states)[:, skip:, : len(MOVING)].double()
-    return errors.square().mean(dim=(0, 1)).numpy()
+    return np.asarray(errors.square().mean(dim=1).numpy(), dtype=np.float64)
 
 
-def weighted(squares: FloatArray) -> float:
-    """The weighted MSE of mean squares in the order of `MOVING`."""
-    return float(sum(weight * squares[MOVING.index(name)] for name, weight in WEIGHTS.items()))
+def weighted(squares: FloatArray) -> FloatArray:
+    """The weighted MSE of mean squares in the order of `MOVING`, (..., 4) -> (...)."""
+    return squares @ np.array([WEIGHTS.get(name, 0.0) for name in MOVING])
 
 
 def one_step_squares(estimator: LearnedUkf, drives: Drive) -> FloatArray:
-    """Mean squared error of the prediction of the next sample from each true state; of `MOVING`, (4,)."""
+    """Mean squared error of the prediction of the next sample from each true state; of `MOVING` in each sequence, (B, 4)."""
     states, inputs = (part[:, :-1].reshape(-1, part.shape[-1]) for part in (drives.states, drives.inputs))
     with torch.no_grad():
-        after = estimator.filter.moved(states, inputs)
-    errors = (after - drives.states[:, 1:].reshape(-1, drives.states.shape[-1]))[:, : len(MOVING)].double()
-    return np.asarray(errors.square().mean(0).numpy(), dtype=np.float64)
+        after = estimator.filter.moved(states, inputs).reshape(drives.states[:, 1:].shape)
+    errors = (after - drives.states[:, 1:])[..., : len(MOVING)].double()
+    return np.asarray(errors.square().mean(1).numpy(), dtype=np.float64)

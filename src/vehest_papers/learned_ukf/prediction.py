@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
+from vehest.constants import FloatArray
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
+from vehest.evaluation.significance import Interval, difference_of_blocks
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
-from vehest_papers.learned_ukf.filtering import MOVING, filtered, mean_squares, one_step_squares, swapped, weighted
+from vehest_papers.learned_ukf.filtering import MOVING, filtered, one_step_squares, squares_of, swapped, weighted
 
 BEFORE, AFTER = paper.NNTF, paper.NNTF_U
 PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
@@ -26,34 +29,77 @@ Pair = tuple[LearnedUkf, LearnedUkf]
 """NNTF and NNTF_U of one seed."""
 
 
-def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> tuple[pd.DataFrame, pd.DataFrame]:
+@dataclass(frozen=True)
+class Compared:
+    """NNTF and NNTF_U on a test set.
+
+    Args:
+        one_step: of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4).
+        estimation: the same of their filters.
+        swaps: (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF.
+    """
+
+    one_step: FloatArray
+    estimation: FloatArray
+    swaps: Mapping[tuple[int, int], FloatArray]
+
+    def states(self, task: str, lower: Mapping[str, bool]) -> dict[str, tuple[Interval, float, bool]]:
+        """State -> difference NNTF_U - NNTF of mean squares, the error of NNTF, and whether the paper has it lower."""
+        before, after = getattr(self, task)
+        found = {}
+        for state, expected in lower.items():
+            k = MOVING.index(state)
+            found[state] = (over_sequences(after[..., k], before[..., k]), float(before[..., k].mean()), expected)
+        return found
+
+
+def over_sequences(first: FloatArray, second: FloatArray) -> Interval:
+    """Difference of means over seeds and sequences of one length, (S, B), both resampled."""
+    return difference_of_blocks(first, second, np.ones(first.shape[1]), n_resamples=4000).mean
+
+
+def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> dict[str, Compared]:
     """Errors of both models as predictors and in their filters, and of all four filters that can be put together of them.
 
     Args:
         pairs: seed -> NNTF and NNTF_U.
         drives: test set -> its sequences.
         protocol: how much of each sequence is not scored.
+    """
+    skip = round(protocol.skip_seconds * protocol.rate_hz)
+    found = {}
+    for test, own in drives.items():
+        predicted = np.array([[one_step_squares(pair[k], own) for pair in pairs.values()] for k in (0, 1)])
+        estimated: dict[tuple[int, int], list[FloatArray]] = {}
+        for pair in pairs.values():
+            results = {(0, 0): filtered(pair[0], own), (1, 1): filtered(pair[1], own)}
+            results |= {(a, b): swapped(pair[a], pair[b], own) for a, b in ((0, 1), (1, 0))}
+            for key, result in results.items():
+                estimated.setdefault(key, []).append(squares_of(result.steps.filtered.mean, own, skip))
+        estimation = np.array([estimated[0, 0], estimated[1, 1]])
+        found[test] = Compared(predicted, estimation, {key: weighted(np.array(squares)) for key, squares in estimated.items()})
+    return found
+
+
+def frames(found: Mapping[str, Compared], seeds: Sequence[int]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """What is drawn.
 
     Returns:
         One row a test set, seed, state and task: ``before``, ``after`` (mean squared errors of NNTF and NNTF_U), ``decrease`` [%].
         One row a test set, seed, ``predicts`` and ``observes``: ``mse`` (weighted).
     """
-    skip = round(protocol.skip_seconds * protocol.rate_hz)
+    names = (BEFORE, AFTER)
     states, swaps = [], []
-    for test, own in drives.items():
-        for seed, pair in pairs.items():
-            predicted = [one_step_squares(estimator, own) for estimator in pair]
-            squares = {(0, 0): filtered(pair[0], own), (1, 1): filtered(pair[1], own)}
-            squares |= {(a, b): swapped(pair[a], pair[b], own) for a, b in ((0, 1), (1, 0))}
-            errors = {key: mean_squares(result.steps.filtered.mean, own, skip) for key, result in squares.items()}
-            for task, (before, after) in (("one_step", predicted), ("estimation", (errors[0, 0], errors[1, 1]))):
+    for test, own in found.items():
+        for place, seed in enumerate(seeds):
+            for task in TASKS:
+                before, after = (part[place].mean(axis=0) for part in getattr(own, task))
                 for state, first, second in zip(MOVING, before, after, strict=True):
                     row = {"test_set": test, "seed": seed, "task": task, "state": state, "before": first, "after": second}
                     states.append(row | {"decrease": 100.0 * (1.0 - second / first)})
-            names = (BEFORE, AFTER)
             swaps += [
-                {"test_set": test, "seed": seed, "predicts": names[a], "observes": names[b], "mse": weighted(own_errors)}
-                for (a, b), own_errors in errors.items()
+                {"test_set": test, "seed": seed, "predicts": names[a], "observes": names[b], "mse": float(mse[place].mean())}
+                for (a, b), mse in own.swaps.items()
             ]
     return pd.DataFrame(states), pd.DataFrame(swaps)
 

@@ -15,6 +15,7 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import median_and_range
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
+from vehest_papers.learned_ukf.errors import Errors, in_words
 from vehest_papers.learned_ukf.filtering import Definiteness
 from vehest_papers.learned_ukf.paper import Published
 
@@ -24,50 +25,72 @@ METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "M
 STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
-def accuracy(runs: pd.DataFrame, test: str, name: str, caption: str, *, authors_code: bool) -> Table:
-    """Table I or II: the paper's figures, ours over seeds, and what the authors' public code reached.
+def accuracy(errors: Errors, test: str, name: str, caption: str) -> Table:
+    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds.
 
     Args:
-        runs: from `candidates.runs_of`.
+        errors: of all methods on the test.
         test: test set.
         name: of the file.
         caption: of the table.
-        authors_code: whether these are the files on which the authors' code was run.
     """
     published = paper.TABLES[test]
     rows = []
-    for candidate in dict.fromkeys(runs["candidate"]):
+    for candidate, squared in errors.squared.items():
+        absolute = errors.absolute[candidate]
+        values = {"mse": errors.mean(squared), "mae": errors.mean(absolute)}
         row: dict[str, object] = {"candidate": candidate}
-        code = paper.AUTHORS_CODE[test] if authors_code and candidate == paper.NNTF_UH else None
-        for short, (metric, _) in METRICS.items():
-            values = of_candidate(runs, candidate, f"{metric}.{test}")
+        for short in METRICS:
             row[f"paper_{short}"] = _figure(published.get(candidate), short)
-            row[f"ours_{short}"] = median_and_range(values, 4 if short != "ae99" else 3)
-            row |= {f"median_{short}": np.median(values), f"min_{short}": values.min(), f"max_{short}": values.max()}
-            row[f"code_{short}"] = _figure(code, short)
-        rows.append(row | {"n_seeds": len(values)})
+        for short, own in values.items():
+            row |= {short: own.value, f"{short}_low": own.low, f"{short}_high": own.high}
+            row[f"ours_{short}"] = in_words(own.value, max(own.low, 0.0), own.high, 4)
+        row["ours_ae99"] = float(np.percentile(absolute, 99.0, axis=1).mean())
+        rows.append(row | {"n_seeds": len(squared)})
     columns = {"candidate": Column("method")}
     for short, (_, header) in METRICS.items():
         columns[f"paper_{short}"] = Column(f"{header}, paper", decimals=4)
-        columns[f"ours_{short}"] = Column(f"{header}, ours")
-        if authors_code:
-            columns[f"code_{short}"] = Column(f"{header}, authors' public code", decimals=4)
+        columns[f"ours_{short}"] = Column(f"{header}, ours", decimals=3)
+    columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str, *, authors_code: bool) -> Table:
+def overview(errors: Mapping[str, Errors], kind: str) -> Table:
+    """What the terminal shows: weighted MSE of every method on both tyres, with its interval, beside the paper's."""
+    rows = []
+    for candidate in next(iter(errors.values())).squared:
+        row: dict[str, object] = {"candidate": candidate}
+        for test, own in errors.items():
+            known = paper.TABLES[test].get(candidate)
+            mse = own.mean(own.squared[candidate])
+            row |= {f"paper_{test}": known.mse if known else math.nan, f"ours_{test}": mse.value}
+            row |= {f"low_{test}": mse.low, f"high_{test}": mse.high}
+            row[f"words_{test}"] = in_words(mse.value, max(mse.low, 0.0), mse.high, 4)
+            row["n_seeds"] = len(own.squared[candidate])
+        rows.append(row)
+    columns = {"candidate": Column("method")}
+    for test in errors:
+        columns[f"paper_{test}"] = Column(f"paper, {'tyre A' if test == 'tyre_a' else 'tyre C'}", decimals=4)
+        columns[f"words_{test}"] = Column(f"ours, {SETS[test]}")
+    columns["n_seeds"] = Column("seeds", decimals=0)
+    caption = (
+        f"Summary: MSE (weighted), ours {kind.upper()}, means over seeds with 95 % intervals over sequences and seeds. Baselines take vx "
+        f"from the rims and the yaw rate from the gyroscope; {paper.ORACLE}: {paper.NNTF_UH} trained on the test itself."
+    )
+    return Table("overview", caption, pd.DataFrame(rows), columns)
+
+
+def by_state(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str) -> Table:
     """Root mean square error of each velocity on each test set."""
     rows = []
     for candidate in dict.fromkeys(runs["candidate"]):
         row: dict[str, object] = {"candidate": candidate}
         for test in tests:
             known = dict(zip(STATES, paper.RMS.get((test, candidate), ()), strict=False))
-            code = paper.AUTHORS_CODE_RMS.get(test, ()) if authors_code and candidate == paper.NNTF_UH else ()
             for state in STATES:
                 values = of_candidate(runs, candidate, f"rmse_{state}.{test}")
                 row[f"ours_{state}_{test}"] = median_and_range(values, 3)
                 row |= {f"median_{state}_{test}": np.median(values), f"paper_{state}_{test}": known.get(state, math.nan)}
-                row[f"code_{state}_{test}"] = dict(zip(STATES, code, strict=False)).get(state, math.nan)
                 row[f"shown_{state}_{test}"] = _beside(row, state, test)
         rows.append(row)
     columns = {"candidate": Column("method")}
@@ -169,10 +192,8 @@ def _figure(published: Published | None, short: str) -> float:
 
 
 def _beside(row: Mapping[str, object], state: str, test: str) -> str:
-    known = [("paper", row[f"paper_{state}_{test}"]), ("authors' code", row[f"code_{state}_{test}"])]
-    words = [f"{who} {fixed(value, 3)}" for who, value in known if isinstance(value, float) and math.isfinite(value)]
-    own = str(row[f"ours_{state}_{test}"])
-    return f"{own} ({'; '.join(words)})" if words else own
+    value, own = row[f"paper_{state}_{test}"], str(row[f"ours_{state}_{test}"])
+    return f"{own} (paper {fixed(value, 3)})" if isinstance(value, float) and math.isfinite(value) else own
 
 
 def _epochs_by_phase(history: pd.DataFrame) -> list[int]:

@@ -170,10 +170,14 @@ class CarFilter(nn.Module):
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""
+        return self.believed(drives, start, steps)[0]
+
+    def believed(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+        """The same with their covariances, (B, T, 5, 5), differentiable too."""
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
         model = self.point_model()
-        parts = []
+        means, covariances = [], []
         for first in range(0, total, steps or total):
             # a later stretch starts with the last sample of the one before, which is not measured twice
             begin, end = max(first - 1, 0), min(first + (steps or total), total)
@@ -182,9 +186,10 @@ class CarFilter(nn.Module):
                 measurements = torch.cat([torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1)
             states = self._settled(drives.states[:, begin:end])
             filtered = self.filtered(measurements, drives.inputs[:, begin:end], initial, states, model).steps.filtered
-            parts.append(filtered.mean[:, first - begin :])
+            means.append(filtered.mean[:, first - begin :])
+            covariances.append(filtered.covariance[:, first - begin :])
             initial = Gaussian(filtered.mean[:, -1].detach(), filtered.covariance[:, -1].detach())
-        return torch.cat(parts, 1)
+        return torch.cat(means, 1), torch.cat(covariances, 1)
 
     def judged(self, drives: Drive) -> Tensor:
         """Estimated states of sequences, (B, T, 5), from the true state of their first sample."""

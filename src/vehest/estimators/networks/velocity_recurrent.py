@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -23,6 +24,8 @@ from vehest.training.context import FitContext
 from vehest.training.sequences import Phase, PhaseRecord, PhaseSettings, train_phases
 
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
+ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
+"""Channels and outputs that change sign in a mirror, left for right; the others stay."""
 CHUNK = 10_000  # samples that are estimated at a time
 
 State = tuple[Tensor, ...]
@@ -37,6 +40,11 @@ class SequenceSettings:
         sequence_steps: samples in a training sequence, the dropped ones included.
         validation_steps: samples in a validation sequence, the dropped ones included.
         dropped_steps: first samples of every sequence, on which the hidden state settles; no loss is taken of them.
+        validation_dropped_steps: the same of validation sequences; none: as in training.
+        truncate_steps: samples that gradients reach back. Drives are then cut whole into sequences of ``sequence_steps`` and less, with no
+            remainder left out, and there is a step after every so many samples, the hidden state carried on. 0: to the start of the
+            sequence, and remainders are left out.
+        mirrored: share of training sequences that are seen in a mirror, left for right.
         batch_size: sequences in a batch.
         weight_vx: of the squared error of vx in the loss; likewise the others.
         weight_vy: of vy.
@@ -52,6 +60,9 @@ class SequenceSettings:
     sequence_steps: int = 300
     validation_steps: int = 1000
     dropped_steps: int = 200
+    validation_dropped_steps: int | None = None
+    truncate_steps: int = 0
+    mirrored: float = 0.0
     batch_size: int = 4
     weight_vx: float = 0.2225
     weight_vy: float = 0.5064
@@ -62,18 +73,24 @@ class SequenceSettings:
     def __post_init__(self) -> None:
         if self.batch_size < 1:
             raise ConfigurationError(f"training.batch_size must be at least 1, not {self.batch_size}")
-        if self.dropped_steps < 0:
-            raise ConfigurationError(f"training.dropped_steps must not be negative, not {self.dropped_steps}")
-        for name in ("sequence_steps", "validation_steps"):
-            if getattr(self, name) <= self.dropped_steps:
-                raise ConfigurationError(
-                    f"training.{name} must be more than dropped_steps ({self.dropped_steps}), not {getattr(self, name)}"
-                )
+        for name in ("dropped_steps", "settling_steps", "truncate_steps"):
+            if getattr(self, name) < 0:
+                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        for name, dropped in (("sequence_steps", self.dropped_steps), ("validation_steps", self.settling_steps)):
+            if getattr(self, name) <= dropped:
+                raise ConfigurationError(f"training.{name} must be more than dropped_steps ({dropped}), not {getattr(self, name)}")
+        if not 0.0 <= self.mirrored <= 1.0:
+            raise ConfigurationError(f"training.mirrored must lie between 0 and 1, not at {self.mirrored}")
         for name in ("weight_vx", "weight_vy", "weight_yaw_rate"):
             if getattr(self, name) < 0:
                 raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
         if self.dtype not in ("float32", "float64"):
             raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+
+    @property
+    def settling_steps(self) -> int:
+        """First samples of a validation sequence that do not count."""
+        return self.dropped_steps if self.validation_dropped_steps is None else self.validation_dropped_steps
 
 
 @dataclass(frozen=True)
@@ -339,12 +356,29 @@ class _Drive:
 
 @dataclass(frozen=True)
 class _Batch:
-    """Sequences side by side: measurements (B, T, C), references (B, T, O), velocities to start from (B, O), mask of dropout."""
+    """Sequences side by side.
+
+    Attributes:
+        inputs: measurements, (B, T, C).
+        targets: references, (B, T, O).
+        starts: velocities to start from, (B, O).
+        mask: of dropout, (B, T, H).
+        counted: which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones.
+        goes_on: whether the batch continues the one before, whose hidden state it starts from.
+    """
 
     inputs: Tensor
     targets: Tensor
     starts: Tensor
     mask: Tensor | None = None
+    counted: Tensor | None = None
+    goes_on: bool = False
+
+    def stretch(self, first: int, end: int) -> _Batch:
+        """Its samples from ``first`` to ``end``."""
+        counted = None if self.counted is None else self.counted[:, first:end]
+        mask = None if self.mask is None else self.mask[:, first:end]
+        return _Batch(self.inputs[:, first:end], self.targets[:, first:end], self.starts, mask, counted, first > 0)
 
 
 class _Cutter:
@@ -361,6 +395,44 @@ class _Cutter:
         rows = firsts.unsqueeze(1) + torch.arange(steps)
         return _Batch(self.inputs[rows], self.targets[rows], self.starts[firsts], mask)
 
+    def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
+        """All drives, cut whole at random places into pieces of ``steps`` samples and less: first row and length of each, (N, 2)."""
+        found = []
+        for length, offset in zip(self.lengths, self.offsets, strict=True):
+            shift = int(torch.randint(steps, (), generator=generator))
+            edges = sorted({0, *range(shift, length, steps), length})
+            found += [(offset + first, end - first) for first, end in itertools.pairwise(edges)]
+        return torch.tensor(found)
+
+    def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
+        """Pieces of different lengths side by side, as long as the longest; what is beyond a piece's end does not count."""
+        firsts, lengths = pieces.unbind(1)
+        places = torch.arange(int(lengths.max()))
+        rows = firsts.unsqueeze(1) + torch.minimum(places, lengths.unsqueeze(1) - 1)
+        counted = ((places >= dropped) & (places < lengths.unsqueeze(1))).to(self.inputs.dtype)
+        return _Batch(self.inputs[rows], self.targets[rows], self.starts[firsts], mask, counted)
+
+
+class _Mirror:
+    """Signs of measurements and outputs, left for right."""
+
+    def __init__(self, settings: VelocityNetworkSettings, dtype: torch.dtype) -> None:
+        signs = [[-1.0 if name in ODD else 1.0 for name in names] for names in (settings.inputs, settings.outputs)]
+        self._inputs, self._outputs = (torch.tensor(own, dtype=dtype) for own in signs)
+
+    def some(self, batch: _Batch, share: float, generator: torch.Generator) -> _Batch:
+        """The batch with a share of its sequences mirrored; nothing is drawn where the share is 0."""
+        if not share:
+            return batch
+        turned = torch.rand(len(batch.starts), 1, generator=generator) < share
+        inputs, outputs = (torch.where(turned, signs, 1.0) for signs in (self._inputs, self._outputs))
+        return replace(
+            batch,
+            inputs=batch.inputs * inputs.unsqueeze(1),
+            targets=batch.targets * outputs.unsqueeze(1),
+            starts=batch.starts * outputs,
+        )
+
 
 def _phase(
     network: VelocityNetwork,
@@ -370,18 +442,26 @@ def _phase(
     validation: Sequence[_Drive],
 ) -> Phase:
     """The one phase of a recurrent network."""
-    dtype, steps, dropped = getattr(torch, training.dtype), training.sequence_steps, training.dropped_steps
-    cutter = _Cutter(train, dtype)
+    dtype, steps, truncated = getattr(torch, training.dtype), training.sequence_steps, training.truncate_steps
+    cutter, mirror = _Cutter(train, dtype), _Mirror(settings, dtype)
     if max(cutter.lengths) < steps:
         lengths = ", ".join(f"'{drive.name}' {len(drive)}" for drive in train)
         raise DataError(f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it")
     judged = _validation_batches(validation, training, dtype)
     weights = torch.tensor([getattr(training, f"weight_{name}") for name in settings.outputs], dtype=dtype)
+    carried: list[State] = []
 
-    def errors(batch: _Batch) -> Tensor:
-        outputs, _ = network(batch.inputs, network.start(batch.starts), batch.mask)
+    def errors(batch: _Batch, dropped: int) -> Tensor:
+        outputs, state = network(batch.inputs, carried[0] if batch.goes_on else network.start(batch.starts), batch.mask)
+        carried[:] = [tuple(part.detach() for part in state)]
         weighted: Tensor = (outputs - batch.targets)[:, dropped:].square() @ weights
         return weighted
+
+    def mask_of(sequences: int, length: int, generator: torch.Generator) -> Tensor | None:
+        if not settings.dropout:
+            return None
+        kept = torch.rand(sequences, length, settings.n_states, generator=generator) >= settings.dropout
+        return kept.to(dtype) / (1.0 - settings.dropout)
 
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
         firsts = []
@@ -392,17 +472,28 @@ def _phase(
                 firsts += [offset + shift + number * steps for number in range(count)]
         order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
         for chosen in order.split(training.batch_size):
-            mask = None
-            if settings.dropout:
-                kept = torch.rand(len(chosen), steps, settings.n_states, generator=generator) >= settings.dropout
-                mask = kept.to(dtype) / (1.0 - settings.dropout)
-            yield cutter.cut(chosen, steps, mask)
+            batch = cutter.cut(chosen, steps, mask_of(len(chosen), steps, generator))
+            yield mirror.some(batch, training.mirrored, generator)
+
+    def stretches(generator: torch.Generator) -> Iterator[_Batch]:
+        pieces = cutter.pieces(steps, generator)
+        for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(training.batch_size):
+            longest = int(chosen[:, 1].max())
+            batch = cutter.padded(chosen, training.dropped_steps, mask_of(len(chosen), longest, generator))
+            batch = mirror.some(batch, training.mirrored, generator)
+            for first in range(0, longest, truncated):
+                yield batch.stretch(first, first + truncated)
+
+    def loss(batch: _Batch) -> Tensor:
+        if batch.counted is None:
+            return errors(batch, training.dropped_steps).mean()
+        return (errors(batch, 0) * batch.counted).sum() / batch.counted.sum().clamp(min=1.0)
 
     def validate() -> float:
-        samples = torch.cat([errors(batch).reshape(-1) for batch in judged])
+        samples = torch.cat([errors(batch, training.settling_steps).reshape(-1) for batch in judged])
         return float(samples.double().mean())
 
-    return Phase("sequences", training.phase, network, batches, lambda batch: errors(batch).mean(), validate)
+    return Phase("sequences", training.phase, network, stretches if truncated else batches, loss, validate)
 
 
 def _validation_batches(drives: Sequence[_Drive], training: SequenceSettings, dtype: torch.dtype) -> list[_Batch]:
@@ -411,10 +502,10 @@ def _validation_batches(drives: Sequence[_Drive], training: SequenceSettings, dt
     batches = []
     for drive, length, offset in zip(drives, cutter.lengths, cutter.offsets, strict=True):
         steps = min(length, training.validation_steps)
-        if steps <= training.dropped_steps:
+        if steps <= training.settling_steps:
             raise DataError(
                 f"recording '{drive.name}' is {length} samples long: too short to validate on with training.dropped_steps "
-                f"{training.dropped_steps}; choose a longer range in conf/split"
+                f"{training.settling_steps}; choose a longer range in conf/split"
             )
         firsts = offset + steps * torch.arange(length // steps)
         batches.append(cutter.cut(firsts, steps))

@@ -1,0 +1,65 @@
+"""How much of the errors the filters' own bands hold, with and without a likelihood term in their training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from vehest.evaluation.consistency import COVERAGE
+from vehest.evaluation.metrics import Scored
+from vehest.report.document import Column, Table
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest_papers.learned_ukf.candidates import SETS, losses, scored_of
+from vehest_papers.learned_ukf.errors import in_words
+
+
+def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedModel]]], candidate: str, name: str, data: str) -> Table:
+    """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two deviations, with 95 % intervals.
+
+    Args:
+        trained: words for a training -> its part and the candidate's seeds.
+        candidate: that is compared.
+        name: of the file.
+        data: real or simulated.
+    """
+    rows: list[dict[str, object]] = []
+    for test, tyre in SETS.items():
+        for words, (part, models) in trained.items():
+            errors = losses(part, test)
+            mse = errors.mean(errors.squared[candidate])
+            row: dict[str, object] = {"tyre": tyre, "training": words, "mse_words": in_words(mse.value, max(mse.low, 0.0), mse.high, 4)}
+            scored = [scored_of(part, model, test) for model in models]
+            for sigma, expected in COVERAGE.items():
+                inside = np.stack([np.concatenate([_within(piece, sigma) for piece in own]) for own in scored])
+                share = errors.mean(inside)
+                row |= {
+                    f"inside_{sigma}": share.value,
+                    f"words_{sigma}": in_words(share.value, max(share.low, 0.0), min(share.high, 1.0), 3),
+                }
+                row[f"expected_{sigma}"] = expected
+            row["width"] = float(np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own]))
+            rows.append(row)
+    columns = {
+        "tyre": Column("tyre"),
+        "training": Column("training"),
+        "mse_words": Column("MSE (weighted)"),
+        **{f"words_{sigma}": Column(f"within {sigma}σ (Gaussian: {expected:.3f})") for sigma, expected in COVERAGE.items()},
+        "width": Column("mean σ of vy [m/s]", decimals=3),
+    }
+    caption = (
+        f"Bands of {candidate}: share of vy's errors within the filter's own deviations, 95 % intervals over sequences and seeds. "
+        f"Likelihood: a second term in the loss of the training through the filter, not in the paper. Data: {data}."
+    )
+    return Table(f"coverage_{name}", caption, pd.DataFrame(rows), columns)
+
+
+def _variance(piece: Scored) -> np.ndarray:
+    assert piece.covariance is not None
+    place = piece.covariance_of.index("vy")
+    return np.maximum(piece.covariance[:, place, place], 0.0)
+
+
+def _within(piece: Scored, sigma: float) -> np.ndarray:
+    return (np.square(piece.errors["vy"]) <= sigma**2 * _variance(piece)).astype(np.float64)
