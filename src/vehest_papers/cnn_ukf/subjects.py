@@ -37,6 +37,10 @@ LINES = {
     paper.DATA: Line("#b8480b", "dashdot", "o"),
     paper.DEEP: Line("#00876c", "solid", "D"),
     paper.CNN: Line("#d6336c", "solid", "^"),
+    paper.FREE: Line("#7048a8", "dashed", "v"),
+    paper.DATA_SHEET: Line("#9aa7b5", "dashdot", "x"),
+    paper.STATIC_MAP: Line("#6b7682", "dashed", "+"),
+    paper.ZERO: Line("#c3cad2", "dotted", "."),
 }
 KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
@@ -50,7 +54,17 @@ _NAMES = {
     ("sideslip_ffnn", False): paper.DATA,
     ("ensemble_ukf", False): paper.DEEP,
     ("cnn_ukf", False): paper.CNN,
+    ("zero", False): paper.ZERO,
+    ("static_map", False): paper.STATIC_MAP,
+    ("data_sheet", False): paper.DATA_SHEET,
 }
+PARTS_AWAY = {
+    "_no_pseudo_measurement": "without pseudo-measurement",
+    "_no_adaptive_distrust": "σ_DD constant",
+    "_no_adaptive_process": "process noise constant",
+    "_plain": "plain tyres",
+}
+"""What a variant's name says is taken away -> in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +94,15 @@ Runs = Mapping[str, Sequence[Run]]
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model.
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named.
 
     Raises:
         DataError: it has none like it.
     """
+    if model.estimator == "cnn_ukf":
+        away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
+        if away:
+            return ", ".join(away)
     name = model.estimator, model.variant.endswith("_smooth")
     if name not in _NAMES:
         raise DataError(f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study")
@@ -117,12 +135,19 @@ def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     for name, runs in groups.items():
         if len({run.model.seed for run in runs}) != len(runs):
             raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in paper.CANDIDATES if name in groups}
+    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
+    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in order}
 
 
 def chosen(runs: Sequence[Run]) -> Run:
-    """The seed with the lowest mean squared error on the validation manoeuvres. Test manoeuvres choose nothing."""
-    return min(runs, key=lambda run: kpis(run.validation).mse)
+    """The seed with the lowest mean RMSE of a validation manoeuvre, which no single one decides. Test manoeuvres choose nothing."""
+    return min(runs, key=lambda run: balanced(run.validation))
+
+
+def balanced(manoeuvres: Manoeuvres) -> float:
+    """Mean over manoeuvres of their RMSE(β) [deg]."""
+    roots = [np.sqrt(np.mean(np.square(np.concatenate([sideslip_error(part) for part in parts])))) for parts in manoeuvres.values()]
+    return float(np.mean(roots))
 
 
 def losses(runs: Runs, *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
@@ -147,11 +172,11 @@ def losses(runs: Runs, *, nonlinear_only: bool = False) -> tuple[dict[str, Float
 
 
 def kpi_table(runs: Runs) -> pd.DataFrame:
-    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse``; a row a run."""
+    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse`` [deg²], ``validation_balanced`` [deg]; a row a run."""
     rows = [
         {"candidate": candidate, "seed": run.model.seed}
         | {name: getattr(run.kpis, name) for name in KPIS}
-        | {"validation_mse": kpis(run.validation).mse}
+        | {"validation_mse": kpis(run.validation).mse, "validation_balanced": balanced(run.validation)}
         for candidate, own in runs.items()
         for run in own
     ]
