@@ -74,15 +74,19 @@ def on_parts(main: Comparison, data: str) -> list[Statement | Claim]:
         if hybrid in main and own_filter in main:
             tests = [Compared(HEADERS[own], main.change(hybrid, own_filter, own)) for own in (MSE, MSE_NL)]
             entries.append(Statement(f"not in the paper: {hybrid} below its own filter", "–", data, tests))
+    if paper.SMOOTH in main:
+        tests = [Compared(HEADERS[own], main.change(paper.SMOOTH, paper.MODEL, own)) for own in (MSE, MSE_NL)]
+        entries.append(Statement("not in the paper: smooth tyres better than plain in the filter alone", "–", data, tests))
     if paper.FREE in main:
         tests = [Compared(HEADERS[own], main.change(paper.CNN, paper.FREE, own)) for own in (MSE, MSE_NL)]
         entries.append(Statement("not in the paper: CNN-UKF below a filter alone with free noise", "–", data, tests))
     others = [name for name in (paper.ZERO, paper.STATIC_MAP, paper.DATA_SHEET) if name in main]
     tests = [Compared(name, main.change(paper.CNN, name, MSE)) for name in others]
     entries.append(Statement("not in the paper: MSE of CNN-UKF below v = 0, static map, data sheet", "–", data, tests))
-    if paper.Z_SCORES in main:
-        tests = [Compared(HEADERS[own], main.change(paper.DATA, paper.Z_SCORES, own)) for own in (MSE, MSE_NL)]
-        entries.append(Statement("III-A: inputs in [0, 1] better than z-scores (data-driven)", "“best results”", data, tests))
+    has_scores = paper.Z_SCORES in main
+    tests = [Compared(HEADERS[own], main.change(paper.DATA, paper.Z_SCORES, own)) for own in (MSE, MSE_NL) if has_scores]
+    words = "III-A: inputs in [0, 1] better than z-scores (data-driven)"
+    entries.append(Statement(words, "“best results”", data, tests, "not trained here"))
     return list(entries)
 
 
