@@ -12,7 +12,7 @@ from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.networks import with_perfect_distrust
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
 
-IDENTIFICATION = IdentificationSettings(trials=40, restarts=2, error="recordings")
+IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")
 
 
 def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
