@@ -103,9 +103,7 @@ def on_networks(main: Comparison, outputs: OutputsOf, data: str) -> list[Stateme
     other, other_low, other_high = _over_samples(main, outputs[paper.DEEP], _decades)
     ours = f"{fixed(value, 1)} [{fixed(low, 1)}, {fixed(high, 1)}] and {fixed(other, 1)} [{fixed(other_low, 1)}, {fixed(other_high, 1)}]"
     apart: Verdict = "reproduced" if low > other_high else "not reproduced" if high < other_low else "undecided"
-    found.append(
-        Claim("CNN-UKF's σ_DD spans more decades than DE-UKF's (1 to 99 %)", "3 and 1", ours, data, apart, "intervals apart, or not")
-    )
+    found.append(Claim("CNN-UKF's σ_DD spans more decades than DE-UKF's (1 to 99 %)", "3 and 1", ours, data, apart, "intervals"))
     for words_of_claim, known, statistic, limit in (
         ("σ_ψ̇ rises by two decades where |β| ≥ 5° (ratio of medians to below 1°)", "100", _rise_of_yaw_rate, 100.0),
         ("σ_Vy rises where non-linear (ratio of medians)", "rises", _rise_of_vy, 1.0),
@@ -138,7 +136,7 @@ def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
     verdict: Verdict = "reproduced" if below == len(changes) else "not reproduced" if above else "undecided"
     low, high = min(own.ends()[0] for own in changes), max(own.ends()[1] for own in changes)
     ours = f"below in {below}, above in {above} of {len(changes)}; −{short(100 * (1 - low))} to {short(100 * (high - 1))} %"
-    entries.append(Claim("CNN-UKF below DE-UKF in MSE_nl in all nine combinations", "all", ours, data, verdict, "intervals of all nine"))
+    entries.append(Claim("CNN-UKF below DE-UKF in MSE_nl in all nine combinations", "all", ours, data, verdict, "intervals"))
     if found.tuned:
         from_there = next(runs for runs in found.stiffness if runs is found.stiffness[0])
         own = Comparison({"tuned": found.tuned, "as trained": from_there[paper.DEEP]}, "test")
@@ -189,14 +187,13 @@ def not_testable() -> list[Claim]:
         ("errors on the BMW's recordings", "Tables II, III", "the recordings are not public"),
         ("intelligent bearings as good as wheel force transducers", "cited", "no such sensors here"),
         ("feed-forward better than recurrent networks with tyre forces", "IV-C, cited", "no recurrent network here takes forces"),
-        ("fewer labelled drives by weakly supervised training", "future work", "not done in the paper"),
     )
     return [Claim(words, known, "–", "none", "not testable on this data", why) for words, known, why in entries]
 
 
 def level(words: str, known: str, data: str, change: Change) -> Claim:
     """The claim that two figures are level: within ±10 %, by the interval of their relative change."""
-    return Claim(words, known, change.in_percent(), data, _level(change), f"interval against ±{100 * LEVEL:.0f} %")
+    return Claim(words, known, change.in_percent(), data, _level(change), f"against ±{100 * LEVEL:.0f} %")
 
 
 def _level(change: Change) -> Verdict:
@@ -228,7 +225,7 @@ def _of_ends(words: str, known: str, ours: str, data: str, ends: Sequence[tuple[
     """The claim that all of some figures lie above a limit, by their intervals."""
     above, below = all(low > limit for low, _ in ends), any(high < limit for _, high in ends)
     verdict: Verdict = "reproduced" if above else "not reproduced" if below else "undecided"
-    return Claim(words, known, ours, data, verdict, f"interval against {limit:g}")
+    return Claim(words, known, ours, data, verdict, f"against {limit:g}")
 
 
 def _nonlinear_moments(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -269,7 +266,7 @@ def _nearest_zero(main: Comparison, data: str) -> Claim:
     reach = [max(abs(low), abs(high)) for name, (_, low, high) in means.items() if name != paper.CNN]
     least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     verdict: Verdict = "reproduced" if largest < min(others) else "not reproduced" if least > min(reach) else "undecided"
-    return Claim("Fig. 5: CNN-UKF's mean error nearest zero (non-linear)", "yes", ours, data, verdict, "intervals of |mean| apart, or not")
+    return Claim("Fig. 5: CNN-UKF's mean error nearest zero (non-linear)", "yes", ours, data, verdict, "intervals")
 
 
 def _groups(main: Comparison, data: str) -> Claim:
@@ -284,7 +281,7 @@ def _groups(main: Comparison, data: str) -> Claim:
     named = ", ".join(group for group, own in zip(groups, best[:, 0], strict=True) if own) or "none"
     ours = f"{drawn[0]} [{low:.0f}, {high:.0f}] of {len(groups)}: {named}"
     verdict: Verdict = "reproduced" if low >= 5 else "not reproduced" if high < 5 else "undecided"
-    return Claim("Fig. 6: CNN-UKF best in MSE_nl in five groups or more", "5 of 7", ours, data, verdict, "interval against 5")
+    return Claim("Fig. 6: CNN-UKF best in MSE_nl in five groups or more", "5 of 7", ours, data, verdict, "against 5")
 
 
 def _of_group(main: Comparison, group: str) -> list[Measured]:

@@ -94,7 +94,7 @@ def claims(found: pd.DataFrame) -> list[Claim]:
     steered, straight = found[found["steer"] > 0], found[found["steer"] == 0]
     full, lost = int((steered["rank"] == 2).sum()), int((straight["rank"] < 2).sum())
     worst = float(straight["deviation"].max() / found[found["steer"] == min(steered["steer"])]["deviation"].max())
-    why = "computed, without sampling error"
+    why = "exact"
     return [
         Claim(
             "III-B: observable where the car steers (rank 2)",
