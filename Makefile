@@ -111,7 +111,7 @@ learned_ukf_sim: $(INSTALLED) ## the same on simulated tyre sets, with fewer can
 heavy_ekf: $(INSTALLED) ## a heavy vehicle by Kalman filters whose tyres adapt: laps, a map of slip and stiffness, and the real Ferrari and AV-21 with VEHEST_DATA; at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/heavy_ekf.yaml
 
-cnn_ukf: $(INSTALLED) ## the tables and figures of the UKF-informed network's paper, simulated, and the real Ferrari with VEHEST_DATA: hours
+cnn_ukf: $(INSTALLED) ## the UKF-informed network's paper claim by claim on new simulated manoeuvres: at most 5 h on two cores, goes on where it was stopped
 	$(BIN)/vehest run pipelines/cnn_ukf.yaml
 
 proving_ground: $(INSTALLED) ## the simulated cars beside papers and a real recording (VEHEST_DATA, if you have it)

@@ -204,3 +204,17 @@ def test_what_makes_no_sense_is_refused():
         DugoffUkf.from_config({"car": {"cg_height": -1.0}})
     with pytest.raises(DataError, match=r"no training recording is called '\*skidpad\*'"):
         DugoffUkf.from_config({}).fit(FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data"))
+
+
+def test_errors_that_are_alike_over_samples_count_as_fewer_measurements():
+    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
+    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
+    np.testing.assert_array_equal(process, same)
+    np.testing.assert_allclose(tenfold, 10.0 * once)
+
+
+def test_the_search_for_the_yaw_rates_noise_stays_below_its_limit():
+    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
+    data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
+    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
+    assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5

@@ -17,7 +17,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
 from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
-from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter
+from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter, error_over
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
@@ -254,3 +254,66 @@ def test_what_makes_no_sense_is_said() -> None:
     estimator = estimator_of("cnn_ukf")
     with pytest.raises(DataError, match="'unit' is missing, unknown or of another shape"):
         estimator.load_weights({name: values for name, values in estimator.weights().items() if name != "network.unit"})
+
+
+@pytest.mark.parametrize(
+    ("away", "held"),
+    [("pseudo_measurement", [cnn_ukf.DISTRUST]), ("adaptive_distrust", [cnn_ukf.DISTRUST]), ("adaptive_process", cnn_ukf.PROCESS)],
+)
+def test_what_is_taken_away_is_the_same_at_every_sample(away: str, held: list[int]) -> None:
+    estimator = estimator_of("cnn_ukf", **{away: False})
+    assert isinstance(estimator, CnnUkf)
+    estimator.fit(DATA, TRAININGS["cnn_ukf"])
+    assert estimator.variant == f"full_no_{away}"
+    outputs = estimator.network.said(DATA.validation[0].stack(estimator.inputs))[0]
+    changing = [output for output in range(4) if np.ptp(outputs[:, output]) > 0.0]
+    assert changing == [output for output in range(4) if output not in held]
+    word = estimator.word(DATA.validation[0].stack(estimator.inputs))
+    if away == "adaptive_process":
+        assert word.process is not None
+        np.testing.assert_allclose(np.sqrt(word.process[0]), [LEVELS["process_vy"], LEVELS["process_yaw_rate"]], rtol=1e-5)
+    elif away == "pseudo_measurement":
+        np.testing.assert_allclose(word.variance, 1.0, rtol=1e-5)
+        alone = estimator.model.estimate([DATA.validation[0].without_references()])[0]["vy"]
+        constant = word._replace(process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone)))
+        ((_, (mean, *_)),) = estimator.filtered([DATA.validation[0]], [constant])
+        np.testing.assert_allclose(mean[0, :, 0], alone, atol=2e-3)
+    else:
+        other = estimator_of("cnn_ukf", **{away: False})
+        other.fit(DATA, replace(TRAININGS["cnn_ukf"], pre_training=PhaseSettings(learning_rate=5e-3, max_epochs=2)))
+        assert other.word(DATA.validation[0].stack(estimator.inputs)).variance[0] != word.variance[0]  # one value, but a learnt one
+
+
+def test_a_loss_in_degrees_is_the_same_in_another_unit() -> None:
+    _, own = end_to_end()
+    batch = next(iter(own.batches(torch.Generator().manual_seed(0))))
+    in_radians = float(own.loss(batch).detach())
+    own.training = replace(own.training, loss_unit="deg")
+    assert float(own.loss(batch).detach()) == pytest.approx(np.degrees(np.degrees(in_radians)), rel=1e-12)
+
+
+def test_one_recording_decides_less_where_recordings_count() -> None:
+    quiet, wild = (0.01 * 100, 100), (4.0 * 100, 100)
+    assert error_over([quiet] * 9 + [wild], "samples") == pytest.approx(0.409)
+    assert error_over([quiet] * 9 + [wild], "recordings") == pytest.approx(0.29**2)
+    assert error_over([quiet, (0.0, 0)], "recordings") == pytest.approx(0.01)
+    estimator = estimator_of("cnn_ukf")
+    words = [Word(drive["sideslip_ref"] + off, np.full(len(drive), 1e-4)) for drive, off in zip(DATA.train, (0.0, 0.05), strict=True)]
+    both, first, second = (
+        estimator.mean_squared_error(drives, own, over="recordings")
+        for drives, own in ((DATA.train, words), (DATA.train[:1], words[:1]), (DATA.train[1:], words[1:]))
+    )
+    assert np.sqrt(both) == pytest.approx(0.5 * (np.sqrt(first) + np.sqrt(second)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong"),
+    [
+        (EndToEndSettings, {"loss_unit": "grad"}),
+        (IdentificationSettings, {"error": "drives"}),
+        (IdentificationSettings, {"most_process_yaw_rate": 0.0}),
+    ],
+)
+def test_settings_of_a_training_that_make_no_sense_are_refused(settings: type, wrong: dict[str, object]) -> None:
+    with pytest.raises(ConfigurationError, match=next(iter(wrong))):
+        settings(**wrong)

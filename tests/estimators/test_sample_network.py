@@ -165,6 +165,18 @@ def test_what_is_missing_or_makes_no_sense_is_said() -> None:
     drive = dugoff_drive(2.0)
     with pytest.raises(DataError, match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu"):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
-    for config in ({"inputs": "all"}, {"hidden": [5]}, {"hidden": "ab"}, {"dropout": 1.0}):
+    for config in ({"inputs": "all"}, {"hidden": [5]}, {"hidden": "ab"}, {"dropout": 1.0}, {"normalisation": "rank"}):
         with pytest.raises(ConfigurationError, match="estimator"):
             estimator_class("sideslip_ffnn").from_config(config)
+
+
+def test_inputs_are_scaled_by_their_range_or_to_z_scores() -> None:
+    inputs = np.column_stack([np.linspace(-3.0, 5.0, 50), np.full(50, 7.0)])
+    network = SampleNetwork(2, (4, 3), 1).double()
+    network.scale(inputs, np.ones(50))
+    scaled = network.scaled(torch.as_tensor(inputs)).numpy()
+    np.testing.assert_allclose([scaled[:, 0].min(), scaled[:, 0].max(), *scaled[:, 1]], [0.0, 1.0, *np.zeros(50)], atol=1e-12)
+    network.scale(inputs, np.ones(50), "standard")
+    scaled = network.scaled(torch.as_tensor(inputs)).numpy()
+    np.testing.assert_allclose([scaled[:, 0].mean(), scaled[:, 0].std(), *scaled[:, 1]], [0.0, 1.0, *np.zeros(50)], atol=1e-12)
+    assert estimator_class("sideslip_ffnn").from_config({"normalisation": "standard"}).variant == "full_standard"

@@ -51,8 +51,8 @@ def configuration(group: str, name: str) -> dict[str, Any]:
 
 
 @cache
-def source() -> SimulatedSource:
-    return SimulatedSource({**configuration("dataset", "sim_bmw"), "vehicle": configuration("vehicle", "bmw_545i")})
+def source(dataset: str = "sim_bmw") -> SimulatedSource:
+    return SimulatedSource({**configuration("dataset", dataset), "vehicle": configuration("vehicle", "bmw_545i")})
 
 
 @cache
@@ -64,8 +64,8 @@ def role_of(drive_id: str) -> str:
     return drive_id.split("_")[0]
 
 
-def mix(role: str) -> Counter[str]:
-    return Counter(drive.manoeuvre["name"] for name, drive in source().drives.items() if role_of(name) == role)
+def mix(role: str, dataset: str = "sim_bmw") -> Counter[str]:
+    return Counter(drive.manoeuvre["name"] for name, drive in source(dataset).drives.items() if role_of(name) == role)
 
 
 # --- the mix
@@ -101,6 +101,18 @@ def test_train_validation_and_test_drives_come_from_the_same_ranges() -> None:
 
     assert ranges("train") == ranges("validation") == ranges("test")
     assert len({drive.seed for drive in source().drives.values()}) == 216
+
+
+def test_the_new_test_is_twice_the_papers_from_the_ranges_of_training_and_shares_no_seed() -> None:
+    assert mix("unseen", "sim_bmw_unseen") == {name: 2 * count for name, count in TEST_MANOEUVRES.items()}
+    new, old = source("sim_bmw_unseen").drives, source().drives
+    assert not {drive.seed for drive in new.values()} & {drive.seed for drive in old.values()}
+    assert len({drive.seed for drive in new.values()}) == len(new) == 94
+    known = {str({key: value for key, value in drive.manoeuvre.items() if key != "laps"}) for drive in old.values()}
+    tested = {
+        str({key: value for key, value in drive.manoeuvre.items() if key != "laps"}) for name, drive in new.items() if "unseen" in name
+    }
+    assert tested == known
 
 
 def nominal_seconds(manoeuvre: Manoeuvre) -> float:
@@ -147,8 +159,7 @@ def five_seconds(name: str, channels: Iterable[str]) -> Recording:
 
 
 def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
-    assert dataset == "sim_bmw"
-    return {name: partial(five_seconds, name) for name in source().ids()}
+    return {name: partial(five_seconds, name) for name in source(dataset).ids()}
 
 
 @cache
@@ -171,6 +182,17 @@ def test_the_limited_split_learns_below_7_and_is_tested_on_everything() -> None:
     assert {span.stop for span in limited.train + limited.validation} == {2.5}  # beyond 7 m/s² after that
     assert limited.tests == full.tests
     assert limited.kept["train"].seconds == pytest.approx(161 * 2.5)
+
+
+def test_the_new_splits_learn_on_the_same_drives_and_test_on_none_that_chose() -> None:
+    full, limited = split("sim_bmw_unseen"), split("sim_bmw_unseen_limited")
+    assert full.train == split("sim_bmw").train
+    assert limited.train == split("sim_bmw_limited").train
+    assert set(split("sim_bmw").validation) < set(full.validation)
+    roles = Counter(role_of(span.recording) for span in full.validation)
+    assert roles == {"validation": 32, "select": 48}
+    assert Counter(role_of(span.recording) for span in full.tests["test"]) == {"unseen": 46}
+    assert limited.tests == full.tests
 
 
 # --- the car

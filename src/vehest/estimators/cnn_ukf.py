@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -9,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.hooks import RemovableHandle
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -26,6 +28,8 @@ from vehest.training.sequences import Phase, PhaseSettings, train_phases
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
+SATURATED = 20.0  # of which the logistic function is 1
+DISTRUST, PROCESS = 1, [2, 3]  # which outputs they are
 MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
 
 
@@ -36,10 +40,22 @@ class CnnUkfSettings(NetworkUkfSettings):
     Args:
         curve: see `DugoffUkfSettings`.
         hidden: see `NetworkUkfSettings`.
+        pseudo_measurement: whether the filter listens to the network's angle; otherwise σ_DD is held at its largest, 1 rad.
+        adaptive_distrust: whether σ_DD changes from sample to sample; otherwise one value is learnt.
+        adaptive_process: whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels.
     """
 
     curve: Literal["plain", "smooth"] = "smooth"
     hidden: tuple[int, int] = (200, 100)
+    pseudo_measurement: bool = True
+    adaptive_distrust: bool = True
+    adaptive_process: bool = True
+
+    @property
+    def without(self) -> tuple[str, ...]:
+        """What of the method is taken away."""
+        parts = ("pseudo_measurement", "adaptive_distrust", "adaptive_process")
+        return tuple(name for name in parts if not getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -53,6 +69,8 @@ class EndToEndSettings:
         steps: samples of a training sequence.
         batch_size: sequences in a batch.
         identification: of the filter.
+        loss_unit: of the angles in the loss of Eq. 7, ``rad`` or ``deg``; the optimum is the same, but gradients in rad² are about as
+            small as the number that AdamW adds to their size, 1e-8, so that it takes steps far below its rate.
         dtype: of the network, ``float32`` or ``float64``; the filter computes in double precision.
         checkpoint_seconds: time between two checkpoints [s].
 
@@ -65,6 +83,7 @@ class EndToEndSettings:
     end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30)  # noqa: RUF009
     steps: int = 256
     batch_size: int = 32
+    loss_unit: Literal["rad", "deg"] = "rad"
     identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
     dtype: Literal["float32", "float64"] = "float32"
     checkpoint_seconds: float = 15.0
@@ -75,6 +94,8 @@ class EndToEndSettings:
                 raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
         if self.steps < 2:
             raise ConfigurationError(f"training.steps must be at least 2, not {self.steps}")
+        if self.loss_unit not in ("rad", "deg"):
+            raise ConfigurationError(f"training.loss_unit '{self.loss_unit}' is not one of: rad, deg")
         if self.dtype not in ("float32", "float64"):
             raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
 
@@ -142,6 +163,12 @@ class CnnUkf(NetworkUkf):
     def _new_network(self) -> SampleNetwork:
         return SampleNetwork(len(self.inputs), self.settings.hidden, 4)
 
+    @property
+    def variant(self) -> str:
+        """With the tyres, where they are not the smooth ones, and what is taken away."""
+        tyres = "" if self.settings.curve == "smooth" else "_plain"
+        return super().variant + tyres + "".join(f"_no_{name}" for name in self.settings.without)
+
     def said(self, outputs: Tensor) -> Said:
         """What outputs of the network, (..., 4), say."""
         shares = torch.sigmoid(outputs[..., 1:].double())
@@ -156,13 +183,14 @@ class CnnUkf(NetworkUkf):
         slow = self.settings.minimum_speed
         raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
         network = self.network = self._new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw)
+        network.scale(*raw, self.settings.normalisation)
         network.reset([torch.Generator().manual_seed(self._seed)])
         levels = torch.tensor([self.model.levels["process_vy"], self.model.levels["process_yaw_rate"]], dtype=torch.float64)
         levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
+        handles = self._hold(network)
         train = network.samples(*raw)
         driven = network.samples(*learnt_samples(data.train, self.inputs, self.name))  # sequences are cut from all that was driven
         end_to_end = EndToEnd(self, driven, data.train, training)
@@ -175,12 +203,39 @@ class CnnUkf(NetworkUkf):
                 end_to_end.batches,
                 end_to_end.loss,
                 lambda: self.mean_squared_error(
-                    data.validation, [self.word(recording.stack(self.inputs)) for recording in data.validation]
+                    data.validation,
+                    [self.word(recording.stack(self.inputs)) for recording in data.validation],
+                    over=training.identification.error,
                 ),
             ),
         ]
         record = record_of_phases(train_phases(phases, self._seed, context, index, training.checkpoint_seconds))
+        for handle in handles:
+            handle.remove()
         return FitRecord(record.history, {**record.metrics, "lost_sequences": end_to_end.lost}, record.interrupted)
+
+    def _hold(self, network: SampleNetwork) -> list[RemovableHandle]:
+        """Take heads away: what is held has no weights and no gradient, so that the network is of the usual shape and says constants."""
+        s = self.settings
+        held_weights, held_biases = [], []
+        if not (s.adaptive_distrust and s.pseudo_measurement):
+            held_weights.append(DISTRUST)
+        if not s.pseudo_measurement:
+            held_biases.append(DISTRUST)
+        if not s.adaptive_process:
+            held_weights += PROCESS
+            held_biases += PROCESS
+        handles = []
+        for name, held in (("weight_3", held_weights), ("bias_3", held_biases)):
+            if held:
+                kept = torch.ones(4, dtype=network.unit.dtype)
+                kept[held] = 0.0
+                handles.append(network.get_parameter(name).register_hook(lambda gradient, kept=kept: gradient * kept))
+        with torch.no_grad():
+            network.get_parameter("weight_3")[..., held_weights] = 0.0
+            if not s.pseudo_measurement:
+                network.get_parameter("bias_3")[..., DISTRUST] = SATURATED
+        return handles
 
     def _pre_training(self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings) -> Phase:
         """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
@@ -245,7 +300,7 @@ class EndToEnd:
         return Cuts(self.samples.inputs[rows], self.sideslip[rows], *of_sensors, self.states[firsts], seeds, firsts)
 
     def loss(self, batch: Cuts) -> Tensor:
-        """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad²].
+        """Mean squared errors of the network's angle and of the filter's, added (Eq. 7) [rad², or deg² if the settings say so].
 
         Cuts whose covariance or gradient is not finite are left out and counted.
 
@@ -268,7 +323,7 @@ class EndToEnd:
         finite = torch.isfinite(filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1))
         lost |= self._account(~finite, batch, "covariance")
         errors = [(batch.sideslip - angle)[~lost].square().mean() for angle in (said.sideslip, sideslip)]
-        return errors[0] + errors[1]
+        return (errors[0] + errors[1]) * (math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0)
 
     def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:
         """A gradient, (B, T, 4), that is zero for sequences that are lost, or for which it is not finite."""

@@ -21,13 +21,13 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.filtering.single_track import checked_sample, require_positive
-from vehest.estimators.filtering.track_filter import TrackFilter, TrackStepper, groups_of, in_nonlinear_range, padded
+from vehest.estimators.filtering.track_filter import Over, TrackFilter, TrackStepper, error_over, groups_of, in_nonlinear_range, padded
 from vehest.estimators.references import reference_sideslip
 from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
 from vehest.vehicle.dugoff import BMW_545I, TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
 
@@ -41,7 +41,7 @@ SEARCHED: dict[str, tuple[str, ...]] = {
     "imu": ("process_vy", "process_yaw_rate"),
 }
 ASSUMED = {"process_vy": 7e-4, "process_yaw_rate": 2e-3, "force_factor": 1.0}  # the first two: Bertipaglia et al. 2024
-BOXES = {"process_vy": (-5.0, 0.0), "process_yaw_rate": (-5.0, 1.0), "force_factor": (0.0, 2.0)}  # powers of ten
+BOXES = {"process_vy": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten; that of the yaw rate is a setting
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
 QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
@@ -118,6 +118,8 @@ class DugoffUkfSettings(EstimatorSettings):
         nonlinear_from: |ay| from which the car behaves non-linearly, so that forces are trusted [m/s²].
         linear_below: |ay| down to which it then stays so [m/s²].
         gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
+        correlated_samples: over how many samples the errors of what sensors measure are alike, by which the variance of each is taken
+            larger, since the filter takes them for independent; about ``rate_hz / (2 f)`` of white noise behind a low-pass of f Hz.
         noise: levels of noise.
         tyres: of both axles.
         car: the car.
@@ -130,6 +132,7 @@ class DugoffUkfSettings(EstimatorSettings):
     nonlinear_from: float = 4.0
     linear_below: float = 3.0
     gate: float | None = None
+    correlated_samples: float = 1.0
     noise: TrackLevels = TrackLevels()
     tyres: AxleTyres = AxleTyres()
     car: LoadedCar = BMW_545I
@@ -139,7 +142,8 @@ class DugoffUkfSettings(EstimatorSettings):
         for name, options in (("inputs", tuple(CHANNELS)), ("curve", ("plain", "smooth"))):
             if getattr(self, name) not in options:
                 raise ConfigurationError(f"estimator.{name} '{getattr(self, name)}' is not one of: {', '.join(options)}")
-        require_positive("estimator", {"minimum_speed": self.minimum_speed, "gate": self.gate})
+        positive = {"minimum_speed": self.minimum_speed, "gate": self.gate, "correlated_samples": self.correlated_samples}
+        require_positive("estimator", positive)
         if not 0.0 <= self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
                 f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
@@ -243,7 +247,7 @@ class DugoffUkf(Estimator):
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
         if data.validation and all("vy_ref" in recording for recording in data.validation):
-            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
+            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds, over=training.error)
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
@@ -301,17 +305,20 @@ class DugoffUkf(Estimator):
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
-            return self._mean_squared_error(recordings, training.skip_seconds, levels)
+            return self._mean_squared_error(recordings, training.skip_seconds, levels, training.error)
 
-        boxes = [BOXES[name] for name in searched]
+        limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
+        boxes = [limits[name] for name in searched]
         if training.method == "optuna":
             return staged_optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
 
-    def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float, levels: Mapping[str, float] | None = None) -> float:
-        """Of sideslip [rad²], over samples fast enough for the model."""
+    def _mean_squared_error(
+        self, recordings: Sequence[Recording], skip_seconds: float, levels: Mapping[str, float] | None = None, over: Over = "samples"
+    ) -> float:
+        """Of sideslip [rad²], over samples fast enough for the model; see `error_over`."""
         skip = round(skip_seconds * self.settings.rate_hz)
-        total, count = 0.0, 0
+        sums: list[tuple[float, int]] = []
         for rows, steps in self._filtered(recordings, levels=levels):
             for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
                 recording = recordings[row]
@@ -319,8 +326,8 @@ class DugoffUkf(Estimator):
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
                 counted = (vx >= self.settings.minimum_speed) & np.isfinite(reference)
                 counted[:skip] = False
-                total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
-        value = total / max(count, 1)
+                sums.append((float(np.square(error[counted]).sum()), int(counted.sum())))
+        value = error_over(sums, over)
         return value if math.isfinite(value) else BAD
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
@@ -383,7 +390,8 @@ class DugoffUkf(Estimator):
         process = torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64).square().diag()
         factor = levels.get("force_factor", 1.0)
         rows = [[levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)] for own in (factor, 1.0)]
-        return process, torch.diag_embed(torch.tensor(rows, dtype=torch.float64).square())
+        alike = self.settings.correlated_samples
+        return process, torch.diag_embed(torch.tensor(rows, dtype=torch.float64).square() * alike)
 
     def online(self) -> DugoffUkfStepper:
         """A stepper that starts from the first sample it sees."""

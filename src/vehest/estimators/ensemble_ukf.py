@@ -102,7 +102,7 @@ class EnsembleUkf(NetworkUkf):
         slow = self.settings.minimum_speed
         raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
         network = self.network = self._new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw)
+        network.scale(*raw, self.settings.normalisation)
         streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.settings.members, np.uint64) >> np.uint64(1)
         network.reset([torch.Generator().manual_seed(int(stream)) for stream in streams])
         train, validation = network.samples(*raw), network.samples(*judged)
@@ -136,7 +136,7 @@ class EnsembleUkf(NetworkUkf):
 
         def cost(scaling: FloatArray) -> float:
             words = [Word(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in told]
-            error = self.mean_squared_error(recordings, words, how.skip_seconds)
+            error = self.mean_squared_error(recordings, words, how.skip_seconds, how.error)
             return error if np.isfinite(error) else 1e6
 
         if how.method == "optuna":

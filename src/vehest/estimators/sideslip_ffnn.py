@@ -12,7 +12,14 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, required
 from vehest.estimators.kernels.sample_network import squared_error
-from vehest.estimators.networks.sample_network import SampleNetwork, SampleNetworkSettings, believed, learnt_samples, network_with_weights
+from vehest.estimators.networks.sample_network import (
+    NAMED,
+    SampleNetwork,
+    SampleNetworkSettings,
+    believed,
+    learnt_samples,
+    network_with_weights,
+)
 from vehest.estimators.phase_records import record_of_phases
 from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings, sample_phase
@@ -45,8 +52,8 @@ class SideslipFfnn(Estimator):
 
     @property
     def variant(self) -> str:
-        """Which inputs it sees."""
-        return self.settings.inputs
+        """Which inputs it sees, and how they are scaled."""
+        return self.settings.inputs + NAMED[self.settings.normalisation]
 
     @property
     def full_title(self) -> str:
@@ -70,7 +77,7 @@ class SideslipFfnn(Estimator):
     def _fit(self, data: FitData, training: SampleSettings, context: FitContext, index: int) -> FitRecord:
         raw, judged = (learnt_samples(part, self.channels, self.name) for part in (data.train, data.validation))
         network = self.network = self._new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw)
+        network.scale(*raw, self.settings.normalisation)
         network.reset([torch.Generator().manual_seed(self._seed)])
         train, validation = network.samples(*raw), network.samples(*judged)
         phase = sample_phase(

@@ -13,7 +13,7 @@ from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.reading import median_and_range
-from vehest_papers.cnn_ukf.subjects import LINES, Prepared, Run, Runs, chosen
+from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, line_of
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
 
@@ -68,7 +68,7 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         figure = new_figure(DOUBLE_COLUMN, 3.4)
         upper, axes = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 3.2))
         for place, (candidate, own) in enumerate(found.items()):
-            line = LINES[candidate]
+            line = line_of(candidate)
             axes.stairs(np.maximum(own.counts, 0.5), own.edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=candidate)
             upper.errorbar(own.mean, -place, xerr=own.deviation, color=line.colour, fmt="x", capsize=3)
         axes.set_yscale("log")
@@ -117,7 +117,7 @@ def groups(runs: Runs, name: str, title: str, data: str, number: int | None = No
             middle = np.array([np.median(values[candidate, group]) for group in known])
             low, high = (np.array([limit(values[candidate, group]) for group in known]) for limit in (np.min, np.max))
             at = np.arange(len(known)) + (place - 0.5 * (len(of_run) - 1)) * width
-            axes.bar(at, middle, width, color=LINES[candidate].colour, alpha=0.8, label=candidate)
+            axes.bar(at, middle, width, color=line_of(candidate).colour, alpha=0.8, label=candidate)
             axes.errorbar(at, middle, yerr=[middle - low, high - middle], fmt="none", ecolor="#222222", elinewidth=0.8, capsize=1.5)
         axes.set_xticks(range(len(known)), [f"{group}\n({counted[group]})" for group in known])
         axes.set_ylabel("MSE$_{nl}$ [deg²]")

@@ -8,9 +8,21 @@ from dataclasses import dataclass
 MODEL, DATA, DEEP, CNN = "Model-based", "Data-driven", "DE-UKF", "CNN-UKF"
 SMOOTH = "Model-based, smooth tyres"
 """Not in the paper: the filter of the CNN-UKF alone."""
+FREE = "Model-based, free noise"
+"""Not in the paper: the same filter, whose process noise may be as large as serves it best, far beyond the paper's."""
+CNN_FREE = "CNN-UKF, free noise"
+"""Not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise."""
+BEFORE = "not trained through the filter"
+Z_SCORES = "Data-driven, z-scores"
+ORACLE_FILTER, ORACLE_DISTRUST = "Oracle: filter fitted to the test", "Oracle: CNN-UKF, perfect distrust"
+ZERO, STATIC_MAP, DATA_SHEET = "v = 0", "Static map", "Data sheet"
 
-CANDIDATES = (MODEL, SMOOTH, DATA, DEEP, CNN)
-"""In the order of Table II."""
+CANDIDATES = (MODEL, SMOOTH, FREE, DATA, DEEP, CNN, CNN_FREE, DATA_SHEET, STATIC_MAP, ZERO, ORACLE_FILTER, ORACLE_DISTRUST)
+"""In the order of Table II, then those that are not in it and those that have to be beaten."""
+OF_FOUR = (MODEL, DATA, DEEP, CNN)
+HYBRIDS = (DEEP, CNN)
+OWN_FILTER = {DEEP: MODEL, CNN: SMOOTH, CNN_FREE: FREE}
+"""Hybrid -> what is left of it without its network."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,9 @@ MEMBER_EPOCHS = 30
 
 BATCH = 256
 """Of both phases of the CNN-UKF's training (Section III-C)."""
+
+PROCESS_RANGE = (2e-3, 2e-1)
+"""σ_ψ̇ of the constant filter, and two orders of magnitude above it, as which Fig. 8(d) is described [rad/s]."""
 
 STIFFNESS_STEP = 0.1
 """By which share both axles' cornering stiffnesses are off in Fig. 14."""

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -19,15 +17,15 @@ from vehest.data.transforms import LowPass, RemoveOutliers
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.network_ukf import NetworkUkf
-from vehest.evaluation.manoeuvres import Kpis, is_nonlinear, kpis, manoeuvres_of, sideslip_error
+from vehest.evaluation.manoeuvres import Kpis, kpis, manoeuvres_of, sideslip_error
 from vehest.evaluation.metrics import Scored, score_all
-from vehest.evaluation.significance import sequence_labels
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.cnn_ukf import paper
 
 TEST = "test"
 CUTOFF_HZ = 5.0
+LARGEST_SIDESLIP = 0.21  # rad, 12°: that of training and validation in the split, beyond which no drive of the paper goes
 OFFLINE = (RemoveOutliers(), LowPass(CUTOFF_HZ, design="fir"), LowPass(CUTOFF_HZ, channels=("vy_ref",), design="fir"))
 """Preprocessing of the paper (Section IV-A), of measurements and of the reference."""
 
@@ -37,7 +35,28 @@ LINES = {
     paper.DATA: Line("#b8480b", "dashdot", "o"),
     paper.DEEP: Line("#00876c", "solid", "D"),
     paper.CNN: Line("#d6336c", "solid", "^"),
+    paper.FREE: Line("#7048a8", "dashed", "v"),
+    paper.CNN_FREE: Line("#e599f7", "solid", "<"),
+    paper.ORACLE_FILTER: Line("#444444", "dashed", "1"),
+    paper.ORACLE_DISTRUST: Line("#444444", "dotted", "2"),
+    paper.DATA_SHEET: Line("#9aa7b5", "dashdot", "x"),
+    paper.STATIC_MAP: Line("#6b7682", "dashed", "+"),
+    paper.ZERO: Line("#c3cad2", "dotted", "."),
 }
+OWN = ", its own filter"
+"""What follows the name of a hybrid that is its own filter."""
+
+
+def plain_name(candidate: str) -> str:
+    """A candidate's name without what it was found to be."""
+    return candidate.removesuffix(OWN)
+
+
+def line_of(candidate: str) -> Line:
+    """How a candidate is drawn."""
+    return LINES[plain_name(candidate)]
+
+
 KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
 
@@ -50,7 +69,17 @@ _NAMES = {
     ("sideslip_ffnn", False): paper.DATA,
     ("ensemble_ukf", False): paper.DEEP,
     ("cnn_ukf", False): paper.CNN,
+    ("zero", False): paper.ZERO,
+    ("static_map", False): paper.STATIC_MAP,
+    ("data_sheet", False): paper.DATA_SHEET,
 }
+PARTS_AWAY = {
+    "_no_pseudo_measurement": "without pseudo-measurement",
+    "_no_adaptive_distrust": "σ_DD constant",
+    "_no_adaptive_process": "process noise constant",
+    "_plain": "plain tyres",
+}
+"""What a variant's name says is taken away -> in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +109,15 @@ Runs = Mapping[str, Sequence[Run]]
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model.
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named.
 
     Raises:
         DataError: it has none like it.
     """
+    if model.estimator == "cnn_ukf":
+        away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
+        if away:
+            return ", ".join(away)
     name = model.estimator, model.variant.endswith("_smooth")
     if name not in _NAMES:
         raise DataError(f"'{model.title}' is none of the paper's methods, and cannot stand in its tables; give it a part of its own study")
@@ -117,45 +150,38 @@ def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     for name, runs in groups.items():
         if len({run.model.seed for run in runs}) != len(runs):
             raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in paper.CANDIDATES if name in groups}
+    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
+    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in order}
 
 
 def chosen(runs: Sequence[Run]) -> Run:
-    """The seed with the lowest mean squared error on the validation manoeuvres. Test manoeuvres choose nothing."""
-    return min(runs, key=lambda run: kpis(run.validation).mse)
+    """The seed with the lowest mean RMSE of a validation manoeuvre, which no single one decides. Test manoeuvres choose nothing."""
+    return min(runs, key=lambda run: balanced(run.validation))
 
 
-def losses(runs: Runs, *, nonlinear_only: bool = False) -> tuple[dict[str, FloatArray], NDArray[np.int64]]:
-    """Squared errors of the test [deg²] of every seed at every sample that counts, and the manoeuvre that each sample belongs to.
-
-    Returns:
-        Candidate -> (seeds, K); and (K,).
-    """
-    table, lengths = {}, [0]
-    for candidate, own in runs.items():
-        seeds = []
-        for run in own:
-            pieces = []
-            for parts in run.test.values():
-                squares = np.square(np.concatenate([sideslip_error(part) for part in parts]))
-                kept = np.concatenate([is_nonlinear(part) for part in parts])
-                pieces.append(squares[kept] if nonlinear_only else squares)
-            lengths = [len(piece) for piece in pieces]
-            seeds.append(np.concatenate(pieces))
-        table[candidate] = np.stack(seeds)
-    return table, sequence_labels(lengths)
+def balanced(manoeuvres: Manoeuvres) -> float:
+    """Mean over manoeuvres of their RMSE(β) [deg]."""
+    roots = [np.sqrt(np.mean(np.square(np.concatenate([sideslip_error(part) for part in parts])))) for parts in manoeuvres.values()]
+    return float(np.mean(roots))
 
 
 def kpi_table(runs: Runs) -> pd.DataFrame:
-    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse``; a row a run."""
+    """Columns: candidate, seed, those of `KPIS` on the test, ``validation_mse`` [deg²], ``validation_balanced`` [deg]; a row a run."""
     rows = [
         {"candidate": candidate, "seed": run.model.seed}
         | {name: getattr(run.kpis, name) for name in KPIS}
-        | {"validation_mse": kpis(run.validation).mse}
+        | {"validation_mse": kpis(run.validation).mse, "validation_balanced": balanced(run.validation)}
         for candidate, own in runs.items()
         for run in own
     ]
     return pd.DataFrame(rows)
+
+
+def until(part: Scored, sideslip: float) -> Scored:
+    """What was scored until |β| first exceeds a limit [rad]; all of it where it never does, one sample at least."""
+    beyond = np.flatnonzero(np.abs(part.sideslip_ref) > sideslip)
+    last = max(int(beyond[0]), 1) if len(beyond) else len(part.time)
+    return Scored(*(getattr(part, name)[:last] for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")))
 
 
 class Prepared:
@@ -163,10 +189,14 @@ class Prepared:
 
     The evaluation scores against the reference as it was measured. The paper's is low-passed as the measurements are, and whether a
     sample counts as non-linear is a matter of the low-passed lateral acceleration.
+
+    Args:
+        part: of the study.
+        whole: whether drives are scored beyond the moment in which |β| first exceeds 12°.
     """
 
-    def __init__(self, part: PartArtefacts) -> None:
-        self._part = part
+    def __init__(self, part: PartArtefacts, *, whole: bool = False) -> None:
+        self._part, self._whole = part, whole
         self._read: dict[tuple[str, str], Recording] = {}
 
     def spans(self, test: str) -> Sequence[Span]:
@@ -196,6 +226,14 @@ class Prepared:
         """The ranges of the training, references included."""
         return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.train]
 
+    def judged(self) -> list[Recording]:
+        """The ranges of the validation, references included."""
+        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.validation]
+
+    def tested(self) -> list[Recording]:
+        """The ranges of the test, references included, for oracles."""
+        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.tests[TEST]]
+
     def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
         """Estimates of a model and prepared references, range by range."""
         return self.score([model.estimate(test, position) for position in range(len(self.spans(test)))], test)
@@ -203,4 +241,5 @@ class Prepared:
     def score(self, estimates: Sequence[Estimate], test: str) -> list[Scored]:
         """Estimates, one a range, and prepared references."""
         spans = self.spans(test)
-        return score_all(estimates.__getitem__, spans, lambda span: self.recording(span.dataset, span.recording), self._part.protocol)
+        parts = score_all(estimates.__getitem__, spans, lambda span: self.recording(span.dataset, span.recording), self._part.protocol)
+        return list(parts) if self._whole else [until(part, LARGEST_SIDESLIP) for part in parts]

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.estimators.filtering.network_ukf import NetworkUkf, Word
-from vehest.estimators.model_files import load_model
+from vehest.estimators.filtering.network_ukf import Word
 from vehest.evaluation.manoeuvres import group_of, sideslip_error
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.subjects import LINES, TEST, Prepared, Run
+from vehest_papers.cnn_ukf.networks import words_of
+from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 
-HYBRIDS = (paper.DEEP, paper.CNN)
 LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
@@ -42,24 +40,6 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     return max(peaks, key=peaks.__getitem__)
 
 
-def hybrid_of(run: Run) -> NetworkUkf:
-    """The fitted hybrid of a run.
-
-    Raises:
-        DataError: it is another estimator's.
-    """
-    fitted = load_model(run.model.model_folder)
-    if not isinstance(fitted, NetworkUkf):
-        raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")
-    return fitted
-
-
-def words_of(run: Run, drives: Sequence[Recording]) -> list[Word]:
-    """What a hybrid's network says of drives."""
-    fitted = hybrid_of(run)
-    return [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
-
-
 def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
     """Reference and all estimates of one manoeuvre.
 
@@ -77,7 +57,7 @@ def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: 
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
         _angles(upper, parts)
         for candidate, part in parts.items():
-            line = LINES[candidate]
+            line = line_of(candidate)
             lower.plot(_from_start(part), sideslip_error(part), color=line.colour, linestyle=line.dash, linewidth=0.9)
         lower.set_ylabel("error [deg]")
         lower.set_xlabel("time [s]")
@@ -112,7 +92,7 @@ def inner_life(
         constant: deviations of the filter's process noise where no network says them, (2,).
         data: real or simulated.
     """
-    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     said = _said(hybrids, prepared, warm_up, span)
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with paper_style():
@@ -120,7 +100,7 @@ def inner_life(
         grid = figure.subplots(2, 2, sharex=True)
         _angles(grid[0, 0], parts)
         for candidate, (time, word) in said.items():
-            line = LINES[candidate]
+            line = line_of(candidate)
             label = f"{candidate}, its network's"
             grid[0, 0].plot(time, np.degrees(word.sideslip), color=line.colour, linewidth=0.7, alpha=0.55, label=label)
             grid[1, 0].plot(time, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
@@ -128,7 +108,7 @@ def inner_life(
                 for axes, deviation in zip(grid[:, 1], np.sqrt(word.process).T, strict=True):
                     axes.plot(time, deviation, color=line.colour, linestyle=line.dash, linewidth=1.0)
         for axes, level in zip(grid[:, 1], constant.tolist(), strict=True):
-            axes.axhline(level, color=LINES[paper.DEEP].colour, linestyle=LINES[paper.DEEP].dash, linewidth=1.0)
+            axes.axhline(level, color=line_of(paper.DEEP).colour, linestyle=line_of(paper.DEEP).dash, linewidth=1.0)
         labels = ("β [deg]", r"$\sigma_{V_y}$ [m/s]", r"$\sigma_{DD}$ [deg]", r"$\sigma_{\dot\psi}$ [rad/s]")
         for axes, label, letter in zip(grid.flat, labels, "abcd", strict=True):
             axes.set_ylabel(label)
@@ -151,7 +131,7 @@ def angles_of_networks(
     runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, name: str, number: int, what: str, data: str
 ) -> Figure:
     """β of both hybrids and β_DD of their networks (Figure 13)."""
-    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 2.7)
@@ -159,7 +139,7 @@ def angles_of_networks(
         _angles(axes, parts)
         for candidate, (time, word) in _said(hybrids, prepared, warm_up, span).items():
             label = f"{candidate}, its network's"
-            axes.plot(time, np.degrees(word.sideslip), color=LINES[candidate].colour, linewidth=0.8, alpha=0.6, label=label)
+            axes.plot(time, np.degrees(word.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
         axes.set_xlabel("time [s]")
         axes.margins(x=0.0)
         legend_above(figure, axes, columns=5)
@@ -174,7 +154,7 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
     window = (float(whole.time[first]), float(whole.time[first + length - 1]))
     parts = {candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()}
     drive = prepared.recording(span.dataset, span.recording).cut(*window)
-    hybrids = {candidate: run for candidate, run in runs.items() if candidate in HYBRIDS}
+    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 4.9)
         grid = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
@@ -184,7 +164,7 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
         grid[1].plot(time, drive["ax"], color="#999999", linestyle="dashed", label="$a_x$")
         grid[1].set_ylabel("acceleration [m/s²]")
         for candidate, (at, word) in _said(hybrids, prepared, warm_up, span, window).items():
-            line = LINES[candidate]
+            line = line_of(candidate)
             grid[2].plot(at, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
         grid[2].set_yscale("log")
         grid[2].set_ylabel(r"$\sigma_{DD}$ [deg]")
@@ -231,7 +211,7 @@ def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
     first = next(iter(parts.values()))
     axes.plot(_from_start(first), np.degrees(first.sideslip_ref), color=REFERENCE.colour, linewidth=1.5, label="reference")
     for candidate, part in parts.items():
-        line = LINES[candidate]
+        line = line_of(candidate)
         axes.plot(_from_start(part), np.degrees(part.sideslip), color=line.colour, linestyle=line.dash, linewidth=1.0, label=candidate)
     axes.set_ylabel("sideslip angle [deg]")
 

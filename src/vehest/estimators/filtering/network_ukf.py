@@ -19,8 +19,16 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
 from vehest.estimators.dugoff_ukf import CHANNELS, MOST_TOGETHER, DugoffUkf, DugoffUkfSettings, samples_of
 from vehest.estimators.filtering.single_track import checked_sample
-from vehest.estimators.filtering.track_filter import TrackFilter, groups_of, padded
-from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork, checked_layers, network_with_weights
+from vehest.estimators.filtering.track_filter import Over, TrackFilter, error_over, groups_of, padded
+from vehest.estimators.networks.sample_network import (
+    INPUTS,
+    NAMED,
+    Normalisation,
+    SampleNetwork,
+    checked_layers,
+    network_with_weights,
+    require_normalisation,
+)
 from vehest.estimators.references import reference_sideslip
 from vehest.filters.gating import Gate, in_words, suffix
 from vehest.filters.gaussian import Gaussian
@@ -38,6 +46,7 @@ class NetworkUkfSettings(DugoffUkfSettings):
     Args:
         hidden: widths of the network's hidden layers.
         dropout: share of hidden values that are hidden in training.
+        normalisation: how inputs are scaled, see `SampleNetwork.scale`.
 
     Raises:
         ConfigurationError: a value that makes no sense.
@@ -45,10 +54,12 @@ class NetworkUkfSettings(DugoffUkfSettings):
 
     hidden: tuple[int, int] = (250, 125)
     dropout: float = 0.2
+    normalisation: Normalisation = "range"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "hidden", checked_layers(self.hidden, self.dropout))
+        require_normalisation(self.normalisation)
 
     @property
     def of_filter(self) -> DugoffUkfSettings:
@@ -104,7 +115,7 @@ class NetworkUkf(Estimator):
     @property
     def variant(self) -> str:
         """Which inputs it sees, and the gate."""
-        return self.settings.inputs + suffix(self.settings.gate)
+        return self.settings.inputs + suffix(self.settings.gate) + NAMED[self.settings.normalisation]
 
     @property
     def full_title(self) -> str:
@@ -207,9 +218,12 @@ class NetworkUkf(Estimator):
             outcome = (*steps.filtered, nis, steps.measured.sum(-1).double())
             yield rows, tuple(part.numpy() for part in outcome)  # type: ignore[misc]
 
-    def mean_squared_error(self, recordings: Sequence[Recording], words: Sequence[Word], skip_seconds: float = 0.0) -> float:
-        """Of the filtered sideslip angle [rad²], over samples fast enough for the model."""
-        skip, total, count = round(skip_seconds * self.settings.rate_hz), 0.0, 0
+    def mean_squared_error(
+        self, recordings: Sequence[Recording], words: Sequence[Word], skip_seconds: float = 0.0, over: Over = "samples"
+    ) -> float:
+        """Of the filtered sideslip angle [rad²], over samples fast enough for the model; see `error_over`."""
+        skip = round(skip_seconds * self.settings.rate_hz)
+        sums: list[tuple[float, int]] = []
         for rows, (mean, *_) in self.filtered(recordings, words):
             for row, states in zip(rows, mean, strict=True):
                 recording = recordings[row]
@@ -217,8 +231,8 @@ class NetworkUkf(Estimator):
                 error = np.arctan2(states[: len(vx), 0], vx) - reference_sideslip(recording)
                 counted = vx >= self.settings.minimum_speed
                 counted[:skip] = False
-                total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
-        return total / max(count, 1)
+                sums.append((float(np.square(error[counted]).sum()), int(counted.sum())))
+        return error_over(sums, over)
 
     def online(self) -> NetworkUkfStepper:
         """A stepper that starts from the first sample it sees."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, TorchModel, UnscentedStepper, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
+
+Over = Literal["samples", "recordings"]
 
 UNKNOWN = (0.5, 0.2)  # m/s, rad/s: standard deviations of a motion that nobody hands over, and of a car that rolls
 ROLLING = np.diag(np.square(UNKNOWN))
@@ -160,6 +163,21 @@ def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool 
     change = np.where(size >= enter, 1, np.where(size <= leave, -1, 0))
     last = np.maximum.accumulate(np.where(change != 0, np.arange(len(ay)), -1))
     return np.where(last < 0, before, change[last] > 0)
+
+
+def error_over(sums: Sequence[tuple[float, int]], over: Over) -> float:
+    """One figure of the errors of several recordings, of each the sum of its squared errors, and over how many samples.
+
+    ``samples``: the mean squared error over all samples. ``recordings``: the squared mean of the recordings' root mean squared errors, in
+    which a recording counts by its error, not by the square of it. Recordings without a sample do not count.
+    """
+    if over == "samples":
+        total, count = 0.0, 0
+        for square, number in sums:
+            total, count = total + square, count + number
+        return total / max(count, 1)
+    roots = [math.sqrt(square / number) for square, number in sums if number]
+    return float(np.mean(roots)) ** 2 if roots else 0.0
 
 
 def groups_of(lengths: Sequence[int], most: int) -> Iterator[list[int]]:

@@ -25,6 +25,10 @@ IMU = ("ax", "ay", "vx", "steer", "yaw_rate")
 INPUTS: dict[str, tuple[str, ...]] = {"full": (*IMU, *(f"f{axis}_{corner}" for axis in "xyz" for corner in CORNERS)), "imu": IMU}
 """Sets of inputs: with tyre forces (Bertipaglia et al. 2024, Section III-A, 17 of them), and without."""
 
+Normalisation = Literal["range", "standard"]
+NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
+"""What a normalisation adds to the name of a variant."""
+
 CHUNK = 50_000  # samples that are estimated at a time
 STEEPEST = 1.5  # rad, beyond which no sideslip angle of a network is believed
 
@@ -37,6 +41,7 @@ class SampleNetworkSettings(EstimatorSettings):
         inputs: ``full``, with the forces of all tyres, or ``imu``, without.
         hidden: widths of the two hidden layers.
         dropout: share of hidden values that are hidden in training.
+        normalisation: how inputs are scaled, see `SampleNetwork.scale`.
 
     Raises:
         ConfigurationError: a value that makes no sense.
@@ -45,12 +50,14 @@ class SampleNetworkSettings(EstimatorSettings):
     inputs: Literal["full", "imu"] = "full"
     hidden: tuple[int, int] = (250, 125)
     dropout: float = 0.2
+    normalisation: Normalisation = "range"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.inputs not in INPUTS:
             raise ConfigurationError(f"estimator.inputs '{self.inputs}' is not one of: {', '.join(INPUTS)}")
         object.__setattr__(self, "hidden", checked_layers(self.hidden, self.dropout))
+        require_normalisation(self.normalisation)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -72,11 +79,19 @@ def checked_layers(hidden: Sequence[int], dropout: float) -> tuple[int, int]:
     return widths[0], widths[1]
 
 
+def require_normalisation(name: str) -> None:
+    """Raises:
+    ConfigurationError: there is no such normalisation.
+    """
+    if name not in NAMED:
+        raise ConfigurationError(f"estimator.normalisation '{name}' is not one of: {', '.join(NAMED)}")
+
+
 class SampleNetwork(nn.Module):
     """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1 convolutions over time.
 
-    Inputs are mapped to [0, 1] by their ranges in training, where a constant one becomes 0; targets are divided by their root mean square
-    in training. Both are kept with the weights and are not parameters.
+    Inputs are mapped to [0, 1] by their ranges in training, or to a mean of 0 and a deviation of 1; a constant one becomes 0. Targets are
+    divided by their root mean square in training. Both are kept with the weights and are not parameters.
 
     Args:
         n_inputs: measured channels C.
@@ -117,11 +132,16 @@ class SampleNetwork(nn.Module):
                     draw = torch.rand(parameter.shape[1:], generator=generator, dtype=torch.float64)
                     parameter[member].copy_((2.0 * draw - 1.0) * limit)
 
-    def scale(self, inputs: FloatArray, sideslip: FloatArray) -> None:
-        """Take ranges of inputs, (N, C), and the unit of targets, (N,) [rad], from training samples."""
-        low, high = inputs.min(axis=0), inputs.max(axis=0)
+    def scale(self, inputs: FloatArray, sideslip: FloatArray, normalisation: Normalisation = "range") -> None:
+        """Take scales of inputs, (N, C), and the unit of targets, (N,) [rad], from training samples.
+
+        ``range`` maps inputs to [0, 1] by their extremes, ``standard`` to a mean of 0 and a standard deviation of 1.
+        """
+        low, span = inputs.min(axis=0), np.ptp(inputs, axis=0)
+        if normalisation == "standard":
+            low, span = inputs.mean(axis=0), np.where(span > 0.0, inputs.std(axis=0), 0.0)
         self.input_low.copy_(torch.as_tensor(low))
-        self.input_span.copy_(torch.as_tensor(np.where(high > low, high - low, np.finfo(np.float32).max)))
+        self.input_span.copy_(torch.as_tensor(np.where(span > 0.0, span, np.finfo(np.float32).max)))
         self.unit.copy_(torch.as_tensor(max(float(np.sqrt(np.mean(np.square(sideslip)))), 1e-6)))
 
     def scaled(self, inputs: Tensor) -> Tensor:

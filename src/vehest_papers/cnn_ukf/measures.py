@@ -1,0 +1,115 @@
+"""The paper's indicators of candidates on manoeuvres, resampled together, and relative changes from one to another with their intervals."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.evaluation.manoeuvres import group_of, is_nonlinear, sideslip_error
+from vehest.evaluation.metrics import Scored
+from vehest_papers.cnn_ukf.subjects import Manoeuvres, Run, Runs
+from vehest_papers.ksnn.comparing import CONFIDENCE, Change, Measured, short
+
+N_RESAMPLES = 4000
+MSE, MSE_NL, ME, ME_NL = "mse", "mse_nonlinear", "max_error", "max_error_nonlinear"
+INDICATORS = (MSE, MSE_NL, ME, ME_NL)
+BALANCED = "balanced"
+"""Mean over manoeuvres of their RMSE, by which seeds and settings are chosen."""
+
+Sums = tuple[FloatArray, FloatArray]
+"""Of each manoeuvre a sum and what it is divided by, (M,) each."""
+
+
+def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:
+    """What an indicator is made of, manoeuvre by manoeuvre."""
+    errors = [np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()]
+    beyond = [np.concatenate([is_nonlinear(part) for part in parts]) for parts in manoeuvres.values()]
+    if indicator in (MSE_NL, ME_NL):
+        errors = [error[kept] for error, kept in zip(errors, beyond, strict=True)]
+    if indicator == BALANCED:
+        return np.array([float(np.sqrt(np.mean(np.square(error)))) for error in errors]), np.ones(len(errors))
+    if indicator in (ME, ME_NL):
+        found = [float(np.abs(error).max()) if len(error) else 0.0 for error in errors]
+        return np.array(found), np.array([float(len(error) > 0) for error in errors])
+    return np.array([float(np.square(error).sum()) for error in errors]), np.array([float(len(error)) for error in errors])
+
+
+def value_of(manoeuvres: Manoeuvres, indicator: str) -> float:
+    """An indicator over all manoeuvres [deg², deg]."""
+    sums, sizes = sums_of(manoeuvres, indicator)
+    return float(sums.sum() / sizes.sum())
+
+
+class Comparison:
+    """Candidates on one test, all on the same resamples of whole manoeuvres; seeds of each candidate are drawn on their own.
+
+    Args:
+        runs: candidate -> its seeds; all over the same manoeuvres.
+        name: of the test; resamples of tests with different names are independent.
+        paired: candidates whose runs are the same trainings under other conditions are drawn together.
+    """
+
+    def __init__(self, runs: Runs, name: str, *, paired: bool = False) -> None:
+        self.runs, self.paired = runs, paired
+        self.manoeuvres = list(next(iter(runs.values()))[0].test)
+        self.groups = [group_of(manoeuvre) for manoeuvre in self.manoeuvres]
+        generator = np.random.default_rng(zlib.crc32(name.encode()))
+        count = len(self.manoeuvres)
+        drawn = generator.multinomial(count - 1, np.full(count, 1.0 / count), size=N_RESAMPLES)  # Rao & Wu 1988
+        self._counts = np.concatenate([np.ones((1, count), dtype=np.int64), drawn])
+        self._seed = int(generator.integers(2**31))
+        self._known: dict[tuple[str, str, str], Measured] = {}
+
+    def __contains__(self, candidate: object) -> bool:
+        return candidate in self.runs
+
+    def get(self, candidate: str, indicator: str, group: str = "") -> Measured:
+        """An indicator of a candidate, over all manoeuvres or those of a group."""
+        key = candidate, indicator, group
+        if key not in self._known:
+            pieces = [sums_of(run.test, indicator) for run in self.runs[candidate]]
+            kept = np.array([group in ("", own) for own in self.groups], dtype=np.float64)
+            sums, sizes = np.stack([own for own, _ in pieces]) * kept, pieces[0][1] * kept
+            self._known[key] = self.measured(sums, sizes, int(np.count_nonzero(kept)))
+        return self._known[key]
+
+    def measured(self, sums: FloatArray, sizes: FloatArray, count: int | None = None) -> Measured:
+        """A mean, of sums by seed and manoeuvre (S, M) over sizes (M,)."""
+        total = np.maximum(self._counts @ sizes, 1e-12)
+        values = self._counts @ sums.T / total[:, None]
+        drawn = values
+        if len(sums) > 1:
+            generator = np.random.default_rng(self._seed if self.paired else zlib.crc32(sums.tobytes()))
+            drawn = np.take_along_axis(values, generator.integers(len(sums), size=(len(values), len(sums) - 1)), axis=1)
+        logs = np.log(np.maximum(drawn[1:].mean(axis=1), 1e-300))
+        own = np.log(np.maximum(values[0], 1e-300))
+        return Measured(float(values[0].mean()), logs, own, len(sizes) if count is None else count, self.paired)
+
+    def change(self, first: str, second: str, indicator: str, group: str = "") -> Change:
+        """From the second candidate to the first."""
+        return Change.of(self.get(first, indicator, group), self.get(second, indicator, group))
+
+    def in_words(self, candidate: str, indicator: str, group: str = "") -> str:
+        """The figure with its interval: ``0.12 [0.09, 0.15]``."""
+        own = self.get(candidate, indicator, group)
+        low, high = own.interval
+        return f"{short(own.value)} [{short(low)}, {short(high)}]"
+
+    def of_statistic(self, candidate: str, statistic: Callable[[Sequence[Run], NDArray[np.int64]], float]) -> tuple[float, float, float]:
+        """Any figure of a candidate's seeds and how often each manoeuvre counts, with the 2.5 and 97.5 % of 500 resamples."""
+        runs, generator = self.runs[candidate], np.random.default_rng(self._seed)
+        found = []
+        for number, counts in enumerate(self._counts[:501]):
+            picked = runs if number == 0 else [runs[at] for at in generator.integers(len(runs), size=len(runs))]
+            found.append(statistic(picked, counts))
+        low, high = np.nanquantile(found[1:], [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2])
+        return found[0], float(low), float(high)
+
+
+def whole(parts: Sequence[Scored]) -> FloatArray:
+    """Errors of a manoeuvre [deg]."""
+    return np.concatenate([sideslip_error(part) for part in parts])

@@ -1,0 +1,119 @@
+"""What hybrids' networks say on the test, how far filters listen, and what a perfect distrust would be worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
+from vehest.estimators.model_files import load_model
+from vehest.evaluation.manoeuvres import is_nonlinear, sideslip_error
+from vehest.evaluation.metrics import Scored
+from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run
+
+
+@dataclass(frozen=True, eq=False)
+class Outputs:
+    """What a network says of the scored samples of one manoeuvre.
+
+    Args:
+        error: β_DD - β [deg], (K,).
+        distrust: σ_DD as the filter takes it [deg], (K,).
+        process: σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's.
+        sideslip: β [deg], (K,).
+        nonlinear: which samples have |ay| ≥ 4 m/s², (K,).
+    """
+
+    error: FloatArray
+    distrust: FloatArray
+    process: FloatArray | None
+    sideslip: FloatArray
+    nonlinear: NDArray[np.bool_]
+
+
+def hybrid_of(run: Run) -> NetworkUkf:
+    """The fitted hybrid of a run.
+
+    Raises:
+        DataError: it is another estimator's.
+    """
+    fitted = load_model(run.model.model_folder)
+    if not isinstance(fitted, NetworkUkf):
+        raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")
+    return fitted
+
+
+def words_of(run: Run, drives: Sequence[Recording]) -> list[Word]:
+    """What a hybrid's network says of drives."""
+    fitted = hybrid_of(run)
+    return [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
+
+
+def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
+    """Samples of a drive that are scored."""
+    return np.rint((part.time - drive.start_time) * drive.rate_hz).astype(np.int64)
+
+
+def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
+    """What the network of a hybrid says of each test manoeuvre."""
+    drives, spans = prepared.seen(TEST), prepared.spans(TEST)
+    found = []
+    for drive, span, word in zip(drives, spans, words_of(run, drives), strict=True):
+        (part,) = run.test[span.recording]
+        at = rows_of(part, drive)
+        found.append(
+            Outputs(
+                sideslip_error(replace(part, sideslip=word.sideslip[at])),
+                np.degrees(np.sqrt(word.variance[at])),
+                None if word.process is None else np.sqrt(word.process[at]),
+                np.degrees(part.sideslip_ref),
+                is_nonlinear(part),
+            )
+        )
+    return found
+
+
+def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], words: Sequence[Word]) -> list[FloatArray]:
+    """β of a hybrid's filter given what its network is made to say, drive by drive [rad]."""
+    found: dict[int, FloatArray] = {}
+    for rows, (mean, *_) in fitted.filtered(drives, words):
+        for place, row in enumerate(rows):
+            vx = drives[row]["vx"]
+            found[row] = np.arctan2(mean[place, : len(vx), 0], vx)
+    return [found[row] for row in range(len(drives))]
+
+
+def shift_of(run: Run, prepared: Prepared) -> float:
+    """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over scored samples."""
+    fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
+    words = [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
+    moved = [word._replace(sideslip=word.sideslip + math.radians(1.0)) for word in words]
+    shifts = []
+    both = zip(drives, spans, filtered_with(fitted, drives, words), filtered_with(fitted, drives, moved), strict=True)
+    for drive, span, before, after in both:
+        at = rows_of(run.test[span.recording][0], drive)
+        shifts.append(float(np.degrees(np.mean((after - before)[at]))))
+    return float(np.median(shifts))
+
+
+def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
+    """A hybrid whose filter is told at each sample how wrong its network's angle is; no estimator, since nobody knows that."""
+    fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
+    words = []
+    for drive, span in zip(drives, spans, strict=True):
+        word = fitted.word(fitted.seen(drive.stack(fitted.channels)))
+        whole = prepared.recording(span.dataset, span.recording).cut(drive.start_time, drive.start_time + len(drive) / drive.rate_hz)
+        error = word.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
+        words.append(word._replace(variance=LEAST_VARIANCE + np.square(error)))
+    test = {}
+    for drive, span, sideslip in zip(drives, spans, filtered_with(fitted, drives, words), strict=True):
+        (part,) = run.test[span.recording]
+        test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
+    return Run(candidate, run.model, run.validation, test)

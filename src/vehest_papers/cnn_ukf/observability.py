@@ -1,0 +1,115 @@
+"""Section III-B: whether the filter's model is observable, and whether it is not where the wheels point straight ahead."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
+from vehest.evaluation.observability import observability_along
+from vehest.report.document import Column, Table
+from vehest.report.style import fixed
+from vehest.studies.kit.claims import Claim
+from vehest.vehicle.dugoff import DugoffTrack
+
+SPEEDS = (5.0, 10.0, 20.0, 30.0)
+ANGLES = (0.0, 0.1, 1.0, 3.0)  # deg, of the front wheels
+SETTLED = 400  # samples, in which a car with a constant steering angle comes to its steady turn
+SIZES = np.array([1.0, 0.2])  # m/s, rad/s: a lateral velocity and a yaw rate of ordinary size
+WINDOW = 10
+
+
+def local(estimator: DugoffUkf) -> pd.DataFrame:
+    """Observability of the model in steady turns, about which it is linearised.
+
+    Returns:
+        Columns: speed [m/s], steer [deg], measured (``all`` or ``ay, yaw rate``), rank of the matrix of two samples, deviation of the
+        lateral velocity from 10 samples [m/s]; a row a speed, steering angle and set of measurements.
+    """
+    track = estimator.track()
+    levels = np.array([estimator.levels[name] for name in SENSORS[estimator.settings.inputs]])
+    rows = []
+    for speed in SPEEDS:
+        for angle in ANGLES:
+            inputs = torch.tensor([speed, math.radians(angle), 0.0], dtype=torch.float64)
+            state = torch.zeros(2, dtype=torch.float64)
+            for _ in range(SETTLED):
+                state = track.transition(state, inputs)
+            if not 0.0 <= abs(float(state[0])) < 0.2 * speed:
+                continue  # no steady turn: beyond what the tyres can do
+            states, driven = (np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs))
+            for words, kept in (("ay, yaw rate, both forces", slice(0, 4)), ("ay, yaw rate", slice(0, 2))):
+                found = {
+                    steps: observability_along(
+                        track.transition,
+                        partial(_observed, track, kept),
+                        states,
+                        driven,
+                        sizes=SIZES,
+                        noise=levels[kept],
+                        steps=steps,
+                    )
+                    for steps in (2, WINDOW)
+                }
+                rows.append(
+                    {
+                        "speed": speed,
+                        "steer": angle,
+                        "measured": words,
+                        "rank": int(found[2].rank[0]),
+                        "deviation": float(found[WINDOW].deviation[0, 0]) * float(SIZES[0]),
+                    }
+                )
+    return pd.DataFrame(rows)
+
+
+def _observed(track: DugoffTrack, kept: slice, states: Tensor, inputs: Tensor) -> Tensor:
+    """Some of what the track measures."""
+    return track.observation(states, inputs)[..., kept]
+
+
+def observability_table(found: pd.DataFrame) -> Table:
+    """`local` as it is shown."""
+    columns = {
+        "speed": Column("speed [m/s]", decimals=0),
+        "steer": Column("steering angle [deg]", decimals=1),
+        "measured": Column("measured"),
+        "rank": Column("rank", decimals=0),
+        "deviation": Column("deviation of V_y from 10 samples [m/s]", decimals=4),
+    }
+    caption = (
+        "Local observability of the smooth-tyre model in steady turns (Section III-B): rank of the matrix of two samples, and how well ten "
+        "samples with the sensors' levels of noise alone determine the lateral velocity. Computed, no recording."
+    )
+    return Table("observability", caption, found, columns)
+
+
+def claims(found: pd.DataFrame) -> list[Claim]:
+    """Rank two wherever the car steers, and less at zero steering."""
+    steered, straight = found[found["steer"] > 0], found[found["steer"] == 0]
+    full, lost = int((steered["rank"] == 2).sum()), int((straight["rank"] < 2).sum())
+    worst = float(straight["deviation"].max() / found[found["steer"] == min(steered["steer"])]["deviation"].max())
+    why = "exact"
+    return [
+        Claim(
+            "III-B: observable where the car steers (rank 2)",
+            "yes",
+            f"rank 2 in {full} of {len(steered)} steady turns",
+            "computed",
+            "reproduced" if full == len(steered) else "not reproduced",
+            why,
+        ),
+        Claim(
+            "III-B: unobservable at δ = 0",
+            "yes",
+            f"rank below 2 in {lost} of {len(straight)}; deviation of V_y there {fixed(worst, 2)} times that at {min(steered['steer']):g}°",
+            "computed",
+            "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided",
+            why,
+        ),
+    ]

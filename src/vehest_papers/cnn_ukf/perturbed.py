@@ -1,0 +1,195 @@
+"""Figure 14 and beyond: what becomes of the errors where filters take the car, or its tyres, for others than they are."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.estimators.base import Estimator
+from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
+from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS
+from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
+from vehest.estimators.model_files import load_model
+from vehest.evaluation.manoeuvres import manoeuvres_of
+from vehest.report.document import Column, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
+from vehest.training.context import FitContext
+from vehest.training.search import staged_optuna_search
+from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
+from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs, chosen, filter_of, line_of
+
+STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
+COMBINATIONS = tuple(itertools.product(STEPS, STEPS))
+"""Shares by which the front and the rear axle's cornering stiffness are off."""
+NOMINAL = COMBINATIONS.index((0.0, 0.0))
+LABELS = [f"{100 * front:+.0f} / {100 * rear:+.0f} %" for front, rear in COMBINATIONS]
+SOFTEST = COMBINATIONS.index((-paper.STIFFNESS_STEP, -paper.STIFFNESS_STEP))
+BODIES = {"mass −10 %": (0.9, 1.0), "mass +10 %": (1.1, 1.0), "inertia −10 %": (1.0, 0.9), "inertia +10 %": (1.0, 1.1)}
+"""What of the car is taken for another than it is -> factors of mass and of yaw inertia."""
+WITH_FILTER = (paper.MODEL, paper.SMOOTH, paper.FREE, paper.DEEP, paper.CNN)
+TRIALS, STAGES, SHRINK = 30, 2, 0.3  # of the search for p₁ and p₂, as in the training
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbed:
+    """Candidates whose filters take the car for another.
+
+    Args:
+        stiffness: of each of `COMBINATIONS` the runs of each candidate.
+        bodies: of each of `BODIES` likewise.
+        tuned: DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none.
+    """
+
+    stiffness: Sequence[Runs]
+    bodies: Mapping[str, Runs]
+    tuned: Sequence[Run]
+
+
+def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
+    """A copy of a filter whose cornering stiffnesses are off by shares of their values.
+
+    Raises:
+        DataError: it has none.
+    """
+    changed = copy.deepcopy(fitted)
+    of_filter = filter_of(changed)
+    if of_filter is None:
+        raise DataError(f"estimator '{fitted.name}' has no cornering stiffness")
+    of_filter.tyres[[0, len(DUGOFF_PARAMETERS)]] *= 1.0 + np.array([front, rear])
+    return changed
+
+
+def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
+    """A copy of a filter that takes the car's mass and yaw inertia for so many times what they are; its tyres stay as they were found.
+
+    Raises:
+        DataError: it has no filter.
+    """
+    changed = copy.deepcopy(fitted)
+    of_filter = filter_of(changed)
+    if of_filter is None:
+        raise DataError(f"estimator '{fitted.name}' knows no mass")
+    car = of_filter.settings.car
+    of_filter.settings = replace(of_filter.settings, car=replace(car, mass=mass * car.mass, yaw_inertia=inertia * car.yaw_inertia))
+    return changed
+
+
+def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) -> EnsembleUkf:
+    """A copy of a DE-UKF whose p₁ and p₂ (Eq. 11) suit its filter as it is now, by the rule of its training."""
+    changed = copy.deepcopy(fitted)
+    changed.scaling = np.array([0.0, 1.0])
+    words = [changed.word(changed.seen(recording.stack(changed.channels))) for recording in recordings]
+
+    def cost(powers: FloatArray) -> float:
+        scaled = [word._replace(variance=scaled_variance(word.variance - LEAST_VARIANCE, powers)) for word in words]
+        error = changed.mean_squared_error(recordings, scaled, over="recordings")
+        return error if np.isfinite(error) else 1e6
+
+    changed.scaling = staged_optuna_search(cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK).best
+    return changed
+
+
+def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
+    """The filters of the study, of each the seed that validation chooses, under all perturbations; only p₁ and p₂ are ever tuned anew."""
+    drives = prepared.seen(TEST)
+    own = {candidate: [chosen(runs[candidate])] for candidate in WITH_FILTER if candidate in runs}
+    fitted = {candidate: [load_model(run.model.model_folder) for run in seeds] for candidate, seeds in own.items()}
+
+    def scored(run: Run, estimator: Estimator) -> Run:
+        parts = prepared.score(estimator.estimate(list(drives)), TEST)
+        return Run(run.candidate, run.model, run.validation, manoeuvres_of(prepared.spans(TEST), parts))
+
+    stiffness = [
+        dict(own)
+        if (front, rear) == (0.0, 0.0)
+        else {
+            candidate: [scored(run, with_stiffness(model, front, rear)) for run, model in zip(seeds, fitted[candidate], strict=True)]
+            for candidate, seeds in own.items()
+        }
+        for front, rear in COMBINATIONS
+    ]
+    bodies = {
+        words: {
+            candidate: [scored(run, with_body(model, *factors)) for run, model in zip(seeds, fitted[candidate], strict=True)]
+            for candidate, seeds in own.items()
+        }
+        for words, factors in BODIES.items()
+    }
+    tuned = []
+    judged = prepared.judged()
+    for run, model in zip(own.get(paper.DEEP, []), fitted.get(paper.DEEP, []), strict=True):
+        assert isinstance(model, EnsembleUkf)
+        softer = with_stiffness(model, *COMBINATIONS[SOFTEST])
+        assert isinstance(softer, EnsembleUkf)
+        tuned.append(scored(run, tuned_anew(softer, judged, run.model.seed)))
+    return Perturbed(stiffness, bodies, tuned)
+
+
+def figure_14(found: Perturbed, data: str) -> Figure:
+    """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
+    comparisons = [Comparison(runs, "test") for runs in found.stiffness]
+    with paper_style():
+        figure = new_figure(DOUBLE_COLUMN, 3.0)
+        panels = figure.subplots(1, 2)
+        for axes, indicator, label in zip(panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True):
+            for candidate in found.stiffness[NOMINAL]:
+                line = line_of(candidate)
+                measured = [own.get(candidate, indicator) for own in comparisons]
+                at = np.arange(len(COMBINATIONS))
+                low, high = np.array([own.interval for own in measured]).T
+                axes.fill_between(at, low, high, color=line.colour, alpha=0.1, linewidth=0)
+                values = [own.value for own in measured]
+                axes.plot(at, values, color=line.colour, linestyle=line.dash, marker=line.marker, label=candidate)
+            axes.set_xticks(range(len(COMBINATIONS)), [f"{100 * front:+.0f}\n{100 * rear:+.0f}" for front, rear in COMBINATIONS])
+            axes.set_xlabel("front (above) and rear stiffness off by [%]")
+            axes.set_ylabel(label)
+            axes.set_yscale("log")
+        legend_above(figure, panels[0], columns=5)
+    caption = (
+        "Errors of the test where cornering stiffnesses of the axles in the filters are off by 10 % (Figure 14 of the paper), of the "
+        f"seed that validation chooses; bands: 95 % intervals over manoeuvres. Nothing is trained again. Data: {data}."
+    )
+    return Figure("figure_14", caption, figure)
+
+
+def perturbed_table(found: Perturbed, data: str) -> Table:
+    """MSE_nl of every filter as it is and under every perturbation, with intervals."""
+    conditions: dict[str, Runs] = {"as identified": found.stiffness[NOMINAL]}
+    conditions |= {
+        f"stiffness {words}": own for words, own in zip(LABELS, found.stiffness, strict=True) if own is not found.stiffness[NOMINAL]
+    }
+    conditions |= found.bodies
+    if found.tuned:
+        conditions[f"stiffness {LABELS[SOFTEST]}, p₁ and p₂ tuned anew"] = {paper.DEEP: found.tuned}
+    rows: list[dict[str, object]] = []
+    for words, runs in conditions.items():
+        own = Comparison(runs, "test")
+        rows.append({"condition": words, **{candidate: own.in_words(candidate, MSE_NL) for candidate in runs}})
+    columns = {"condition": Column("the filter takes")} | {candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]}
+    caption = (
+        "MSE_nl [deg²] where filters take tyres or body for others than they are, front / rear, of the chosen seed, with 95 % "
+        f"intervals over manoeuvres. The plant's mass and inertia are known exactly otherwise. Data: {data}."
+    )
+    return Table("perturbed", caption, pd.DataFrame(rows).fillna("–"), columns)
+
+
+def values(found: Perturbed) -> pd.DataFrame:
+    """MSE and MSE_nl of every run with every combination; columns: candidate, seed, front, rear, mse, mse_nonlinear."""
+    return pd.DataFrame(
+        [
+            {"candidate": candidate, "seed": run.model.seed, "front": front, "rear": rear}
+            | {"mse": run.kpis.mse, "mse_nonlinear": run.kpis.mse_nonlinear}
+            for (front, rear), runs in zip(COMBINATIONS, found.stiffness, strict=True)
+            for candidate, seeds in runs.items()
+            for run in seeds
+        ]
+    )
