@@ -79,3 +79,21 @@ def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, tmp_p
     assert "invalid partition" in driver.said
     assert "Traceback" not in driver.said
     assert not trained(output)
+
+
+def test_a_queue_that_takes_no_more_jobs_fails_what_is_left_and_no_other(folder, alone, tmp_path):  # noqa: F811
+    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
+    environment = install(queue)
+    driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
+    lost = driver.sees(lambda: with_a_checkpoint(output))
+    (queue / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n")
+    os.kill(lost["pid"], signal.SIGKILL)
+    assert driver.ended() == 5, driver.said
+    assert "SLURM takes no jobs" in driver.said
+    assert "out of hours" in driver.said
+    assert "Traceback" not in driver.said
+    made = trained(output)
+    assert made
+    assert set(made.values()) == {1}
+    assert not set(lost["keys"]) & set(made)
+    assert set(states(queue).values()) == {"COMPLETED", "FAILED"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from place import Place, write_csv
 from vehest.cli import _complete_model_or_file
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class
-from vehest.sources.base import kind_of
+from vehest.sources.base import kind_of, open_source
 from vehest.stages.config import compose_config
 from vehest.stages.estimate import pretrained_folder
 from vehest.trust.record import read_trust
@@ -93,6 +94,28 @@ def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the
     assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in trust.bands.datasets)
     assert trust.bands.n_blocks >= 34
     assert "ferrari_250_lm" not in trust.bands.vehicles
+
+
+def bands_on(name: str, data_root: Path) -> tuple[float, float, float]:
+    """Of the first recording of a data set: share of sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
+    source = open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
+    recording = next(iter(source.recordings()))
+    estimate = vehest.estimate(vehest.load_model(), recording)
+    reference = np.interp(estimate.time, recording.time, recording["sideslip_ref"])
+    error, band = np.abs(estimate["sideslip"] - reference), estimate["band_sideslip"]
+    judged = np.isfinite(error) & np.isfinite(band)
+    inside, valid = np.mean(error[judged] <= band[judged]), np.mean(estimate["health"][judged] == 0)
+    return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
+
+
+def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root: Path):
+    text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
+    told = re.search(r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid", text)
+    assert told is not None
+    inside, median, valid = bands_on("ferrari_250lm", data_root)
+    assert [told[1], told[2], told[3]] == [f"{100 * inside:.0f}", f"{median:.1f}", f"{100 * valid:.0f}"]
+    assert "hardly a sample is valid" in text
+    assert bands_on("roboracer", data_root)[2] < 0.01
 
 
 def test_python_interface_loads_the_pretrained_model_by_default():

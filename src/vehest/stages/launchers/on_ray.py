@@ -28,6 +28,7 @@ from vehest.stages.failures import Failure, failure_of
 from vehest.stages.group import Group, Member
 from vehest.stages.launcher import Done, Reporter
 from vehest.stages.launchers.board import Board
+from vehest.stages.launchers.returned import Returned
 from vehest.stages.launchers.store import Store
 from vehest.stages.launchers.times import Times, next_lot
 from vehest.stages.launchers.worker import Order, Report, find_like, inputs_of, mark_shared, moved, run_order, this_world
@@ -94,9 +95,9 @@ class RayLauncher:
         self._task: Any = None
         self._token = ""
         self._shunned: dict[str, str] = {}
-        self._told: set[str] = set()
         self._pushed: set[Path] = set()
         self._times = Times(output)
+        self._returned = Returned(output, self._times, messages, self._here)
         self._there, self._seen = 1, 0.0
 
     @property
@@ -254,17 +255,8 @@ class RayLauncher:
         yield from self._reported(node, told, lot, course)
 
     def _reported(self, node: str, told: Report, lot: _Lot, course: _Course) -> Iterator[Done[list[Member]]]:
-        self._compare_processors(told)
-        left = set(lot.positions)
-        for ended in told.ended:
-            left.discard(ended.position)
-            if ended.outcome is None:
-                continue
-            outcome: list[Member] | Failure = ended.outcome
-            if not isinstance(outcome, Failure):
-                outcome = self._here(moved(outcome, self._output.resolve(), self._output))
-                self._times.learn(course.groups[ended.position], ended.seconds)
-            yield Done(ended.position, outcome, ended.seconds)
+        done, left = self._returned.read(told, lot.positions, course.groups)
+        yield from done
         if told.unsuitable and left:
             if node not in self._shunned:
                 self._shunned[node] = told.unsuitable
@@ -272,11 +264,10 @@ class RayLauncher:
                 self._seen = 0.0
             if not self._nodes():
                 yield from (
-                    Done(at, Failure(f"no machine of the cluster can do it; {told.host}: {told.unsuitable}", exit_code=4))
-                    for at in sorted(left)
+                    Done(at, Failure(f"no machine of the cluster can do it; {told.host}: {told.unsuitable}", exit_code=4)) for at in left
                 )
             else:
-                course.again.append(_Lot(sorted(left)))
+                course.again.append(_Lot(left))
 
     def _lost(self, lot: _Lot, course: _Course, error: Exception) -> Iterator[Done[list[Member]]]:
         """Give what a dead worker had to others, each group by itself, so that one which kills them takes no other along."""
@@ -305,13 +296,6 @@ class RayLauncher:
         except Exception as error:
             return failure_of(error)
         return members
-
-    def _compare_processors(self, told: Report) -> None:
-        here = this_world().cpu
-        if told.cpu != here and told.host not in self._told:
-            self._told.add(told.host)
-            detail = f"has another processor ({told.cpu}, here {here}): last digits may differ from those made here"
-            self._messages.line("note", "cluster", told.host, detail)
 
     def _call_off(self, course: _Course) -> None:
         """Take back tasks that no machine has begun."""

@@ -26,6 +26,7 @@ from vehest.stages.console import Messages
 from vehest.stages.failures import Failure
 from vehest.stages.group import Group, Member
 from vehest.stages.launcher import Done, Reporter, default_jobs
+from vehest.stages.launchers.returned import Returned
 from vehest.stages.launchers.times import Times, next_lot
 from vehest.stages.launchers.worker import JOURNAL, Order, Report, mark_shared, moved, run_order, this_world
 from vehest.stages.signals import StopSignals, TimeLimit
@@ -137,11 +138,11 @@ class SlurmLauncher:
         self._output, self._messages = output, messages
         self._run = uuid.uuid4().hex[:12]
         self._times = Times(output)
+        self._returned = Returned(output, self._times, messages)
         self._executor: Any = None
         self._token = ""
         self._failed = False
         self._under_way = 0
-        self._told: set[str] = set()
 
     @property
     def cores(self) -> int:
@@ -172,7 +173,7 @@ class SlurmLauncher:
                     if not course.flying:
                         return
                 else:
-                    self._hand_in(course)
+                    yield from self._hand_in(course)
                 ended = [entry for entry in course.flying if entry[0].done()]
                 if not ended:
                     time.sleep(POLL_SECONDS[self._cluster])
@@ -214,8 +215,12 @@ class SlurmLauncher:
                         report(position, None)
         self._under_way = sum(not course.begun.isdisjoint(positions) for _, positions in course.flying)
 
-    def _hand_in(self, course: _Course) -> None:
-        """Give the queue all that waits, or as much as may run here."""
+    def _hand_in(self, course: _Course) -> Iterator[Done[list[Member]]]:
+        """Give the queue all that waits, or as much as may run here; failures where it takes no more.
+
+        Raises:
+            MissingError: it takes no jobs from the start.
+        """
         lots: list[list[int]] = []
         while (course.again or course.waiting) and (self._cluster == "slurm" or len(course.flying) + len(lots) < self.cores):
             lots.append(course.again.popleft() if course.again else self._next(course))
@@ -226,9 +231,16 @@ class SlurmLauncher:
         try:
             handed = self._executor.map_array(OnSlurm(), [self._order(lot, course) for lot in lots])
         except (submitit.core.utils.FailedSubmissionError, submitit.core.utils.UncompletedJobError) as error:
-            shutil.rmtree(self._folder, ignore_errors=True)
             reason = " ".join(str(error).split())[-300:]
-            raise MissingError(f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit") from error
+            why = f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit"
+            if not course.flying and not course.deaths:
+                shutil.rmtree(self._folder, ignore_errors=True)
+                raise MissingError(why) from error
+            left = [*(at for lot in lots for at in lot), *course.waiting, *(at for lot in course.again for at in lot)]
+            course.waiting.clear()
+            course.again.clear()
+            yield from (Done(at, Failure(why, exit_code=MissingError.exit_code)) for at in left)
+            return
         course.flying += zip(handed, lots, strict=True)
 
     def _next(self, course: _Course) -> list[int]:
@@ -272,23 +284,10 @@ class SlurmLauncher:
             yield from self._reported(told, lot, course)
 
     def _reported(self, told: Report, lot: list[int], course: _Course) -> Iterator[Done[list[Member]]]:
-        here = this_world().cpu
-        if told.cpu != here and told.host not in self._told:
-            self._told.add(told.host)
-            detail = f"has another processor ({told.cpu}, here {here}): last digits may differ from those made here"
-            self._messages.line("note", "cluster", told.host, detail)
-        left = set(lot)
-        for ended in told.ended:
-            left.discard(ended.position)
-            if ended.outcome is None:
-                continue
-            outcome: list[Member] | Failure = ended.outcome
-            if not isinstance(outcome, Failure):
-                outcome = moved(outcome, self._output.resolve(), self._output)
-                self._times.learn(course.groups[ended.position], ended.seconds)
-            yield Done(ended.position, outcome, ended.seconds)
+        done, left = self._returned.read(told, lot, course.groups)
+        yield from done
         if told.unsuitable:
-            yield from (Done(at, Failure(f"{told.host}: {told.unsuitable}", exit_code=MissingError.exit_code)) for at in sorted(left))
+            yield from (Done(at, Failure(f"{told.host}: {told.unsuitable}", exit_code=MissingError.exit_code)) for at in left)
 
     def _lost(self, job: Any, lot: list[int], course: _Course) -> Iterator[Done[list[Member]]]:
         """Hand in again what a dead job had, each group by itself, so that one which kills jobs takes no other along."""
