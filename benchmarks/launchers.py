@@ -73,7 +73,7 @@ def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:
 
 
 def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
-    """Both launchers on the same groups, each into a fresh output root; the best of the repeats."""
+    """Both launchers on the same groups, each into a fresh output root; the median of the repeats."""
     recordings = scratch / "recordings"
     found: dict[str, list[dict[str, float]]] = {"local": [], "ray": []}
     on_ray.LEAST_SECONDS = 0.0  # a task a group
@@ -83,7 +83,7 @@ def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
             shutil.copytree(recordings, output)
             launcher = LocalLauncher(CORES) if name == "local" else RayLauncher("local", CORES, None, output, QUIET)
             own.append(timed(launcher, groups_of(output, number)))
-    return {name: {key: round(min(one[key] for one in own), 5) for key in own[0]} for name, own in found.items()}
+    return {name: {key: round(float(np.median([one[key] for one in own])), 5) for key in own[0]} for name, own in found.items()}
 
 
 def scheduler(number: int) -> dict[str, float]:
