@@ -97,7 +97,7 @@ def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the
 
 
 def bands_on(name: str, data_root: Path) -> tuple[float, float, float]:
-    """Of a data set's first recording: share of sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
+    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
     source = open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
     recording = next(iter(source.recordings()))
     estimate = vehest.estimate(vehest.load_model(), recording)

@@ -26,13 +26,14 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.studies.trust_faults import FaultTrials, elsewhere, health_of, trials_of
+from vehest.studies.trust_shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 from vehest.trust.bands import ELSEWHERE, LEVELS
 from vehest.trust.faults import parse_condition
 
 TAKES = "parts"
 SHOWS_FAILED = True
 
-LEARNT, OTHER = "learnt on", "another"
+OTHER = "another"
 FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "error_icc", "band_blocks", "rmse_sideslip")
 COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
 SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
@@ -43,10 +44,16 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report: bands on cars learnt on, bands elsewhere, faults against what could be seen, integrity, then how it was made."""
     parts = artefacts.parts
     board = coverage_board(parts)
+    scores = scores_learnt(parts, board)
+    board["if_shuffled"] = if_shuffled(parts, board, scores)
     trials = [trials_of(name, part) for name, part in parts.items() if _tries_faults(part)]
     blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append(f"{_bands_in_words(board)}\n\n{_faults_in_words(trials)}")
-    blocks += ["## Bands on cars and tyres that were learnt on", *_bands(board[board["car"] == LEARNT], "learnt")]
+    blocks.append(f"{_bands_in_words(board)}\n\n{shuffled_in_words(board)}\n\n{_faults_in_words(trials)}")
+    blocks += [
+        "## Bands on cars and tyres that were learnt on",
+        *_bands(board[board["car"] == LEARNT], "learnt"),
+        *over_parts(board, scores),
+    ]
     blocks += [_reliability(board), _by_acceleration(parts, board)]
     blocks += ["## Bands on another car or tyre", _widening_in_words(board), *_bands(board[board["car"] == OTHER], "elsewhere")]
     blocks += ["## Faults", *_faults(trials), *_bands_under_faults(parts, trials)]
@@ -75,14 +82,10 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                 row |= {"car": OTHER if elsewhere(part, test_set) else LEARNT}
                 row |= {figure: float(own["value"][figure]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
                 row |= {end: float(own[end]["coverage_90"]) for end in ("low", "high")}
-                row |= {"inside": _holds(row["low"], row["high"])}
+                row |= {"inside": in_words(row["low"], row["high"])}
                 row |= {"without_widening": _without_widening(part, models[0], test_set) if row["car"] == OTHER else math.nan}
                 rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _holds(low: float, high: float) -> str:
-    return "no interval" if math.isnan(low) else "yes" if low <= 0.9 <= high else "too wide" if low > 0.9 else "too narrow"
 
 
 def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
@@ -144,6 +147,8 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
         "error_icc": Column("correlation", decimals=2),
         "band_blocks": Column("manoeuvres", decimals=1),
     }
+    if name == "learnt":
+        columns = {**columns, "if_shuffled": Column("0.90 in it if shuffled [%]", decimals=0)}
     if name == "elsewhere":
         columns = {**columns, "without_widening": Column("inside without the factor [%]", decimals=1)}
     caption = (
@@ -151,6 +156,8 @@ def _bands(board: pd.DataFrame, name: str) -> list[Block]:
         "mean full width; interval score; intraclass correlation of squared errors, 1 where an error lasts for a whole manoeuvre; and how "
         "many equal manoeuvres the errors are spread over."
     )
+    if name == "learnt":
+        caption += " If shuffled: share of draws with 0.90 in the interval, manoeuvres of calibration and test shuffled."
     return [Table("overview" if name == "learnt" else f"bands_{name}", caption, shown, columns)]
 
 
