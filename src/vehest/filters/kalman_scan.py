@@ -73,26 +73,9 @@ def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatA
 
 @numba.njit(cache=True, error_model="numpy")
 def _scan(  # type: ignore[no-untyped-def]
-    A,
-    b,
-    Q,
-    C,
-    d,
-    R,
-    y,
-    mean,
-    cov,
-    prior_mean,
-    prior_cov,
-    post_mean,
-    post_cov,
-    innovation,
-    innovation_cov,
-    likelihood,
-    limit,
-    patience,
-    refused,
-):
+    A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post_cov, innovation, innovation_cov, likelihood,
+    limit, patience, refused,
+):  # fmt: skip
     """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
