@@ -13,11 +13,11 @@ from scipy import stats
 from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored
+from vehest.studies.kit.statements import Change, Compared, Statement, counted, decided, outcomes
 from vehest_papers.ksnn import claims, cost, paper, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
-from vehest_papers.ksnn.comparing import Change, Errors, masked_segments
+from vehest_papers.ksnn.comparing import Errors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
-from vehest_papers.ksnn.statements import Compared, Statement, counted, decided, outcomes
 
 PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
 

@@ -14,13 +14,12 @@ from vehest.constants import FloatArray
 from vehest.evaluation.manoeuvres import GROUPS, is_nonlinear
 from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim, Verdict
+from vehest.studies.kit.statements import Change, Compared, Expected, Measured, Statement, short
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.measures import ME, ME_NL, MSE, MSE_NL, Comparison, whole
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.perturbed import NOMINAL, Perturbed
 from vehest_papers.cnn_ukf.subjects import Run
-from vehest_papers.ksnn.comparing import Change, Measured, short
-from vehest_papers.ksnn.statements import Compared, Expected, Statement
 
 LEVEL = 0.10
 HEADERS = {MSE: "MSE", MSE_NL: "MSE_nl", ME: "ME", ME_NL: "ME_nl"}

@@ -16,6 +16,7 @@ from vehest.report.style import fixed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
+from vehest.studies.kit.statements import decided
 from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, tables, traces
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
 from vehest_papers.cnn_ukf.networks import outputs_of, shift_of
@@ -34,7 +35,6 @@ from vehest_papers.cnn_ukf.subjects import (
     kpi_table,
     runs_of,
 )
-from vehest_papers.ksnn.statements import decided
 
 FULL, BEFORE, FREE, ABLATION, STANDARD, LIMITED = "full", "before", "free", "ablation", "standard", "limited"
 RENAMED = {

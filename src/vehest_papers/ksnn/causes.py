@@ -10,9 +10,9 @@ import pandas as pd
 
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed, listed
+from vehest.studies.kit.statements import Compared, Outcome, outcomes
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.schemes import Scheme
-from vehest_papers.ksnn.statements import Compared, Outcome, outcomes
 
 Order = Literal["comes out", "does not come out", "is open"]
 CAUSES = {"same_sensors": "the same sensors", "same_tyres": "the same tyres", "same_driving": "the same driving"}

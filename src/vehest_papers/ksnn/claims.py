@@ -10,10 +10,10 @@ from scipy import stats
 
 from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim
+from vehest.studies.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
 from vehest_papers.ksnn import paper
-from vehest_papers.ksnn.comparing import Change, Errors, short
+from vehest_papers.ksnn.comparing import Errors
 from vehest_papers.ksnn.schemes import THIRD, Scheme, segments_on
-from vehest_papers.ksnn.statements import Compared, Expected, Statement, counted, outcomes
 
 ABOUT_A_QUARTER = (0.20, 0.30)
 EXPLAINED = 0.10

@@ -19,12 +19,12 @@ from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.kit.claims import Claim
 from vehest.studies.kit.reading import median_and_range
+from vehest.studies.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
 from vehest_papers.ksnn import behaviour, cost, paper
-from vehest_papers.ksnn.comparing import N_RESAMPLES, Change, Measured, short
+from vehest_papers.ksnn.comparing import N_RESAMPLES
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_of
-from vehest_papers.ksnn.statements import Compared, Statement, counted, outcomes
 
 ENOUGH, LONGER = "30", "60"
 """Samples of a window: the paper's 1.5 s, and twice that."""

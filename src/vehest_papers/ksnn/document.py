@@ -13,12 +13,12 @@ from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
+from vehest.studies.kit.statements import Statement, decided
 from vehest.studies.kit.warnings import warnings_of
 from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_table, headline
 from vehest_papers.ksnn.curve import Curve, curve_figure, curve_of, curve_table
 from vehest_papers.ksnn.schemes import SET_TITLES, Scheme
-from vehest_papers.ksnn.statements import Statement, decided
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
 """Part -> the paper's table, test set of the car that is learnt on, test set of the other."""

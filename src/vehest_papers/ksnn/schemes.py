@@ -13,9 +13,10 @@ from vehest.evaluation.blocks import Segments, read_segments
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import words_of_kinds
 from vehest.studies.kit.runs import by_name
+from vehest.studies.kit.statements import Change, Measured
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
-from vehest_papers.ksnn.comparing import Change, Errors, Measured
+from vehest_papers.ksnn.comparing import Errors
 from vehest_papers.ksnn.paper import Published
 
 THIRD = "j1"

@@ -1,4 +1,4 @@
-"""Statements of the paper with the comparisons that decide them, and what becomes of them together."""
+"""Statements of a paper with the comparisons that decide them: relative changes with their intervals, and the verdicts on them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,119 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from vehest.evaluation.significance import holm
+import numpy as np
+from scipy import stats
+
+from vehest.constants import FloatArray
+from vehest.evaluation.blocks import LEAST_BLOCKS
+from vehest.evaluation.significance import CONFIDENCE, holm
+from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim, Verdict
-from vehest_papers.ksnn.comparing import CONFIDENCE, Change, short
 
 Outcome = Literal["as claimed", "the other way round", "not told apart"]
 Expected = Literal["lower", "higher"]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A figure of one candidate over all its seeds.
+
+    Args:
+        value: an error of it, above zero.
+        draws: logarithm of it in each resample, blocks and seeds drawn anew, (n,).
+        of_each: its logarithm for each seed alone, (S,).
+        n_blocks: blocks of the drive, or drives, that were resampled.
+        paired: whether the seeds are the very networks of the others it is compared with, and were drawn together with theirs.
+    """
+
+    value: float
+    draws: FloatArray
+    of_each: FloatArray
+    n_blocks: int
+    paired: bool = False
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval, symmetric on a logarithmic axis; NaN where the test has too few blocks."""
+        return Change.of(self, None).ends()
+
+
+@dataclass(frozen=True)
+class Change:
+    """How a figure stands to another one, or to a limit, as a ratio.
+
+    Args:
+        log_ratio: its logarithm.
+        error: standard error of that.
+        dof: degrees of freedom of Student's t, by Welch and Satterthwaite from blocks and seeds.
+    """
+
+    log_ratio: float
+    error: float
+    dof: float
+
+    @classmethod
+    def of(cls, first: Measured, second: Measured | None, limit: float = 1.0) -> Change:
+        """Of one figure to another on the same or on another test, or to a limit.
+
+        Figures whose draws are of the same resamples are paired; those of two tests are not.
+        """
+        draws = first.draws - (second.draws if second is not None else 0.0)
+        parts = [own for own in (first, second) if own is not None]
+        error = float(np.std(draws)) if min(own.n_blocks for own in parts) >= LEAST_BLOCKS else math.nan
+        apart = [own.of_each for own in parts]
+        if second is not None and first.paired and second.paired:
+            apart = [first.of_each - second.of_each]
+        of_seeds = [(float(np.var(own, ddof=1)) / len(own), len(own) - 1) for own in apart if len(own) > 1]
+        of_blocks = max(error**2 - sum(variance for variance, _ in of_seeds), 0.0)
+        terms = [(of_blocks, min(own.n_blocks for own in parts) - 1), *of_seeds]
+        spread = sum(variance**2 / max(free, 1) for variance, free in terms)
+        dof = sum(variance for variance, _ in terms) ** 2 / spread if spread > 0 else math.inf
+        ratio = first.value / (second.value if second is not None else 1.0) / limit
+        return cls(math.log(ratio) if ratio > 0 else math.nan, error, dof)
+
+    def p_value(self, beyond: float = 0.0) -> float:
+        """Two-sided, of the hypothesis that the relative change is ``beyond``; NaN where nothing is known of it."""
+        distance = abs(self.log_ratio - math.log1p(beyond))
+        return 2.0 * float(stats.t.sf(distance / self.error, self.dof)) if self.error > 0 else math.nan
+
+    def ends(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
+        """Ends of the interval of the ratio."""
+        half = float(stats.t.ppf(0.5 + confidence / 2.0, self.dof)) * self.error
+        return math.exp(self.log_ratio - half), math.exp(self.log_ratio + half)
+
+    def in_percent(self, confidence: float = CONFIDENCE) -> str:
+        """In words: ``−24 % [−31, −16]``."""
+        low, high = self.ends(confidence)
+        value = percent(math.exp(self.log_ratio))
+        return f"{value} % [{percent(low)}, {percent(high)}]" if math.isfinite(low) else f"{value} %"
+
+    def as_ratio(self, confidence: float = CONFIDENCE) -> str:
+        """The ratio in words: ``2.1 [1.7, 2.6]``."""
+        low, high = self.ends(confidence)
+        value = math.exp(self.log_ratio)
+        return f"{short(value)} [{short(low)}, {short(high)}]" if math.isfinite(low) else short(value)
+
+    def in_decibels(self, confidence: float = CONFIDENCE) -> str:
+        """The ratio of two powers in words: ``7.1 dB [5.2, 9.0]``."""
+        value, low, high = (10.0 * math.log10(own) for own in (math.exp(self.log_ratio), *self.ends(confidence)))
+        return f"{fixed(value, 1)} dB [{fixed(low, 1)}, {fixed(high, 1)}]" if math.isfinite(low) else f"{fixed(value, 1)} dB"
+
+    def over(self, other: Change) -> Change:
+        """The ratio of two ratios that share no resamples."""
+        error = math.hypot(self.error, other.error)
+        return Change(self.log_ratio - other.log_ratio, error, min(self.dof, other.dof))
+
+
+def percent(ratio: float) -> str:
+    """A ratio as a change in whole per cent, with its sign: ``−24``, ``+3``."""
+    change = 100.0 * (ratio - 1.0)
+    return f"{'+' if round(change) > 0 else ''}{fixed(change, 0)}" if round(change) else "0"
+
+
+def short(value: float) -> str:
+    """A positive number in as few digits as tell it apart: two decimals, three below 0.1."""
+    return fixed(value, 3 if abs(value) < 0.1 else 2 if abs(value) < 10 else 0)
 
 
 @dataclass(frozen=True)
