@@ -186,10 +186,7 @@ def _asked(
     shown = ", ".join(f"{name} {driven.in_words(name, MSE_NL)}" for name in (paper.CNN, paper.SMOOTH, paper.FREE) if name in driven)
     sentences.append(f"**Mind:** a spin and a 43° slide are cut at 12°; scored whole, where networks have learnt nothing: {shown} deg².")
     row = active[active["candidate"] == paper.CNN].iloc[0]
-    sentences.append(
-        f"**Is the network heard?** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°; σ_ψ̇: "
-        f"{row['process_yaw_rate']} rad/s."
-    )
+    sentences.append(f"**Is the network heard?** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°.")
     return [words, " ".join(sentences)]
 
 
