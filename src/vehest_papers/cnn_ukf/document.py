@@ -312,10 +312,11 @@ def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kin
         "Table III: ours with 95 % intervals, means over seeds (paper's in brackets), learnt up to 7 m/s². What does not learn, "
         f"and its errors of validation, are those of the full set. Data: {words}."
     )
+    training = {name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()}
     of_networks = "What hybrids' networks say, and what filters make of it, learnt on the limited set"
     return [
         "## Appendix: limited set",
-        tables.accuracy(learnt.comparison, paper.TABLE_III, {}, "table_3", caption),
+        tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
         tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", f"{of_networks}. Data: {words}."),
         figure,
         traces.compared(picked, turn, "figure_12", 12, what, words),
