@@ -23,14 +23,17 @@ from vehest.data.transforms import transform_from_config
 from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.network_ukf import Word
-from vehest.estimators.model_files import save_model
+from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.networks.sample_network import INPUTS
+from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score_all
 from vehest.report.document import Document, Figure, Table
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
-from vehest_papers.cnn_ukf import claims, documents, networks, observability, paper, perturbed, tables, traces
+from vehest_papers.cnn_ukf import claims, documents, networks, observability, paper, perturbed, search, tables, traces
+from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, limited
 from vehest_papers.cnn_ukf.measures import MSE, Comparison
 from vehest_papers.cnn_ukf.subjects import OFFLINE, OWN, Prepared, Run, candidate_of, chosen, line_of, runs_of, until
 
@@ -40,6 +43,7 @@ TESTS = ("test_j_turn_1", "test_slalom_1", "test_spiral_1", "test_lap_1")
 NAMES = ("train_1", "validation_1", *TESTS)
 SPLIT = Split("made", (Span("car", "train_1"),), (Span("car", "validation_1"),), {"test": tuple(Span("car", name, 1.5) for name in TESTS)})
 TRAINED = {"phase": {"patience": 6, "max_epochs": 30}, "batch_size": 32, "steps": 256}
+POINT = "point"
 SAMPLES = SampleSettings(PhaseSettings(learning_rate=1e-3, max_epochs=1))
 
 
@@ -59,12 +63,24 @@ def fitted_models(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
         hybrid.fit(data, TRAININGS[name])
         made[candidate] = hybrid, [0, 1]
     made[paper.ZERO] = estimator_class("zero").from_config({"rate_hz": 100}), [0]
+    made |= further_networks(data)
     return made
 
 
+def further_networks(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
+    """A recurrent network with all 17 inputs, and a point of the search."""
+    recurrent = estimator_class("velocity_gru").from_config({"inputs": list(INPUTS["full"]), "outputs": ["vy"], "n_states": 4})
+    phase = PhaseSettings(learning_rate=1e-3, max_epochs=1)
+    recurrent.fit(data, SequenceSettings(phase, sequence_steps=100, validation_steps=100, dropped_steps=20))
+    narrower = estimator_class("sideslip_ffnn").from_config({"hidden": [5, 6]})
+    narrower.seed(0)
+    narrower.fit(data, SAMPLES)
+    return {paper.RECURRENT: (recurrent, [0, 1]), POINT: (narrower, [0])}
+
+
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
-    """The four methods, the smooth filter and baselines on four test manoeuvres of six seconds."""
+def everything(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+    """The four methods, the smooth filter, baselines and further networks on four test manoeuvres of six seconds."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)}
     references = {}
@@ -72,9 +88,10 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
         references["car", name] = folder / f"{name}.parquet"
         write_recording(own, references["car", name])
     models, rows = [], []
-    for number, (estimator, seeds) in enumerate(fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]])).values()):
+    fitted = fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]]))
+    for number, (candidate, (estimator, seeds)) in enumerate(fitted.items()):
         for seed in seeds:
-            home = folder / f"{number}-{seed}"
+            home = folder / f"{candidate if candidate == POINT else number}-{seed}"
             home.mkdir()
             save_model(estimator, home)
             (home / "fit.csv").write_text("metric,value\nbest_validation_loss,1.0\nbest_epoch,1\n")
@@ -121,20 +138,32 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
 
 
 @pytest.fixture(scope="module")
+def part(everything: PartArtefacts) -> PartArtefacts:
+    """What Table II needs."""
+    return PartArtefacts(**{**vars(everything), "models": [own for own in everything.models if not is_further(own)]})
+
+
+def is_further(own: EvaluatedModel) -> bool:
+    return own.estimator == "velocity_gru" or own.model_folder.name.startswith(POINT)
+
+
+@pytest.fixture(scope="module")
 def runs(part: PartArtefacts) -> dict[str, list[Run]]:
     return runs_of(part, Prepared(part))
 
 
 @pytest.fixture(scope="module")
-def report(part: PartArtefacts) -> Document:
+def report(part: PartArtefacts, everything: PartArtefacts) -> Document:
     """Of a study whose parts are all made from the same small models."""
-    names = ("full", "before", "free", "ablation", "standard", "limited")
+    names = ("full", "before", "free", "ablation", "standard", "limited", "recurrent", "search_5_6")
     models = {
         "before": [own for own in part.models if own.estimator == "cnn_ukf"],
         "free": [own for own in part.models if own.variant.endswith("_smooth") or own.estimator == "cnn_ukf"],
         "ablation": [replace(own, variant="full_no_adaptive_process") for own in part.models if own.estimator == "cnn_ukf"],
         "standard": [own for own in part.models if own.estimator == "sideslip_ffnn"],
         "limited": [own for own in part.models if own.estimator in ("sideslip_ffnn", "ensemble_ukf", "cnn_ukf")],
+        "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
+        "search_5_6": [own for own in everything.models if own.model_folder.name.startswith(POINT)],
     }
     parts = {name: PartArtefacts(**{**vars(part), "models": models.get(name, part.models)}) for name in names}
     return documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
@@ -156,6 +185,10 @@ def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_a
         "filters",
         "scaling",
         "budget",
+        "networks_alone",
+        "networks_limited",
+        "oracles",
+        "search",
     } <= of_tables
     assert "SIMULATED data" in text
     assert not re.search(r"\bnan\b", text)
@@ -323,6 +356,43 @@ def test_the_model_is_observable_straight_ahead_as_well() -> None:
     assert set(straight["rank"]) == {2}
     first, second = observability.claims(found)
     assert (first.verdict, second.verdict) == ("reproduced", "not reproduced")
+
+
+def test_claims_of_added_candidates_are_tested_where_they_were_trained(report: Document) -> None:
+    frame = next(block.frame for block in report.blocks if isinstance(block, Table) and block.name == "claims")
+    added = frame[frame["claim"].str.contains("limited set|z-scores|recurrent")]
+    assert len(added) == 7
+    assert (added["verdict"] != "not testable on this data").all()
+
+
+def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(
+    part: PartArtefacts, runs: dict[str, list[Run]], tmp_path: Path
+) -> None:
+    prepared = Prepared(part)
+    learnt = {name: runs[name] for name in (paper.DATA, *paper.HYBRIDS)}
+    same = limited(runs, learnt, prepared).scaling
+    assert same.get(AS_TUNED, MSE).value == pytest.approx(same.get(OF_THE_FULL_SET, MSE).value, rel=2e-3)  # estimated on raw drives
+    other = load_model(runs[paper.DEEP][0].model.model_folder)
+    other.scaling = other.scaling + np.array([4.0, 0.0])  # type: ignore[attr-defined]  # DE-UKF
+    save_model(other, tmp_path)
+    of_full = [replace(run, model=replace(run.model, model_folder=tmp_path)) for run in runs[paper.DEEP]]
+    changed = limited({**runs, paper.DEEP: of_full}, learnt, prepared)
+    assert changed.scaling.get(OF_THE_FULL_SET, MSE).value != pytest.approx(same.get(AS_TUNED, MSE).value, rel=1e-2)
+    assert changed.scaling.get(AS_TUNED, MSE).value == same.get(AS_TUNED, MSE).value
+    assert paper.MODEL in changed.comparison  # the filter of the full set
+    with pytest.raises(DataError, match="no CNN-UKF among the models of part 'limited'"):
+        limited(runs, {name: learnt[name] for name in (paper.DATA, paper.DEEP)}, prepared)
+
+
+def test_the_search_compares_validation_with_the_papers_widths(everything: PartArtefacts, runs: dict[str, list[Run]]) -> None:
+    point = PartArtefacts(**{**vars(everything), "models": [own for own in everything.models if own.model_folder.name.startswith(POINT)]})
+    parts = {"search_5_6": runs_of(point, Prepared(point)), "standard": {paper.DATA: runs[paper.DATA]}}
+    assert list(search.points_of(parts, runs)) == [(5, 6), (10, 6)]
+    table = search.search_table(parts, runs, "D")
+    assert table.frame["change"].tolist()[1] == "–"
+    assert table.frame["weights"].tolist() == [5 * 18 + 6 * 6 + 7, 10 * 18 + 6 * 11 + 7]
+    wild = replace(runs[paper.DATA][0], test={})  # the search knows no test
+    assert search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist() == table.frame["validation"].tolist()
 
 
 def test_a_report_without_its_main_part_is_refused(part: PartArtefacts) -> None:

@@ -11,6 +11,7 @@ from test_ranking import RATE, candidates, scored
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.ranking import rank
 from vehest.studies.kit.claims import bound_claim, claims_table, order_claim
+from vehest.studies.kit.statements import percent
 
 NAMES = {name: (name, name) for name in ("good", "other", "like", "zero", "static_map")}
 TITLES = {pair: f"the {name}" for name, pair in NAMES.items()}
@@ -55,3 +56,8 @@ def test_the_table_counts_its_verdicts(ranking):
     assert "1 reproduced, 1 undecided" in table.caption
     assert table.caption.endswith("A note.")
     assert list(table.frame["verdict"]) == ["reproduced", "undecided"]
+
+
+@pytest.mark.parametrize(("ratio", "words"), [(0.76, "−24"), (1.03, "+3"), (0.9963, "−0.4"), (1.004, "+0.4"), (1.0002, "0"), (1.0, "0")])
+def test_a_change_says_on_which_side_of_zero_it_lies(ratio, words):
+    assert percent(ratio) == words

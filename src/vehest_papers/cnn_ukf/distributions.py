@@ -66,7 +66,7 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
     found = {candidate: _distribution(run) for candidate, run in picked.items()}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.4)
-        upper, axes = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 3.2))
+        upper, axes = figure.subplots(2, 1, height_ratios=(1.2, 3.2))  # errors reach ten times as far as deviations
         for place, (candidate, own) in enumerate(found.items()):
             line = line_of(candidate)
             axes.stairs(np.maximum(own.counts, 0.5), own.edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=candidate)
@@ -77,6 +77,7 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         axes.set_xlabel("error of the sideslip angle [deg]")
         upper.set_yticks([])
         upper.set_ylabel("mean, s.d.")
+        upper.set_xlabel("[deg]")
         upper.margins(y=0.25)
         legend_above(figure, axes, columns=5)
     shown = "; ".join(
@@ -119,7 +120,7 @@ def groups(runs: Runs, name: str, title: str, data: str, number: int | None = No
             at = np.arange(len(known)) + (place - 0.5 * (len(of_run) - 1)) * width
             axes.bar(at, middle, width, color=line_of(candidate).colour, alpha=0.8, label=candidate)
             axes.errorbar(at, middle, yerr=[middle - low, high - middle], fmt="none", ecolor="#222222", elinewidth=0.8, capsize=1.5)
-        axes.set_xticks(range(len(known)), [f"{group}\n({counted[group]})" for group in known])
+        axes.set_xticks(range(len(known)), [f"{group.replace(' in the ', chr(10) + 'in the ')}\n({counted[group]})" for group in known])
         axes.set_ylabel("MSE$_{nl}$ [deg²]")
         axes.set_yscale("log")
         legend_above(figure, axes, columns=5)

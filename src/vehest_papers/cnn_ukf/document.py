@@ -17,7 +17,8 @@ from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import spans_in_words, words_of_kinds
 from vehest.studies.kit.statements import decided
-from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, tables, traces
+from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, search, tables, traces
+from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
 from vehest_papers.cnn_ukf.networks import outputs_of, shift_of
 from vehest_papers.cnn_ukf.oracles import oracles
@@ -43,7 +44,10 @@ RENAMED = {
     STANDARD: {paper.DATA: paper.Z_SCORES},
 }
 """Part -> what its candidates are called beside those of the full set."""
-IN_TABLE_II = (*paper.CANDIDATES,)
+ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
+NETWORKS = (paper.DATA, paper.Z_SCORES, paper.RECURRENT)
+"""Networks without a filter, in a table of their own."""
+IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in ORACLES)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -76,7 +80,7 @@ def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
     """Candidates of all parts that learnt on the full set, by names that tell them apart."""
     found: dict[str, Sequence[Run]] = {}
     for name, runs in parts.items():
-        if name != LIMITED:
+        if name != LIMITED and not search.is_point(name):
             found |= {RENAMED.get(name, {}).get(candidate, candidate): own for candidate, own in runs.items()}
     return found
 
@@ -95,24 +99,22 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
     off = perturbed.perturbed(runs, own)
     driven = _whole_drives(artefacts)
     local = observability.local(_filter(chosen(runs[paper.SMOOTH])))
-    limited, of_limited = None, {}
-    if LIMITED in parts:
-        filters = {name: runs[name] for name in (paper.MODEL, paper.SMOOTH) if name in runs}
-        limited = Comparison({**filters, **parts[LIMITED]}, "test")
-        of_limited = {name: [outputs_of(run, own) for run in parts[LIMITED][name]] for name in paper.HYBRIDS}
+    learnt = limited(runs, parts[LIMITED], own) if LIMITED in parts else None
     statements = [
         *claims.on_accuracy(main, kind),
         *claims.on_parts(main, kind),
         *claims.on_networks(main, outputs, kind),
         *claims.on_robustness(off, kind),
-        *claims.on_limited(limited, of_limited, kind),
+        *claims.on_limited(learnt, kind),
     ]
     verdicts = [*decided(statements), *observability.claims(local), *claims.not_testable()]
     picked = {name: chosen(seeds) for name, seeds in runs.items() if name in paper.TABLE_II or name in (paper.SMOOTH, paper.FREE)}
     drawn = {titles[name]: run for name, run in picked.items()}
-    data = {f"kpis_{name}": kpi_table(seeds) for name, seeds in parts.items()} | {"stiffness": perturbed.values(off)}
+    data = {f"kpis_{name}": kpi_table(seeds) for name, seeds in parts.items() if not search.is_point(name)} | {
+        "stiffness": perturbed.values(off)
+    }
     blocks: list[Block] = [
-        *_asked(artefacts, main, driven, titles, active),
+        *_asked(artefacts, main, driven, titles, active, learnt),
         _claims(verdicts),
         *_results(artefacts, main, parts, prepared, active, titles, drawn),
         *_appendices(artefacts, main, runs, prepared, titles, drawn, data),
@@ -123,9 +125,10 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
             main, outputs, "networks_full", f"What hybrids' networks say, and what filters make of it. Data: {kind.upper()}."
         ),
     ]
-    if limited is not None:
-        blocks += _limited(artefacts, limited, of_limited, parts[LIMITED], prepared[LIMITED], kind)
+    if learnt is not None:
+        blocks += _limited(artefacts, learnt, prepared[LIMITED], kind)
     blocks += [
+        *_networks_and_oracles(parts, prepared, main, kind),
         "## Appendix: robustness to tyres and body",
         perturbed.figure_14(off, kind.upper()),
         perturbed.perturbed_table(off, kind.upper()),
@@ -149,7 +152,9 @@ def _filter(run: Run) -> DugoffUkf:
     return found
 
 
-def _asked(artefacts: StudyArtefacts, main: Comparison, driven: Comparison, titles: Mapping[str, str], active: pd.DataFrame) -> list[Block]:
+def _asked(
+    artefacts: StudyArtefacts, main: Comparison, driven: Comparison, titles: Mapping[str, str], active: pd.DataFrame, learnt: Limited | None
+) -> list[Block]:
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     count = len(main.manoeuvres)
     words = (
@@ -172,13 +177,16 @@ def _asked(artefacts: StudyArtefacts, main: Comparison, driven: Comparison, titl
             f"**A filter alone** whose process noise is free, as no row of the paper is, has {main.in_words(paper.FREE, MSE_NL)} deg²: "
             f"{name} against it {change.in_percent()}."
         )
+    if learnt is not None:
+        own = learnt.comparison
+        order = ", ".join(
+            f"{name} {own.in_words(name, MSE_NL)}" for name in sorted(paper.OF_FOUR, key=lambda name: own.get(name, MSE_NL).value)
+        )
+        sentences.append(f"**Learnt without the limit of handling** (|ay| ≤ 7 m/s²): {order}.")
     shown = ", ".join(f"{name} {driven.in_words(name, MSE_NL)}" for name in (paper.CNN, paper.SMOOTH, paper.FREE) if name in driven)
     sentences.append(f"**Mind:** a spin and a 43° slide are cut at 12°; scored whole, where networks have learnt nothing: {shown} deg².")
     row = active[active["candidate"] == paper.CNN].iloc[0]
-    sentences.append(
-        f"**Is the network heard?** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°; σ_ψ̇: "
-        f"{row['process_yaw_rate']} rad/s."
-    )
+    sentences.append(f"**Is the network heard?** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°.")
     return [words, " ".join(sentences)]
 
 
@@ -207,8 +215,8 @@ def _results(
     learnt = {run.candidate if name == titles.get(run.candidate) else name: tables.training_error(run, own) for name, run in drawn.items()}
     in_table = {titles[name]: seeds for name, seeds in main.runs.items() if name in IN_TABLE_II}
     caption = (
-        f"Table II of the paper and ours with 95 % intervals; means over seeds. RMSE of validation and training: means over manoeuvres. "
-        f"Oracles know the test. Data: {kind}."
+        "Table II: ours with 95 % intervals, means over seeds (paper's in brackets). RMSE of validation and training: means over "
+        f"manoeuvres. Data: {kind}."
     )
     published = {titles[name]: known for name, known in paper.TABLE_II.items()}
     shown = {titles.get(name, name): value for name, value in learnt.items()}
@@ -291,25 +299,47 @@ def _appendices(
     ]
 
 
-def _limited(
-    artefacts: StudyArtefacts, limited: Comparison, outputs: claims.OutputsOf, runs: Runs, prepared: Prepared, kind: str
-) -> list[Block]:
+def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str) -> list[Block]:
     """Table III and Figures 11 to 13."""
-    part, words = artefacts.parts[LIMITED], kind.upper()
-    picked = {name: chosen(own) for name, own in limited.runs.items()}
-    hybrids = {name: chosen(own) for name, own in runs.items() if name in paper.HYBRIDS}
+    part, words, runs = artefacts.parts[LIMITED], kind.upper(), learnt.comparison.runs
+    drawn = {name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH}
+    picked = {name: chosen(own) for name, own in drawn.items()}
+    hybrids = {name: chosen(learnt.runs[name]) for name in paper.HYBRIDS}
     turn = traces.manoeuvre_of(part, prepared, "J-turn")
-    figure, _ = distributions.errors_figure(limited.runs, "figure_11", 11, "limited set", words)
+    figure, _ = distributions.errors_figure(drawn, "figure_11", 11, "limited set", words)
     what = "J-turn with the largest sideslip angle of those without a spin, learnt on the limited set"
-    caption = f"Table III of the paper and ours with 95 % intervals; filters alone are those of the full set. Data: {words}."
+    caption = (
+        "Table III: ours with 95 % intervals, means over seeds (paper's in brackets), learnt up to 7 m/s². What does not learn, "
+        f"and its errors of validation, are those of the full set. Data: {words}."
+    )
+    training = {name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()}
+    of_networks = "What hybrids' networks say, and what filters make of it, learnt on the limited set"
     return [
         "## Appendix: limited set",
-        tables.accuracy(limited, paper.TABLE_III, {}, "table_3", caption),
-        tables.networks_alone(limited, outputs, "networks_limited", f"Networks and filters, limited set. Data: {words}."),
+        tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
+        tables.networks_alone(learnt.comparison, learnt.outputs, "networks_limited", f"{of_networks}. Data: {words}."),
         figure,
         traces.compared(picked, turn, "figure_12", 12, what, words),
         traces.angles_of_networks(hybrids, prepared, part.protocol.warm_up_seconds, turn, "figure_13", 13, "The same J-turn", words),
     ]
+
+
+def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: Comparison, kind: str) -> list[Block]:
+    """Networks without a filter and their search; what nobody can have."""
+    words, blocks = kind.upper(), list[Block]()
+    if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(map(search.is_point, parts)):
+        blocks.append("## Appendix: networks without a filter")
+    if len(known) > 1:
+        own = prepared[FULL]
+        training = {name: tables.training_error(chosen(seeds), own) for name, seeds in known.items()}
+        also = {name: main.runs[name] for name in (paper.STATIC_MAP, paper.ZERO) if name in main}
+        caption = f"Networks without a filter on the full set: inputs in [0, 1], as z-scores, and a recurrent network. Data: {words}."
+        blocks.append(tables.accuracy(Comparison(known | also, "test"), {}, training, "networks_alone", caption))
+    if any(map(search.is_point, parts)):
+        blocks.append(search.search_table(parts, parts[FULL], words))
+    oracles_alone = Comparison({name: main.runs[name] for name in (*ORACLES, paper.CNN) if name in main}, "test")
+    caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
+    return [*blocks, "## Appendix: oracles", tables.accuracy(oracles_alone, {}, {}, "oracles", caption)]
 
 
 def _whole_drives(artefacts: StudyArtefacts) -> Comparison:
@@ -362,7 +392,7 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
         "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, by a car with the paper's mass, "
         "inertia and wheelbase; its tyres, springs and sensors are assumed, each drive has sensors' offsets of its own.",
         "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper says smooth tyres "
-        "of the training only. The same filter alone, and CNN-UKF on plain tyres, stand beside it.",
+        "of the training only. The same filter alone stands beside it.",
         f"σ_DD is a standard deviation everywhere, R = σ_DD² + {LEAST_VARIANCE:g} rad², where Eq. 6 has a variance; Eq. 11 scales the "
         "variance of the networks' angles, in rad², and R is its result.",
         "Both hybrids have the paper's constant levels of process noise, from which CNN-UKF's heads start; what sensors measure is taken "
@@ -412,12 +442,13 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
                 "test": spans_in_words(own.split.tests[TEST]) if name == FULL else "the same",
             }
             for name, own in artefacts.parts.items()
+            if not search.is_point(name)
         ]
     )
     columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
     trainings = {candidate_of(model): model.training for model in part.models}
     return [
         "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines),
-        Table("data", "What was used for what.", rows, columns | {"test": Column("test")}),
+        Table("data", "What was used for what; points of a search as the full set.", rows, columns | {"test": Column("test")}),
         "### What departs from the paper\n\n" + "\n".join(f"- {line}" for line in departures(trainings)),
     ]

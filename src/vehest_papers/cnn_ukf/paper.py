@@ -14,6 +14,8 @@ CNN_FREE = "CNN-UKF, free noise"
 """Not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise."""
 BEFORE = "not trained through the filter"
 Z_SCORES = "Data-driven, z-scores"
+RECURRENT = "Recurrent network"
+PLAIN = "plain tyres"
 ORACLE_FILTER, ORACLE_DISTRUST = "Oracle: filter fitted to the test", "Oracle: CNN-UKF, perfect distrust"
 ZERO, STATIC_MAP, DATA_SHEET = "v = 0", "Static map", "Data sheet"
 

@@ -67,6 +67,7 @@ _NAMES = {
     ("dugoff_ukf", False): paper.MODEL,
     ("dugoff_ukf", True): paper.SMOOTH,
     ("sideslip_ffnn", False): paper.DATA,
+    ("velocity_gru", False): paper.RECURRENT,
     ("ensemble_ukf", False): paper.DEEP,
     ("cnn_ukf", False): paper.CNN,
     ("zero", False): paper.ZERO,
@@ -77,7 +78,7 @@ PARTS_AWAY = {
     "_no_pseudo_measurement": "without pseudo-measurement",
     "_no_adaptive_distrust": "σ_DD constant",
     "_no_adaptive_process": "process noise constant",
-    "_plain": "plain tyres",
+    "_plain": paper.PLAIN,
 }
 """What a variant's name says is taken away -> in words."""
 

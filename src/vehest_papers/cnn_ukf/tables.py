@@ -1,4 +1,4 @@
-"""Tables II and III of the paper beside ours, what hybrids are made of, what causal preprocessing costs, another car, and the budget."""
+"""Tables II and III of the paper beside ours, what hybrids are made of and what is active in them, their filters, and the budget."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def medians(runs: Runs, name: str) -> dict[str, float]:
 def accuracy(
     comparison: Comparison, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:
-    """Table II or III: the paper's figures beside ours with their intervals, errors of validation and of training.
+    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
 
     Args:
         comparison: of the candidates.
@@ -63,15 +63,15 @@ def accuracy(
     for candidate, own in comparison.runs.items():
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}
         for kpi in KPIS:
-            row[f"paper_{kpi}"] = getattr(published[candidate], kpi) if candidate in published else math.nan
-            row[f"ours_{kpi}"] = comparison.in_words(candidate, kpi)
+            known = getattr(published[candidate], kpi) if candidate in published else math.nan
+            row[f"paper_{kpi}"], row[f"ours_{kpi}"] = known, comparison.in_words(candidate, kpi)
+            row[kpi] = row[f"ours_{kpi}"] if math.isnan(known) else f"{row[f'ours_{kpi}']} ({fixed(known, 3)})"
         judged = [balanced(run.validation) for run in own]
         row["validation"] = fixed(float(np.median(judged)), 3) if candidate not in ORACLES else MISSING
         row["training"] = fixed(training[candidate], 3) if candidate in training else MISSING
         rows.append(row)
     columns = {"candidate": Column("method")}
-    for kpi, header in KPIS.items():
-        columns |= {f"paper_{kpi}": Column(f"{header}, paper", decimals=3), f"ours_{kpi}": Column("ours")}
+    columns |= {kpi: Column(header) for kpi, header in KPIS.items()}
     columns |= {
         "validation": Column("RMSE, validation [deg]"),
         "training": Column("training [deg]"),
@@ -109,8 +109,6 @@ def ablation(comparison: Comparison, active: pd.DataFrame, caption: str) -> Tabl
         rows.append({**own, **{str(key): value for key, value in row.items()}})
     columns = {
         "candidate": Column("method"),
-        "mse": Column("MSE [deg²]"),
-        "change_mse": Column("CNN-UKF against it"),
         "mse_nonlinear": Column("MSE_nl [deg²]"),
         "change_mse_nonlinear": Column("CNN-UKF against it"),
         "shift_range": Column("β for 1° of β_DD [deg]"),

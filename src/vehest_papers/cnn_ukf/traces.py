@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -20,6 +21,7 @@ from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.networks import words_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 
+WIDE = 5.0  # ratio from which deviations stand on a logarithmic axis
 LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
@@ -63,7 +65,7 @@ def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: 
         lower.set_xlabel("time [s]")
         for axes in (upper, lower):
             axes.margins(x=0.0)
-        legend_above(figure, upper, columns=6)
+        legend_above(figure, upper, columns=4)
     caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. {_squares(runs, parts)} Data: {data}."
     return Figure(name, caption, figure)
 
@@ -115,7 +117,7 @@ def inner_life(
             axes.set_title(f"({letter})", loc="left")
             axes.margins(x=0.0)
             if letter != "a":
-                axes.set_yscale("log")
+                _deviations(axes)
         for axes in grid[1]:
             axes.set_xlabel("time [s]")
         legend_above(figure, grid[0, 0], columns=3)
@@ -166,12 +168,12 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
         for candidate, (at, word) in _said(hybrids, prepared, warm_up, span, window).items():
             line = line_of(candidate)
             grid[2].plot(at, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
-        grid[2].set_yscale("log")
+        _deviations(grid[2])
         grid[2].set_ylabel(r"$\sigma_{DD}$ [deg]")
         grid[2].set_xlabel("time [s]")
         for axes in grid:
             axes.margins(x=0.0)
-        legend_above(figure, grid[0], grid[1], columns=6)
+        legend_above(figure, grid[0], grid[1], columns=5)
     caption = (
         f"Part of a lap (Figure 10 of the paper), the {fixed(window[1] - window[0], 0)} s of {as_code(span.recording)} with the largest "
         "mean |ay|: sideslip angle, accelerations (full and dashed: lateral and longitudinal), and the deviation of the networks' angle as "
@@ -214,6 +216,17 @@ def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
         line = line_of(candidate)
         axes.plot(_from_start(part), np.degrees(part.sideslip), color=line.colour, linestyle=line.dash, linewidth=1.0, label=candidate)
     axes.set_ylabel("sideslip angle [deg]")
+
+
+def _deviations(axes: Any) -> None:
+    """A vertical axis of standard deviations: logarithmic where they span a factor of five and more; plain numbers at the ticks."""
+    low, high = axes.dataLim.intervaly
+    if high < WIDE * low:
+        return
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _squares(runs: Mapping[str, Run], parts: Mapping[str, Scored]) -> str:

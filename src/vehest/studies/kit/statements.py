@@ -112,9 +112,11 @@ class Change:
 
 
 def percent(ratio: float) -> str:
-    """A ratio as a change in whole per cent, with its sign: ``−24``, ``+3``."""
+    """A ratio as a change in per cent, with its sign: ``−24``, ``+3``; below a half a decimal says on which side of zero it lies."""
     change = 100.0 * (ratio - 1.0)
-    return f"{'+' if round(change) > 0 else ''}{fixed(change, 0)}" if round(change) else "0"
+    decimals = 0 if round(change) else 1
+    rounded = round(change, decimals)
+    return f"{'+' if rounded > 0 else ''}{fixed(change, decimals)}" if rounded else "0"
 
 
 def short(value: float) -> str:
