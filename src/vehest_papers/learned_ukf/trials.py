@@ -48,5 +48,5 @@ def trials_table(parts: Mapping[str, PartArtefacts], used: Mapping[str, float]) 
         "validation": Column("MSE (weighted), validation", decimals=4),
         "chosen": Column("chosen"),
     }
-    caption = "Step sizes that were tried, as many for each method, on one seed that is not in the tables. Validation: tyre A, run 0."
+    caption = "Step sizes that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
     return Table("trials", caption, frame, columns), other
