@@ -140,8 +140,8 @@ def test_online_with_a_gate_is_batch_with_a_gate(name: str) -> None:
 
 @EVERY
 def test_a_variant_with_a_gate_is_called_another(name: str) -> None:
-    assert estimator(name, 5.0).variant == estimator(name).variant + "_gate5"
-    assert estimator(name, 5.0).full_title.endswith("gated at 5 sigma")
+    assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
+    assert "gated at 5 sigma" in estimator(name, 5.0).full_title
 
 
 @EVERY
