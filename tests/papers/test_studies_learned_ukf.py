@@ -568,7 +568,12 @@ def test_added_intervals_widen_with_their_number_and_those_without_claims_count(
 )
 def test_local_minima_are_counted_on_validation(losses, verdict):
     scratch = subject_of({}, "s", losses)
-    assert minima_claim(scratch, subject_of({}, "t", (0.9, 1.0, 0.8)), "real").verdict == verdict
+    pre_trained = subject_of({}, "t", (0.9, 1.0, 0.8))
+    assert minima_claim(scratch, pre_trained, "real").verdict == verdict
+    lost = minima_claim(scratch, pre_trained, "real", (7, 8, 9))
+    assert lost.verdict == "reproduced"
+    assert lost.ours.startswith(f"{3 + sum(loss > 1.0 for loss in losses)} of 6 seeds")
+    assert lost.why.endswith("seed 7, 8 and 9 gave up")
 
 
 def test_samples_are_counted_as_often_as_they_are_seen(part):

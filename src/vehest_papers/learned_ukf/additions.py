@@ -3,8 +3,8 @@
 - **A difference** is that of mean weighted MSE over seeds and sequences, by the paired block bootstrap of `errors`. Where seeds of one
   number share initial weights and pre-training they are compared seed by seed. All differences of a test are corrected together by Holm.
 - **A claim** on several tests is reproduced if each corrected interval lies below zero, not reproduced if one lies above, else undecided.
-- **Local minima**: of trainings from scratch those count whose validation loss is kept above that of every pre-trained seed; reproduced if
-  at least half do, not reproduced if none does, else undecided.
+- **Local minima**: of trainings from scratch those count whose validation loss is kept above that of every pre-trained seed, and those
+  that gave up; reproduced if at least half do, not reproduced if none does, else undecided.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vehest.data.splits import VALIDATION
 from vehest.data.store import read_recording
 from vehest.evaluation.significance import CONFIDENCE, Interval, holm
 from vehest.report.document import Column, Table
-from vehest.report.style import fixed
+from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.claims import Claim, Verdict
 from vehest.studies.kit.reading import median_and_range, metric_values
@@ -143,15 +143,23 @@ def comparison_claims(comparisons: Sequence[Comparison], found: Corrected, data:
     return claims
 
 
-def minima_claim(scratch: Subject, trained: Subject, data: str) -> Claim:
-    """That trainings from scratch end in local minima, by their validation losses."""
+def minima_claim(scratch: Subject, trained: Subject, data: str, gave_up: Sequence[int] = ()) -> Claim:
+    """That trainings from scratch end in local minima, by their validation losses.
+
+    Args:
+        scratch: those that ended.
+        trained: with pre-training.
+        data: real or simulated.
+        gave_up: seeds from scratch that ended without a model.
+    """
     limit = float(trained.validation().max())
-    stuck = [bool(loss > limit) for loss in scratch.validation()]
+    stuck = [bool(loss > limit) for loss in scratch.validation()] + [True] * len(gave_up)
     k, n = sum(stuck), len(stuck)
     ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)
     verdict: Verdict = "reproduced" if 2 * k >= n else "not reproduced" if not k else "undecided"
     ours = f"{k} of {n} seeds, {100 * k / n:.0f} % [{100 * ends.low:.0f}, {100 * ends.high:.0f}]"
-    why = f"validation loss above {fixed(limit, 4)}, the worst of {len(trained.seeds)} pre-trained"
+    lost = f"; seed {listed([str(seed) for seed in gave_up])} gave up" if gave_up else ""
+    why = f"validation MSE above {fixed(limit, 4)}, the worst of {len(trained.seeds)} pre-trained{lost}"
     return Claim("from scratch is prone to local minima", "Section III-B", ours, f"{data}, validation", verdict, why)
 
 
