@@ -170,8 +170,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "likelihood": "With likelihood"}
     parts = {"simulated": part, **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)}, "likelihood": part}
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}
-    parts |= {"scratch": only(part, "NNTF_UH", untrained), "scratch_short": only(part, "NNTF_UH", untrained)}
-    parts["diagonal"] = only(part, "NNTF_UH")
+    parts |= {"scratch": only(part, "NNTF_UH", untrained), "diagonal": only(part, "NNTF_UH")}
     artefacts = StudyArtefacts("learned_ukf", "t", "a", "c", titles, parts, ["real"])
     document = documents(artefacts)["report"]
     write_document(document, tmp_path, page=False)
