@@ -201,7 +201,10 @@ def _standing(errors: Errors, tyre: str) -> str:
             pair for pair, own, p in zip(pairs, tested, holm([own.p_value for own in tested]), strict=True) if own.value < 0 and p < 0.05
         }
         weak = [name for name in order if name not in baselines and not all((name, other) in lower for other in baselines)]
-        words += f" Not below all of {listed(baselines)} by more than chance: {listed(weak) if weak else 'none'}."
+        if len(weak) == len(order) - len(baselines):
+            words += f" No method is below all of {listed(baselines)} by more than chance."
+        else:
+            words += f" Not below all of {listed(baselines)} by more than chance: {listed(weak) if weak else 'none'}."
     return words + " Corrected by Holm."
 
 
@@ -219,13 +222,10 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     trained = tracks["tyre_d"][friction.TRAINED_FROM]
     times, final = friction.interval_of(trained.times(), friction.median), friction.interval_of(trained.final, friction.mean)
     own.claims += claims.friction_claims(times, final, kind)
-    own.front += [
-        "## Friction",
-        friction.figure(tracks, skip, name, where),
-        friction.convergence_table(tracks, skip, name, kind.upper()),
-    ]
+    own.front += ["## Friction", friction.figure(tracks, skip, name, where)]
     own.appendix += [
-        f"## Appendix: what the start of the friction is worth, {kind}",
+        f"## Appendix: the start of the friction, {kind}",
+        friction.convergence_table(tracks, skip, name, kind.upper()),
         friction.start_table(filters, drives, part.protocol, name, kind.upper()),
     ]
 
