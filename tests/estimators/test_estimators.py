@@ -162,8 +162,8 @@ def test_window_network_has_no_state_to_start_from(drive):
 
 
 def test_registry_knows_names_and_modules():
-    first = "cnn_ukf, data_sheet, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, kinematic, ksnn, learned_ukf, lstm, luenberger"
-    names = f"{first}, rational_ekf, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
+    first = "cnn_ukf, data_sheet, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, kinematic, ksnn, learned_ukf"
+    names = f"{first}, learned_ukf_variant, lstm, luenberger, rational_ekf, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
     assert ", ".join(sorted(estimator_names())) == names
     assert estimator_module("ksnn") == "vehest.estimators.ksnn"
     with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):

@@ -26,7 +26,7 @@ SETTINGS: dict[str, dict[str, object]] = {
     "velocity_lstm": {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 4},
     "sideslip_ffnn": {"inputs": "imu", "hidden": [8, 4]},
 }
-FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf")
+FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
 FITTED = ("kinematic", "static_map", "luenberger")  # in a moment
 OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
 
@@ -41,7 +41,7 @@ def ready(name: str) -> Estimator:
 
 
 def rows(name: str) -> list[dict[str, float]]:
-    recording = small_car_drive(2.0) if name == "learned_ukf" else linear_drive(2.0)[0]
+    recording = small_car_drive(2.0) if name.startswith("learned_ukf") else linear_drive(2.0)[0]
     return [{channel: float(recording[channel][k]) for channel in recording.channels} for k in range(60)]
 
 

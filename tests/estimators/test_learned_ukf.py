@@ -12,8 +12,11 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
+from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
 from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf, LearnedUkfSettings
+from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
+from vehest.filters.noise_models import with_entropy
 from vehest.sources.base import open_source
 from vehest.stages.config import compose_config
 from vehest.training.context import FitContext
@@ -285,3 +288,72 @@ def test_it_is_registered_and_counts_its_parameters() -> None:
     network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
     assert made.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
     assert torch.get_default_dtype() == torch.float32
+
+
+# Diagonal noise and curvature
+
+
+def variant_of(seed: int = 0, **config) -> LearnedUkfVariant:
+    made = LearnedUkfVariant.from_config({"width": 16} | config)
+    made.seed(seed)
+    return made
+
+
+def test_variant_without_its_options_is_the_learned_filter_to_the_bit() -> None:
+    one, other = estimator(), variant_of()
+    for made in (one, other):
+        made.fit(data(), quick(one_step=3))
+    assert other.variant == "nntf_uh"
+    assert other.n_parameters == one.n_parameters
+    assert all(np.array_equal(values, other.weights()[name]) for name, values in one.weights().items())
+    with pytest.raises(ConfigurationError, match=r"estimator\.curvature is of estimator\.dynamics=pacejka"):
+        variant_of(curvature=True)
+
+
+@pytest.mark.parametrize("noise", ["constant", "state_dependent"])
+def test_diagonal_noise_stays_diagonal_while_it_learns(noise: str) -> None:
+    full, made = estimator(noise=noise), variant_of(noise=noise, correlated_noise=False)
+    for own in (full, made):
+        own.fit(data(), quick(3, one_step=3))
+    assert made.variant == f"{full.variant}_diagonal"
+    state = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]], dtype=torch.float64)
+    inputs = torch.zeros(1, 2, dtype=torch.float64)
+    for own, is_diagonal in ((made, True), (full, False)):
+        for part in (own.filter.process_noise, own.filter.observation_noise):
+            with torch.no_grad():
+                covariance = part(state, inputs)[0]
+            assert bool((covariance == covariance.diagonal().diag()).all()) == is_diagonal
+            assert (torch.linalg.eigvalsh(covariance) > 0).all()
+    start = variant_of(noise=noise, correlated_noise=False)
+    start.filter.to(torch.float64).begin_noise([made.drive(own, torch.float64) for own in data().train], 0.2)
+    with torch.no_grad():
+        moved = made.filter.process_noise(state, inputs) - start.filter.process_noise(state, inputs)
+    assert (moved[0].diagonal().abs() > 0).all(), "the diagonal has learnt"
+    each = (1 + 5 + 1) if noise == "state_dependent" else 1
+    assert full.n_parameters - made.n_parameters == each * (10 + 6), "entries off the diagonals of 5 and 4 rows"
+
+
+def test_diagonal_noise_in_use_is_that_of_its_training() -> None:
+    """The compiled noise of filters at work against the module's own."""
+    made = variant_of(correlated_noise=False)
+    made.fit(data(), quick(2, one_step=3))
+    states = np.random.default_rng(0).normal(size=(4, 5))
+    process, observation = made.filter.noise_at()
+    nothing = torch.zeros(4, 2, dtype=torch.float64)
+    with torch.no_grad():
+        expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
+        of_process = with_entropy(made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY).numpy()
+    np.testing.assert_allclose(observation(states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(process(states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0)
+
+
+def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt() -> None:
+    plain = {"dynamics": "pacejka", "noise": "constant", "through_filter": False}
+    one, other = estimator(**plain), variant_of(curvature=True, **plain)
+    assert other.n_parameters == one.n_parameters + 3
+    state, inputs = torch.tensor([[2.0, 0.3, 1.0, 2.1, 0.6]]), torch.tensor([[0.1, 8.0]])
+    with torch.no_grad():
+        torch.testing.assert_close(other.filter.moved(state, inputs), one.filter.moved(state, inputs), rtol=0, atol=1e-6)
+    other.fit(FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)]), quick(one_step=5, steps=40, validation_steps=60))
+    assert other.variant == "pc_curved"
+    assert (other.filter.dynamics.tyres.curvature.detach().abs() > 0).all()

@@ -103,7 +103,7 @@ def test_imports_for_type_checkers_do_not_count(package):
     [
         ("lstm", {"lstm"}),
         ("ksnn", {"ksnn"}),
-        ("lanes", {"gru", "lstm", "learned_ukf"}),
+        ("lanes", {"gru", "lstm", "learned_ukf", "learned_ukf_variant"}),
         ("dugoff_track", {"dugoff_ukf", "cnn_ukf", "ensemble_ukf"}),
     ],
 )

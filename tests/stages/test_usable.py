@@ -117,7 +117,9 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
     estimator = new_estimator(config["estimator"])
     training = settings_from_config(estimator.training_type, config["training"], "training")
     needed = lacking_to_train(estimator, training, ())
-    unread = {"learned_ukf": {"vx"}, "kalman": {"vx"}}.get(name, set())  # their fits read other channels, their estimates this one
+    unread = {"learned_ukf": {"vx"}, "learned_ukf_variant": {"vx"}, "kalman": {"vx"}}.get(
+        name, set()
+    )  # their fits read other channels, their estimates this one
     assert bool(needed) == estimator.learns
     generator = np.random.default_rng(0)
     channels = {channel: 10.0 + generator.normal(size=400) for channel in needed}

@@ -109,6 +109,9 @@ FAMILIES = (
 )
 """In the order of what is expected of them on a car that nobody knows, cheap ones before dear ones of the same promise."""
 
+OF_STUDIES = {"learned_ukf_variant"}
+"""Variants of a family that only the study of its paper compares."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -155,7 +158,7 @@ def plan_of(contents: Sequence[Contents], vehicle: Vehicle) -> Plan:
         else:
             sweeps.append((own, family.about))
     lacking = {name: what for name, what in lacking.items() if not any(name in sweep[0].split("=")[1].split(",") for sweep, _ in sweeps)}
-    known = {family.name for family in FAMILIES}
+    known = {family.name for family in FAMILIES} | OF_STUDIES
     for name in dict.fromkeys((*choices("estimator"), *estimator_names())):
         if name not in known:
             lacking[name] = "not one of vehest's own families; add it as you need it"

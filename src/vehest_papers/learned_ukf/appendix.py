@@ -15,6 +15,7 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.order import differences, order_in_words, pairs_table
 from vehest.studies.kit.reading import recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
+from vehest_papers.learned_ukf.ablations import SCRATCH
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Errors
@@ -102,6 +103,8 @@ def how_it_was_made(
             for candidate, models in models_by_candidate(part).items()
             if candidate in (paper.NNTF_UH, paper.GRU, paper.LSTM)
         }
+        if SCRATCH in artefacts.parts:
+            used |= {candidate: step_size(own[0]) for candidate, own in models_by_candidate(artefacts.parts[SCRATCH]).items()}
         table, other = trials_table(trials, used)
         words = "" if not other else f"The tables do not use what validation chose for {', '.join(other)}."
         blocks += ["## Appendix: trials", *([words] if words else []), table]

@@ -47,14 +47,17 @@ _FILTERS = {
     "nntf_uh": paper.NNTF_UH,
     "nntf_uh_mu0.4": paper.NNTF_UH_LOW,
 }
+_VARIANTS = {"nntf_uh_diagonal": paper.DIAGONAL, "pc_curved": paper.CURVED}
 _NETWORKS = {"velocity_gru": paper.GRU, "velocity_lstm": paper.LSTM}
 _BASELINES = {"zero": paper.ZERO, "static_map": paper.STATIC_MAP, "data_sheet": paper.DATA_SHEET}
 
 
 def candidate_of(model: EvaluatedModel) -> str:
     """What the paper calls a model; its own title if the paper has none like it."""
-    if model.estimator == "learned_ukf":
-        return _FILTERS.get(model.variant, model.title)
+    if model.estimator in ("learned_ukf", "learned_ukf_variant"):
+        name = (_FILTERS | _VARIANTS).get(model.variant, model.title)
+        pre_training = model.training.get("one_step", {})
+        return f"{name}{paper.FROM_SCRATCH}" if pre_training.get("max_epochs") == 0 else name
     return (_NETWORKS | _BASELINES).get(model.estimator, model.title)
 
 

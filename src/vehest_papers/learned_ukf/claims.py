@@ -193,14 +193,14 @@ def difference_claim(claim: str, words: str, own: Interval, values: tuple[float,
     return Claim(claim, words, f"{shown}; difference {in_words(own.value, own.low, own.high, 4)}", data, verdict, why)
 
 
-def not_testable() -> list[Claim]:
-    """What the files at hand cannot say."""
+def not_testable(*, timed: bool = False) -> list[Claim]:
+    """What the files at hand cannot say; ``timed``: the length of training sequences has a row of its own."""
     untestable: Verdict = "not testable on this data"
     rows = (
         ("every figure of Table II itself", "tyre C", "recordings of tyre C are not at hand; tyre D stands in"),
         ("RMS errors 0.062 and 0.070 m/s on tyre A", "0.062; 0.070 m/s", "the test is another part of tyre A's recordings"),
         ("99th percentile of rear slip beyond 40°", "40°", "3 of the data set's files are at hand"),
-        ("longer training sequences take longer an epoch", "Figure 7", "times are in no published file"),
+        *(() if timed else (("longer training sequences take longer an epoch", "Figure 7", "times are in no published file"),)),
     )
     return [Claim(claim, words, "–", "none", untestable, why) for claim, words, why in rows]
 

@@ -14,7 +14,8 @@ from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.reading import words_of_kinds
-from vehest_papers.learned_ukf import claims, coverage, friction, lengths, paper, prediction, tables, traces
+from vehest_papers.learned_ukf import ablations, claims, coverage, friction, paper, prediction, tables, traces
+from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCRATCH
 from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
 from vehest_papers.learned_ukf.candidates import SETS, chosen, losses, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.errors import Errors, in_words
@@ -22,7 +23,7 @@ from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtere
 from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
 MAIN = ("real", "simulated")
-LIKELIHOOD, SCRATCH, LENGTH, TRIAL = "likelihood", "scratch", "length_", "trial_"
+LIKELIHOOD, TRIAL = "likelihood", "trial_"
 ROMAN = {"tyre_a": "I", "tyre_d": "II"}
 SHOWN_IN_FIGURE_4 = (paper.NNTF_UH, paper.NNTF_UH_LOW, paper.GRU)
 NOTE = (
@@ -39,6 +40,8 @@ class Outcome:
     picture: list[Block] = field(default_factory=list)
     front: list[Block] = field(default_factory=list)
     appendix: list[Block] = field(default_factory=list)
+    added: list[Block] = field(default_factory=list)
+    timed: bool = False
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -56,8 +59,11 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
             raise DataError(f"study '{artefacts.study}': the test sets of part '{name}' must be called {' and '.join(SETS)}")
     data: dict[str, pd.DataFrame] = {}
     found = {name: _outcome(name, part, artefacts, data) for name, part in main.items()}
-    every = [claim for own in found.values() for claim in own.claims] + claims.not_testable()
-    blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE), f"{_budgets_in_words(main)} {_left_out(artefacts)}".strip()]
+    every = [claim for own in found.values() for claim in own.claims] + claims.not_testable(timed=any(own.timed for own in found.values()))
+    blocks: list[Block] = [*_asked(artefacts, main), claims_table(every, NOTE)]
+    for own in found.values():
+        blocks += own.added
+    blocks.append(f"{_budgets_in_words(main)} {_left_out(artefacts)}".strip())
     for own in found.values():
         blocks += [*own.picture, *own.front]
     for own in found.values():
@@ -79,10 +85,14 @@ def _asked(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> list
 
 def _left_out(artefacts: StudyArtefacts) -> str:
     """What the paper has and this run does not."""
-    absent = ["training through the filter from scratch (Section III-B)"] if SCRATCH not in artefacts.parts else []
-    absent += ["the length of training sequences (Figure 7)"] if not any(name.startswith(LENGTH) for name in artefacts.parts) else []
-    absent += ["the E terms of Equation 3", "diagonal noise, which the paper leaves out as well"]
-    return f"Not run here, for their budget: {listed(absent)}."
+    known = {
+        SCRATCH: "training through the filter from scratch (Section III-B)",
+        LENGTH: "the length of training sequences (Figure 7)",
+        CURVATURE: "the E terms of Equation 3",
+        DIAGONAL: "diagonal noise, which the paper leaves out as well",
+    }
+    absent = [words for part, words in known.items() if not any(name.startswith(part) for name in artefacts.parts)]
+    return f"Not run here, for their budget: {listed(absent)}." if absent else ""
 
 
 def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
@@ -123,9 +133,11 @@ def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: di
     _friction(own, name, part, where, kind)
     _instability(own, part, kind)
     beside = {title: other for title, other in artefacts.parts.items() if words_of_kinds(other) == kind}
-    _variants(own, name, part, beside, errors, kind)
+    _likelihood(own, name, part, beside, kind)
     _prediction(own, name, part, where, kind, data)
-    _lengths(own, {title: other for title, other in beside.items() if title.startswith(LENGTH)}, kind)
+    added = ablations.additions(name, part, beside, errors, kind)
+    own.added, own.timed = [*added.front()], added.timed
+    own.appendix += added.appendix
     groups = models_by_candidate(part)
     shown: dict[str, EvaluatedModel] = {method: chosen(part, runs, method) for method in SHOWN_IN_FIGURE_4 if method in groups}
     if shown:
@@ -189,7 +201,10 @@ def _standing(errors: Errors, tyre: str) -> str:
             pair for pair, own, p in zip(pairs, tested, holm([own.p_value for own in tested]), strict=True) if own.value < 0 and p < 0.05
         }
         weak = [name for name in order if name not in baselines and not all((name, other) in lower for other in baselines)]
-        words += f" Not below all of {listed(baselines)} by more than chance: {listed(weak) if weak else 'none'}."
+        if len(weak) == len(order) - len(baselines):
+            words += f" No method is below all of {listed(baselines)} by more than chance."
+        else:
+            words += f" Not below all of {listed(baselines)} by more than chance: {listed(weak) if weak else 'none'}."
     return words + " Corrected by Holm."
 
 
@@ -207,13 +222,10 @@ def _friction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: st
     trained = tracks["tyre_d"][friction.TRAINED_FROM]
     times, final = friction.interval_of(trained.times(), friction.median), friction.interval_of(trained.final, friction.mean)
     own.claims += claims.friction_claims(times, final, kind)
-    own.front += [
-        "## Friction",
-        friction.figure(tracks, skip, name, where),
-        friction.convergence_table(tracks, skip, name, kind.upper()),
-    ]
+    own.front += ["## Friction", friction.figure(tracks, skip, name, where)]
     own.appendix += [
-        f"## Appendix: what the start of the friction is worth, {kind}",
+        f"## Appendix: the start of the friction, {kind}",
+        friction.convergence_table(tracks, skip, name, kind.upper()),
         friction.start_table(filters, drives, part.protocol, name, kind.upper()),
     ]
 
@@ -229,23 +241,14 @@ def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
     own.claims += claims.instability_claims(lost, kind)
 
 
-def _variants(
-    own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Errors], kind: str
-) -> None:
-    """Training with a likelihood term, and from scratch."""
-    if SCRATCH in beside:
-        scratch = losses(beside[SCRATCH], "tyre_a")
-        one, other = errors["tyre_a"].squared[paper.NNTF_UH], scratch.squared[paper.NNTF_UH]
-        change = errors["tyre_a"].difference(one, other)
-        claim = f"{paper.NNTF_UH} below the same from scratch"
-        values = (float(one.mean()), float(other.mean()))
-        own.claims.append(claims.difference_claim(claim, "inefficient, local minima (III-B)", change, values, f"{kind}, tyre A"))
+def _likelihood(own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str) -> None:
+    """Training with a likelihood term."""
     if LIKELIHOOD in beside:
         trained = {
             words: (which, models_by_candidate(which)[paper.NNTF_UH])
             for words, which in (("squared errors", part), ("with likelihood", beside[LIKELIHOOD]))
         }
-        own.front += ["## Bands", coverage.coverage_table(trained, paper.NNTF_UH, name, kind.upper())]
+        own.appendix += ["## Appendix: bands", coverage.coverage_table(trained, paper.NNTF_UH, name, kind.upper())]
 
 
 def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: str, data: dict[str, pd.DataFrame]) -> None:
@@ -278,13 +281,3 @@ def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: 
         swapped = f"{paper.NNTF_U} in the prediction alone: lower MSE"
         values = (float(mse[1, 0].mean()), float(mse[0, 0].mean()))
         own.claims.append(claims.difference_claim(swapped, "18 % lower, Figure 6", change, values, on))
-
-
-def _lengths(own: Outcome, parts: Mapping[str, PartArtefacts], kind: str) -> None:
-    if not parts:
-        return
-    found = lengths.lengths(parts)
-    own.claims += lengths.length_claims(found, "tyre_a", kind)
-    figure, table = lengths.figure_7(found, kind.upper())
-    own.front += ["## Length of the training sequences", figure]
-    own.appendix += ["## Appendix: length of the training sequences", table]

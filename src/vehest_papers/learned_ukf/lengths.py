@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,12 +11,12 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.claims import Claim
-from vehest_papers.learned_ukf.candidates import SETS, losses
-from vehest_papers.learned_ukf.claims import difference_claim
-from vehest_papers.learned_ukf.errors import Errors, in_words
+from vehest_papers.learned_ukf.additions import Comparison, Subject, drive_lengths
+from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
+from vehest_papers.learned_ukf.errors import in_words
 
 _SUBSCRIPT_U = re.compile(r"_uh?(_|$)")
 WAYS = {"batch": "constant batch", "samples": "constant samples a batch"}
@@ -29,15 +30,20 @@ class Length:
         steps: samples of a sequence.
         batch: sequences in a batch.
         epochs: through the filter.
-        errors: test set -> losses of the only candidate.
-        candidate: which.
+        sequences: that an epoch goes through.
+        subject: the candidate, with its losses.
     """
 
     steps: int
     batch: int
     epochs: int
-    errors: Mapping[str, Errors]
-    candidate: str
+    sequences: int
+    subject: Subject
+
+    @property
+    def batches(self) -> int:
+        """Of an epoch."""
+        return math.ceil(self.sequences / self.batch)
 
 
 def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
@@ -52,9 +58,11 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
             if "steps" not in model.training or not _SUBSCRIPT_U.search(model.variant):
                 raise DataError(f"part '{name}': {model.title} was not trained through the filter; set estimator.through_filter=true")
         training = part.models[0].training
-        errors = {test: losses(part, test) for test in part.split.tests}
-        candidate = next(iter(next(iter(errors.values())).squared))
-        found.append(Length(int(training["steps"]), int(training["batch_size"]), int(training["through"]["max_epochs"]), errors, candidate))
+        steps, batch = int(training["steps"]), int(training["batch_size"])
+        candidate = next(iter(models_by_candidate(part)))
+        subject = Subject.of(part, candidate, f"{candidate}, {batch} × {steps} samples")
+        sequences = sum(length // steps for length in drive_lengths(part))
+        found.append(Length(steps, batch, int(training["through"]["max_epochs"]), sequences, subject))
     return sorted(found, key=lambda own: (own.steps, own.batch))
 
 
@@ -72,12 +80,13 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     for way, words in WAYS.items():
         for own in of_way(found, way):
             row: dict[str, object] = {"way": words, "steps": own.steps, "batch": own.batch, "epochs": own.epochs}
-            for test, errors in own.errors.items():
-                mse = errors.mean(errors.squared[own.candidate])
+            row |= {"epoch_samples": own.sequences * own.steps, "batches": own.batches, "in_a_row": own.batches * own.steps}
+            for test, errors in own.subject.errors.items():
+                mse = errors.mean(own.subject.squared(test))
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
                 row[f"words.{test}"] = in_words(mse.value, max(mse.low, 0.0), mse.high, 4)
             rows.append(row)
-    frame, tests = pd.DataFrame(rows), list(found[0].errors)
+    frame, tests = pd.DataFrame(rows), list(SETS)
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 2.7)
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
@@ -95,29 +104,40 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
             axes.set_ylim(bottom=0.0)
         grid[0].set_ylabel("MSE (weighted)")
         legend_above(figure, grid[0])
-    seeds = len(next(iter(found[0].errors.values())).squared[found[0].candidate])
+    seeds = sorted({len(own.subject.seeds) for own in found})
     caption = (
-        f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].candidate}, {seeds} seeds, "
+        f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].subject.candidate}, "
+        f"{listed([str(own) for own in seeds])} seeds, "
         f"{found[0].epochs} epochs through the filter. An epoch goes once through the drives, so a smaller batch takes more steps. "
         f"Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
     columns = {"way": Column("held constant"), "steps": Column("samples", decimals=0), "batch": Column("sequences in a batch", decimals=0)}
-    columns |= {"epochs": Column("epochs", decimals=0)}
+    columns |= {"epochs": Column("epochs", decimals=0), "batches": Column("batches an epoch", decimals=0)}
+    columns |= {"epoch_samples": Column("filter steps an epoch", decimals=0), "in_a_row": Column("of them one after another", decimals=0)}
     columns |= {f"words.{test}": Column(f"MSE (weighted), {SETS[test]}") for test in tests}
     return Figure("figure_7", caption, figure), Table("sequence_length", "What Figure 7 draws.", frame, columns)
 
 
-def length_claims(found: Sequence[Length], test: str, data: str) -> list[Claim]:
-    """That the longest sequences have the lower error than the shortest ones, either way."""
-    claims = []
+def length_comparisons(found: Sequence[Length]) -> list[Comparison]:
+    """The longest sequences against the shortest ones, either way."""
+    comparisons = []
     for way, words in WAYS.items():
         own = of_way(found, way)
-        if len(own) < 2:
-            continue
-        short, long = own[0], own[-1]
-        one, other = (part.errors[test].squared[part.candidate] for part in (long, short))
-        change = long.errors[test].difference(one, other)
-        claim = f"sequences of {long.steps} samples below {short.steps}, {words}"
-        values = (float(one.mean()), float(other.mean()))
-        claims.append(difference_claim(claim, "Figure 7: longer is better", change, values, f"{data}, {SETS[test]}"))
-    return claims
+        if len(own) > 1:
+            short, long = own[0], own[-1]
+            claim = f"sequences of {long.steps} samples below {short.steps}, {words}"
+            comparisons.append(Comparison(long.subject, short.subject, claim, "Figure 7: longer is better"))
+    return comparisons
+
+
+def epoch_claim(found: Sequence[Length]) -> Claim:
+    """That longer sequences take longer an epoch, as far as it can be counted: times are in no published file."""
+    counts = []
+    for way, words in WAYS.items():
+        own = of_way(found, way)
+        counts.append(f"{', '.join(str(one.batches * one.steps) for one in own)} at {words}")
+    steps = ", ".join(str(one.steps) for one in of_way(found, "batch"))
+    ours = f"of {steps} samples: filter steps one after another, an epoch {'; '.join(counts)}"
+    return Claim(
+        "longer training sequences take longer an epoch", "Figure 7", ours, "none", "not testable on this data", "times are not published"
+    )

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 PC, PCR, NN, NN_U = "PC", "PCR", "NN", "NN_U"
 NNT, NNT_U, NNTF, NNTF_U, NNTF_UH = "NNT", "NNT_U", "NNTF", "NNTF_U", "NNTF_UH"
 NNTF_UH_LOW = "NNTF_UH*"
+DIAGONAL, CURVED = "NNTF_UH with diagonal noise", "PC with E"
+FROM_SCRATCH = " from scratch"
 GRU, LSTM = "GRU", "LSTM"
 ZERO, STATIC_MAP, DATA_SHEET, ORACLE = "zero", "static map", "data sheet", "oracle"
 BASELINES = (ZERO, STATIC_MAP, DATA_SHEET)

@@ -124,7 +124,7 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table,
             if states["decrease"].min() < -100.0:
                 axes.set_yscale("symlog", linthresh=100.0)
                 axes.set_yticks(_ticks(states["decrease"].to_numpy()))
-                axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+                axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
                 axes.minorticks_off()
         grid[0].set_ylabel(f"decrease of the MSE, {BEFORE} to {AFTER} [%]")
         figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
@@ -182,7 +182,7 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, 
                 axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=hatch, hatch="////", linewidth=0)
                 axes.bar(place, np.median(values), 0.66, facecolor="none", edgecolor=border, linewidth=1.8)
                 axes.scatter(np.full(len(values), place), values, s=9, color="black", zorder=3, linewidths=0)
-            axes.set_xticks(range(4), [f"{a}\n{b}" for a, b in combinations])
+            axes.set_xticks(range(4), [f"{a}\n{b}" for a, b in combinations], linespacing=1.5)
             axes.set_title(SETS[test], loc="left")
             axes.grid(visible=False, axis="x")
             axes.set_ylabel("MSE (weighted)")

@@ -9,6 +9,7 @@ import pandas as pd
 
 from vehest.data.splits import VALIDATION
 from vehest.report.document import Column, Table
+from vehest.report.style import MISSING
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.reading import metric_values
 from vehest_papers.learned_ukf.candidates import candidate_of
@@ -33,6 +34,7 @@ def trials_table(parts: Mapping[str, PartArtefacts], used: Mapping[str, float]) 
         for model in part.models:
             key = (model.estimator, model.variant, model.seed, VALIDATION, "mse_weighted")
             row = {"candidate": candidate_of(model), "step_size": step_size(model), "seed": model.seed}
+            row["start"] = str(model.training.get("start_noise", MISSING))
             rows.append(row | {"validation": values.get(key, np.nan)})
     frame = pd.DataFrame(rows).sort_values(["candidate", "step_size"], kind="stable").reset_index(drop=True)
     frame["chosen"] = [
@@ -44,9 +46,10 @@ def trials_table(parts: Mapping[str, PartArtefacts], used: Mapping[str, float]) 
     columns = {
         "candidate": Column("method"),
         "step_size": Column("step size", digits=1, each=True),
+        "start": Column("noise starts from"),
         "seed": Column("seed", decimals=0),
         "validation": Column("MSE (weighted), validation", decimals=4),
         "chosen": Column("chosen"),
     }
-    caption = "Step sizes that were tried, as many for each method, on one seed that is not in the tables. Validation: tyre A, run 0."
+    caption = "Step sizes that were tried, on one seed that is not in the tables. Validation: tyre A, run 0."
     return Table("trials", caption, frame, columns), other
