@@ -196,8 +196,8 @@ def _in_paper(name: str) -> float:
 
 def _claims(verdicts: Sequence[Claim]) -> Table:
     note = (
-        "Changes are CNN-UKF's to the other's unless said. Seeds 3 and 4 of the hybrids and the limited set were added after the test had been "
-        "seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
+        "Changes are CNN-UKF's to the other's unless said. Seeds 3 and 4 of the hybrids and the limited set were added after the test had "
+        "been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
     )
     return claims_table(verdicts, note)
 
