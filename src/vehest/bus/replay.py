@@ -210,11 +210,15 @@ class _Run:
         thread.start()
         receiver, sampler = self.receiver, self.receiver.sampler
         try:
-            while not (self.over.is_set() and self._on_bus(time.time()) > self.last + sampler.cycle) and not self.stopped():
+            while not self.stopped():
+                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + sampler.cycle
                 wait = self.begin + (sampler.next_time - self.first) / self.speed - time.time()
-                frame = self.unit.recv(min(max(wait, 0.0), PATIENCE))
+                frame = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
                 if frame is not None:
                     receiver.frame(frame, self._on_bus(frame.timestamp))
+                elif ended:  # and nothing is left that a late receiver has not taken
+                    receiver.advance(self.last + sampler.cycle)
+                    break
                 else:
                     receiver.advance(self._on_bus(time.time()))
                 self._show()
