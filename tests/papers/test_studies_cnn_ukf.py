@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -32,7 +33,7 @@ from vehest.report.document import Document, Figure, Table
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
-from vehest_papers.cnn_ukf import claims, documents, networks, observability, paper, perturbed, search, tables, traces
+from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search, tables, traces
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, limited
 from vehest_papers.cnn_ukf.measures import MSE, Comparison
 from vehest_papers.cnn_ukf.subjects import OFFLINE, OWN, Prepared, Run, candidate_of, chosen, line_of, runs_of, until
@@ -443,3 +444,13 @@ def test_manoeuvres_in_two_ranges_are_refused(part: PartArtefacts) -> None:
 def test_a_method_that_the_paper_does_not_have_is_refused() -> None:
     with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
         candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
+
+
+def test_the_report_counts_the_drives_that_are_cut_and_tells_how_far_they_slide() -> None:
+    def driven(*largest: float) -> SimpleNamespace:
+        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
+        return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
+
+    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
+    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
+    assert document._cut_in_words(driven(3.0)) == "no drive is"

@@ -92,12 +92,12 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
     return own
 
 
-def _alone(beside: Mapping[str, PartArtefacts], name: str, words: str = "") -> Subject | None:
+def _alone(beside: Mapping[str, PartArtefacts], name: str) -> Subject | None:
     """The only candidate of a part, if the part is there."""
     if name not in beside:
         return None
     candidate = next(iter(models_by_candidate(beside[name])))
-    return Subject.of(beside[name], candidate, candidate + words)
+    return Subject.of(beside[name], candidate)
 
 
 def _against(own: Additions, lower: Subject, higher: Subject | None, claim: str, words: str, *, shared: bool = True) -> None:
