@@ -63,7 +63,7 @@ test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium c
 TESTS_docs := tests/test_docs.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
-TESTS_processes := tests/stages/test_locks.py tests/stages/test_kills.py tests/stages/test_tracking.py
+TESTS_processes := tests/run/test_locks.py tests/run/test_kills.py tests/run/test_tracking.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -46,8 +46,8 @@ LEVELS = {
 
 def drives(seconds: float) -> list[Any]:
     """Simulated drives, over and over, of so many seconds in all."""
+    from vehest.run.config import compose_config
     from vehest.sources.base import open_source
-    from vehest.stages.config import compose_config
 
     temporary = tempfile.gettempdir()
     config = compose_config("ingest", ["dataset=sim_bmw", f"root={temporary}", f"output={temporary}"])
@@ -271,7 +271,7 @@ def main() -> None:
 
 def measure() -> None:
     """Measure, write, print, on as many threads as torch is allowed."""
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     recordings = drives(HOURS * 3600)
     step, epoch = through_the_filter(recordings)

@@ -27,7 +27,7 @@ def main() -> None:
     from vehest.estimators.rational_ekf import RationalFilter
     from vehest.filters.gaussian import Gaussian
     from vehest.filters.nonlinear import extended_filter
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     torch.set_num_threads(1)
     noise = {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003, "tyres": 0.01}

@@ -40,7 +40,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     from vehest.data.errors import VehestError
     from vehest.estimators.model_files import read_description
     from vehest.export.method import exportable
-    from vehest.stages.calibrate import trust_of
+    from vehest.run.calibrate import trust_of
 
     found: dict[tuple[str, str, str], Path] = {}
     for folder in sorted((output / "train").glob("[!.]*")):
@@ -94,9 +94,9 @@ def onnx_time(model: Any, samples: dict[str, np.ndarray]) -> float:
 def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> dict[str, np.ndarray]:
     """The drive's channels at the model's rate."""
     from vehest.data.store import read_recording
+    from vehest.run.config import compose_config
+    from vehest.run.estimate import preparation_of, prepared_recording
     from vehest.sources.base import open_source
-    from vehest.stages.config import compose_config
-    from vehest.stages.estimate import preparation_of, prepared_recording
 
     name, first, last = DRIVES[dataset]
     if "*" in name:
@@ -116,7 +116,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
     from vehest.export.measure import CORTEX_M4F, HOST, footprint
     from vehest.export.program import program_files
     from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
-    from vehest.stages.calibrate import trust_of
+    from vehest.run.calibrate import trust_of
     from vehest.trust.contract import GuardedStepper
 
     model, trust = load_model(folder), trust_of(folder, output)

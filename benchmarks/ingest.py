@@ -73,9 +73,9 @@ def all_channels(root: Path) -> Callable[[], Any]:
 
 def whole_stage(root: Path) -> Callable[[], Any]:
     """What ``vehest ingest`` does: hash the files, read, check, write Parquet, hash that."""
-    from vehest.stages.artefacts import make
-    from vehest.stages.ingest import plan_ingest, write_ingest
-    from vehest.stages.signals import StopSignals
+    from vehest.run.artefacts import make
+    from vehest.run.ingest import plan_ingest, write_ingest
+    from vehest.run.signals import StopSignals
 
     config = configuration(root)
 
@@ -88,7 +88,7 @@ def whole_stage(root: Path) -> Callable[[], Any]:
 
 def configuration(root: Path) -> dict[str, Any]:
     """The data set's configuration, one recording long."""
-    from vehest.stages.config import compose_config
+    from vehest.run.config import compose_config
 
     overrides = ["dataset=revs_targa_2014", f"dataset.recordings=[{RECORDING}]", f"root={root}", f"output={root / 'outputs'}"]
     return compose_config("ingest", overrides)
@@ -136,7 +136,7 @@ def case(name: str, baseline: tuple[float, float], ours: tuple[float, float]) ->
 
 def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     return library_versions()
 

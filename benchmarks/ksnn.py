@@ -131,7 +131,7 @@ def measured(config: dict[str, Any], pools: list[ProcessPoolExecutor]) -> list[F
 
 def main() -> None:
     """Measure, write, print the ratios."""
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     with ExitStack() as stack:
         pools = [stack.enter_context(ProcessPoolExecutor(1, mp_context=get_context("spawn"))) for _ in range(2)]

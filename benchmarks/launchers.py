@@ -25,19 +25,19 @@ from typing import Any
 import numpy as np
 
 from vehest.data.files import remove_leftovers
-from vehest.stages.comparison import plain_resampling
-from vehest.stages.config import compose_config
-from vehest.stages.console import Messages
-from vehest.stages.evaluate import protocol_from_config
-from vehest.stages.failures import Failure
-from vehest.stages.group import Evaluation, Group
-from vehest.stages.launchers import on_ray
-from vehest.stages.launchers.base import Launcher, LocalLauncher
-from vehest.stages.launchers.on_ray import RayLauncher
-from vehest.stages.signals import StopSignals
-from vehest.stages.starting import plan_training
-from vehest.stages.sweep import plan_sweep
-from vehest.stages.workshop import Workshop
+from vehest.run.comparison import plain_resampling
+from vehest.run.config import compose_config
+from vehest.run.console import Messages
+from vehest.run.evaluate import protocol_from_config
+from vehest.run.failures import Failure
+from vehest.run.group import Evaluation, Group
+from vehest.run.launchers import on_ray
+from vehest.run.launchers.base import Launcher, LocalLauncher
+from vehest.run.launchers.on_ray import RayLauncher
+from vehest.run.signals import StopSignals
+from vehest.run.starting import plan_training
+from vehest.run.sweep import plan_sweep
+from vehest.run.workshop import Workshop
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "launchers.json"
 CORES = 2

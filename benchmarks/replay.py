@@ -87,7 +87,7 @@ def soak(minutes: float, model: str) -> int:
 
     from conftest import planar_drive
     from vehest.api import load_model
-    from vehest.stages.replay import ReplayWords, replay_log
+    from vehest.run.replay import ReplayWords, replay_log
 
     torch.set_num_threads(1)
     if os.environ.get("VEHEST_DATA"):

@@ -33,9 +33,9 @@ def plant_runs() -> tuple[float, float, float]:
     import numpy as np
     from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
+    from vehest.run.config import compose_config
     from vehest.simulation.plant.multi_body import MultiBodyPlant
     from vehest.simulation.plant.parameters import library_parameters, vehicle_from_configuration
-    from vehest.stages.config import compose_config
 
     config = compose_config("ingest", ["dataset=sim_small"])["dataset"]["vehicle"]
     plant = MultiBodyPlant(vehicle_from_configuration(config), STEP)
@@ -74,11 +74,11 @@ def plant_runs() -> tuple[float, float, float]:
 
 def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
     """Seconds, peak memory of the largest process [MB], and how many drives there are."""
-    from vehest.stages.config import compose_config
-    from vehest.stages.console import Messages
-    from vehest.stages.signals import StopSignals
-    from vehest.stages.simulate import outcome_of
-    from vehest.stages.workshop import Workshop
+    from vehest.run.config import compose_config
+    from vehest.run.console import Messages
+    from vehest.run.signals import StopSignals
+    from vehest.run.simulate import outcome_of
+    from vehest.run.workshop import Workshop
 
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         config = compose_config("ingest", [f"dataset={name}", f"output={folder}"])
@@ -98,7 +98,7 @@ def in_own_process(work: Any, *arguments: object) -> Any:
 
 def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     return library_versions()
 

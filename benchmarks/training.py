@@ -67,7 +67,7 @@ def in_own_process(work: Callable[..., tuple[float, float]], *arguments: object)
 
 def main() -> None:
     """Measure, write, print the ratios."""
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     cases = []
     for structure in STRUCTURES:

@@ -46,7 +46,7 @@ def main() -> None:
     """Measure, write, print."""
     import vehest
     from single_track_drive import linear_drive
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
     from vehest.trust.contract import GuardedStepper, estimate_guarded
 
     torch.set_num_threads(1)

@@ -64,8 +64,8 @@ def dataset() -> str:
 
 def recordings(prefix: str) -> list[Any]:
     """Recordings of the data set of which the names begin so."""
+    from vehest.run.config import compose_config
     from vehest.sources.base import open_source
-    from vehest.stages.config import compose_config
 
     root = os.environ.get("VEHEST_DATA", tempfile.gettempdir())
     config = compose_config("ingest", [f"dataset={dataset()}", f"root={root}", f"output={tempfile.gettempdir()}"])
@@ -319,7 +319,7 @@ def versions() -> dict[str, str]:
     """Versions of the libraries; in a process of its own."""
     from importlib.metadata import version
 
-    from vehest.stages.artefacts import library_versions
+    from vehest.run.artefacts import library_versions
 
     return {**library_versions(), "torchdiffeq": version("torchdiffeq")}
 

@@ -17,8 +17,8 @@ import yaml
 from scipy import signal
 
 from vehest.data.recording import Recording
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 REAL = ("f1tenth", "iros_hoons_1_with_friction_run_*")
 SIMULATED = (("sim_tyre_sets", "learn_a_*"), ("sim_tyre_sets", "test_a_*"), ("sim_tyre_sets", "test_d_*"))

@@ -17,12 +17,12 @@ import pandas as pd
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description, save_model
 from vehest.report.style import fixed
-from vehest.stages.calibrate import plan_calibrate, write_calibration
-from vehest.stages.config import compose_config
-from vehest.stages.console import Messages
-from vehest.stages.estimate import find_model, model_artefact, preparation_of
-from vehest.stages.signals import StopSignals
-from vehest.stages.workshop import Workshop
+from vehest.run.calibrate import plan_calibrate, write_calibration
+from vehest.run.config import compose_config
+from vehest.run.console import Messages
+from vehest.run.estimate import find_model, model_artefact, preparation_of
+from vehest.run.signals import StopSignals
+from vehest.run.workshop import Workshop
 from vehest.trust.record import read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]

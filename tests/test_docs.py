@@ -28,10 +28,10 @@ from vehest.data.transforms import TRANSFORMS, Resample
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import UNITS
+from vehest.run.config import compose_config, expand
+from vehest.run.config_files import GROUPS, choices
+from vehest.run.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
 from vehest.sources.base import COMMON_KEYS, open_source, source_names
-from vehest.stages.config import compose_config, expand
-from vehest.stages.config_files import GROUPS, choices
-from vehest.stages.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
 from vehest.studies.artefacts import METRIC_COLUMNS
 
 pytestmark = pytest.mark.apart

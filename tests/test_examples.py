@@ -20,7 +20,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
-from vehest.stages.artefacts import read_artefact
+from vehest.run.artefacts import read_artefact
 from vehest.training.context import FitContext
 from vehest.training.nothing import NoTraining
 from vehest.training.supervised import SupervisedSettings

@@ -22,9 +22,9 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model as _load_model
 from vehest.estimators.model_files import save_model as _save_model
-from vehest.stages.calibrate import trust_of
-from vehest.stages.estimate import PRETRAINED, estimate_recording, find_model, preparation_of, read_table, write_estimate_table
-from vehest.stages.in_memory import score_on, train_on
+from vehest.run.calibrate import trust_of
+from vehest.run.estimate import PRETRAINED, estimate_recording, find_model, preparation_of, read_table, write_estimate_table
+from vehest.run.in_memory import score_on, train_on
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust, write_trust
 from vehest.trust.verdict import reason_in_words

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError, is_printable, printable
-from vehest.stages.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
-from vehest.stages.launchers.where import LAUNCHERS, Where
+from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
+from vehest.run.launchers.where import LAUNCHERS, Where
 from vehest.version import __version__
 
 if TYPE_CHECKING:
-    from vehest.stages.config import Config
-    from vehest.stages.finished import Finished
-    from vehest.stages.shown import Shown
-    from vehest.stages.workshop import Workshop
+    from vehest.run.config import Config
+    from vehest.run.finished import Finished
+    from vehest.run.shown import Shown
+    from vehest.run.workshop import Workshop
 
 app = typer.Typer(
     name="vehest",
@@ -59,7 +59,7 @@ def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, 
     """Completion of a command's overrides."""
 
     def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-        from vehest.stages.completion import complete_override
+        from vehest.run.completion import complete_override
 
         given = [str(word) for word in context.params.get("overrides") or []]
         if context.params.get("check"):
@@ -180,8 +180,8 @@ def new_car(
     Proposes for every column channel, unit, sign and delay, with what speaks for it, asks what the logs do not decide, and writes
     conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
-    from vehest.stages.new_car import Vehicle
-    from vehest.stages.new_car_outcome import begin, conclude, in_words, settle
+    from vehest.run.new_car import Vehicle
+    from vehest.run.new_car_outcome import begin, conclude, in_words, settle
 
     given = dict(_key_and_answer(text) for text in answer or [])
     examined = begin(name, files, force=force)
@@ -217,7 +217,7 @@ def _key_and_answer(text: str) -> tuple[str, str]:
 
 def _asked(question: Any) -> str:
     """An answer from the terminal; Enter takes what is proposed, and what is no answer is asked again."""
-    from vehest.stages.new_car_questions import check_answer
+    from vehest.run.new_car_questions import check_answer
 
     for line in question.evidence:
         _echo(f"    {line}")
@@ -256,7 +256,7 @@ def ingest(
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
     with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
         if download:
-            from vehest.stages.download import download_files
+            from vehest.run.download import download_files
 
             download_files(config, workshop)
         artefact = workshop.ingest(config)
@@ -280,7 +280,7 @@ def simulate(
     The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
-    from vehest.stages.simulate import outcome_of, simulation_config
+    from vehest.run.simulate import outcome_of, simulation_config
 
     config = simulation_config(dataset, overrides or [])
     with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
@@ -320,14 +320,14 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.stages.group import Group
+    from vehest.run.group import Group
 
     config = _compose("train", overrides or [])
     with _workshop(config, force={"train", "calibrate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
         _, job = _train_job(config, workshop)
         members, failures = workshop.run_groups([Group([job], None, workshop.force, split=workshop.split(config))])
         _raise_failure(failures)
-    from vehest.stages.train import read_fit_metrics
+    from vehest.run.train import read_fit_metrics
 
     model = members[0].model
     if model is not None:
@@ -356,16 +356,16 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.stages.artefacts import find
-    from vehest.stages.comparison import plain_resampling
-    from vehest.stages.estimate import find_model, model_artefact, preparation_of
-    from vehest.stages.evaluate import protocol_from_config
-    from vehest.stages.evaluate_faults import fault_figures, write_faulted
-    from vehest.stages.faults import check_channels, faults_of
-    from vehest.stages.fitting import fitted_evaluation
-    from vehest.stages.group import Evaluation
-    from vehest.stages.train import trained_rate
-    from vehest.stages.workshop import test_figures
+    from vehest.run.artefacts import find
+    from vehest.run.comparison import plain_resampling
+    from vehest.run.estimate import find_model, model_artefact, preparation_of
+    from vehest.run.evaluate import protocol_from_config
+    from vehest.run.evaluate_faults import fault_figures, write_faulted
+    from vehest.run.faults import check_channels, faults_of
+    from vehest.run.fitting import fitted_evaluation
+    from vehest.run.group import Evaluation
+    from vehest.run.train import trained_rate
+    from vehest.run.workshop import test_figures
 
     config = _compose("eval", overrides or [])
     faults = faults_of(config)
@@ -433,8 +433,8 @@ def estimate(
     """
     from vehest.data.limits import limits_from_config, use_limits
     from vehest.estimators.model_files import load_model
-    from vehest.stages.calibrate import trust_of
-    from vehest.stages.estimate import (
+    from vehest.run.calibrate import trust_of
+    from vehest.run.estimate import (
         PRETRAINED,
         SUFFIXES,
         estimate_recording,
@@ -531,8 +531,8 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; what was written is kept.
     """
-    from vehest.stages.replay import ReplayWords, replay_log
-    from vehest.stages.signals import StopSignals
+    from vehest.run.replay import ReplayWords, replay_log
+    from vehest.run.signals import StopSignals
 
     words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
     stop = StopSignals()
@@ -573,8 +573,8 @@ def export(
     """
     from vehest.estimators.model_files import load_model
     from vehest.export.folder import export_model
-    from vehest.stages.calibrate import trust_of
-    from vehest.stages.estimate import find_model
+    from vehest.run.calibrate import trust_of
+    from vehest.run.estimate import find_model
 
     config = _compose("estimate", [])
     output = Path(config["output"])
@@ -621,9 +621,9 @@ def compare(
     """
     from vehest.data.limits import limits_from_config, use_limits
     from vehest.estimators.model_files import load_model, read_description
-    from vehest.stages.calibrate import trust_of
-    from vehest.stages.compare_files import compare_estimates, read_estimate_table
-    from vehest.stages.estimate import estimate_recording, find_model, preparation_of, read_table
+    from vehest.run.calibrate import trust_of
+    from vehest.run.compare_files import compare_estimates, read_estimate_table
+    from vehest.run.estimate import estimate_recording, find_model, preparation_of, read_table
 
     files = [Path(word) for word in words or [] if _is_file_name(word)]
     overrides = [word for word in words or [] if not _is_file_name(word)]
@@ -743,7 +743,7 @@ def report(
 
 def _check_published(words: list[str], as_json: bool) -> None:
     """Say of published studies whether they are those of today; exit code 3 unless all are."""
-    from vehest.stages.published_check import check_published
+    from vehest.run.published_check import check_published
 
     verdicts = check_published([word for word in words if _is_file_name(word)], [word for word in words if not _is_file_name(word)])
     if as_json:
@@ -776,7 +776,7 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
+    from vehest.run.finished import Asked, Outcome, recall, remember, stamps_of
 
     words = tuple(overrides or [])
     asked = Asked(("sweep", name or "", *words), words)
@@ -785,8 +785,8 @@ def sweep(
         folder, _ = _repeat(finished, dry_run=dry_run, quiet=quiet)
         _print_sweep(finished.record.shown, as_json, folder, skipped=True)
         return
-    from vehest.stages.shown import shown_of_sweep
-    from vehest.stages.sweep import SweepOutcome, plan_sweep, run_sweep
+    from vehest.run.shown import shown_of_sweep
+    from vehest.run.sweep import SweepOutcome, plan_sweep, run_sweep
 
     planned = plan_sweep(words, name)
 
@@ -819,9 +819,9 @@ def plan(
     Trainings, tasks of a cluster, core hours, memory, data to move, and the time on so many cores. What is guessed, since nothing like it
     was trained into this output root, is called a guess.
     """
-    from vehest.stages.launcher import default_jobs
-    from vehest.stages.launchers.plan import plan_study
-    from vehest.stages.pipeline import pipeline_configs, read_pipeline
+    from vehest.run.launcher import default_jobs
+    from vehest.run.launchers.plan import plan_study
+    from vehest.run.pipeline import pipeline_configs, read_pipeline
 
     study = read_pipeline(pipeline)
     configs = pipeline_configs(study, overrides or [])
@@ -843,7 +843,7 @@ def show_config(
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
     if command not in COMMANDS:
         raise ConfigurationError(f"'{command}' is not one of: {', '.join(COMMANDS)}")
-    from vehest.stages.config import GIVEN, as_yaml
+    from vehest.run.config import GIVEN, as_yaml
 
     config = {key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN}
     _echo(_json(config) if as_json else as_yaml(config).rstrip(), keep="\n")
@@ -861,7 +861,7 @@ def prune(
     That is what other code has made than today's, what is damaged or half-written, and what was made from something that is gone. Models
     and recordings of today's code stay, whatever their settings, and so does everything that vehest has not made.
     """
-    from vehest.stages.prune import remove_found, unnamed
+    from vehest.run.prune import remove_found, unnamed
 
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
@@ -902,7 +902,7 @@ def _age(seconds: float) -> str:
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
     """Say what works on this machine and what is missing."""
-    from vehest.stages.doctor import examine
+    from vehest.run.doctor import examine
 
     items = examine()
     if as_json:
@@ -918,7 +918,7 @@ def doctor(as_json: AsJson = False) -> None:
 @data_app.command("list")
 def data_list(as_json: AsJson = False) -> None:
     """List the data sets that conf/dataset offers, with their licences and what to cite."""
-    from vehest.stages.inspect_data import dataset_rows
+    from vehest.run.inspect_data import dataset_rows
 
     rows = dataset_rows()
     if as_json:
@@ -951,7 +951,7 @@ def data_show(
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
-    from vehest.stages.inspect_data import describe
+    from vehest.run.inspect_data import describe
 
     shown = describe(source, overrides or [])
     if as_json:
@@ -982,7 +982,7 @@ def data_check(
     as_json: AsJson = False,
 ) -> None:
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
-    from vehest.stages.inspect_data import check
+    from vehest.run.inspect_data import check
 
     findings = check(source, overrides or [])
     if as_json:
@@ -1004,8 +1004,8 @@ def data_usable(
     as_json: AsJson = False,
 ) -> None:
     """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
-    from vehest.stages.inspect_data import examine_usability
-    from vehest.stages.usable import HEADER, borrowed_cars, remedies, table_row
+    from vehest.run.inspect_data import examine_usability
+    from vehest.run.usable import HEADER, borrowed_cars, remedies, table_row
 
     found = examine_usability(source, overrides or [])
     if as_json:
@@ -1056,7 +1056,7 @@ def data_align(
     Prints what was found with its uncertainty, and the transforms that would correct it. Applies nothing.
     """
     from vehest.alignment.settings import AlignmentSettings
-    from vehest.stages.align import (
+    from vehest.run.align import (
         PARAMETER_HEADER,
         RESIDUAL_HEADER,
         align_recording,
@@ -1092,7 +1092,7 @@ def data_align(
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
-    from vehest.stages.signals import Stopped
+    from vehest.run.signals import Stopped
 
     _open_streams()
     try:
@@ -1151,7 +1151,7 @@ def _fail_usage(error: Any) -> None:
 
 
 def _fail_with(error: Exception) -> None:
-    from vehest.stages.failures import failure_of
+    from vehest.run.failures import failure_of
 
     failure = failure_of(error)
     if failure.exit_code != 1:
@@ -1209,7 +1209,7 @@ def _run_pipeline(
     where: Where | None = None,
 ) -> None:
     begun = time.monotonic()
-    from vehest.stages.finished import Asked, Outcome, recall, remember, stamps_of
+    from vehest.run.finished import Asked, Outcome, recall, remember, stamps_of
 
     asked = Asked(("run", name, *overrides), tuple(overrides), name)
     finished = None if force else recall(asked)
@@ -1217,8 +1217,8 @@ def _run_pipeline(
         folder, published = _repeat(finished, dry_run=dry_run, quiet=quiet)
         _print_shown(finished.record.shown, as_json, folder, {"published": str(published) if published else None})
         return
-    from vehest.stages.pipeline import PipelineOutcome, content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
-    from vehest.stages.shown import shown_of_pipeline
+    from vehest.run.pipeline import PipelineOutcome, content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
+    from vehest.run.shown import shown_of_pipeline
 
     pipeline = read_pipeline(name)
     configs = pipeline_configs(pipeline, overrides)
@@ -1257,8 +1257,8 @@ def _until(minutes: float | None, begun: float) -> float | None:
 
 def _repeat(finished: Finished, *, dry_run: bool, quiet: bool) -> tuple[Path, Path | None]:
     """Say what the whole way would say of a finished study, publish it where its copy is not there; returns its report and that copy."""
-    from vehest.stages.console import Messages
-    from vehest.stages.publishing import publish_study
+    from vehest.run.console import Messages
+    from vehest.run.publishing import publish_study
 
     messages = Messages(quiet=quiet)
     messages.again(finished.record.said)
@@ -1293,7 +1293,7 @@ def _print_shown(shown: Shown, as_json: bool, folder: Path, further: dict[str, A
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
-    from vehest.stages.config import compose_config
+    from vehest.run.config import compose_config
 
     return compose_config(command, overrides)
 
@@ -1305,8 +1305,8 @@ def _names(group: str, overrides: list[str] | None) -> bool:
 
 def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
     """The configuration at a rate that the recordings have, and what it trains."""
-    from vehest.stages.fitting import fitted_job
-    from vehest.stages.starting import plan_training
+    from vehest.run.fitting import fitted_job
+    from vehest.run.starting import plan_training
 
     _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz")
     split, config = workshop.split(config), fitted_job(config, workshop)
@@ -1326,12 +1326,12 @@ def _workshop(
 ) -> Iterator[Workshop]:
     """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
     from vehest.data.limits import limits_from_config, use_limits
-    from vehest.stages.console import Messages
-    from vehest.stages.launcher import default_jobs
-    from vehest.stages.launchers.base import chosen_launcher
-    from vehest.stages.signals import StopSignals
-    from vehest.stages.tracking import Tracker
-    from vehest.stages.workshop import NotThereYet, Workshop
+    from vehest.run.console import Messages
+    from vehest.run.launcher import default_jobs
+    from vehest.run.launchers.base import chosen_launcher
+    from vehest.run.signals import StopSignals
+    from vehest.run.tracking import Tracker
+    from vehest.run.workshop import NotThereYet, Workshop
 
     messages, stop, output = Messages(quiet=quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if track else None

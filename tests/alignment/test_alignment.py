@@ -26,14 +26,14 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
 from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_from_config
+from vehest.run.align import FILES, override_of
+from vehest.run.config import compose_config
+from vehest.run.downsample import transforms_of
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.recording import SensorLevel, ideal_sensors, measure, specific_force
 from vehest.sources.base import open_source
-from vehest.stages.align import FILES, override_of
-from vehest.stages.config import compose_config
-from vehest.stages.downsample import transforms_of
 
 IMU = ("lever_arm", "mounting", "delay", "offsets")
 PLANTED = {

@@ -13,8 +13,8 @@ from vehest.alignment.bandwidth import held_rate
 from vehest.alignment.checks import Finding, checks_of_recording
 from vehest.alignment.spectra import cross_spectra, lag_of
 from vehest.data.recording import Recording
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 
 def found_by(check: str, recording: Recording) -> dict[str, Finding]:

@@ -15,8 +15,8 @@ from vehest.alignment.delays import Delay, delays_of, spectra_of
 from vehest.alignment.motion import motion_of
 from vehest.alignment.spectra import cross_spectra, lag_of
 from vehest.data.recording import Recording
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 
 def delays(recording: Recording) -> list[Delay]:

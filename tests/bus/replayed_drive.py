@@ -12,7 +12,7 @@ from can_drive import SIGNALS, write_log
 from vehest.api import estimate, load_model
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.stages.replay import ReplayWords, replay_log
+from vehest.run.replay import ReplayWords, replay_log
 
 JITTER, LOST = 0.001, 0.01
 SETTLED = 2.0  # s after the first estimate of both

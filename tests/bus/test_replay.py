@@ -19,7 +19,7 @@ from vehest.bus.sampling import Sample
 from vehest.bus.view import LiveView, PlainView, Shown, rows_of, view_on
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.recording import Recording
-from vehest.stages.replay import ReplayWords, replay_log
+from vehest.run.replay import ReplayWords, replay_log
 from vehest.trust.contract import GuardedStepper
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")

@@ -82,7 +82,7 @@ def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus: Place, monkeyp
                 monkeypatch.setattr(self, "is_due", lambda samples: False)
                 signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("vehest.stages.replay.standard_view", lambda title, quiet: Impatient())
+    monkeypatch.setattr("vehest.run.replay.standard_view", lambda title, quiet: Impatient())
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "-o", "out.csv")
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert code == 130

@@ -6,8 +6,8 @@ import pytest
 
 from vehest.data.split_files import split_from_config
 from vehest.data.splits import Split
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 SETS = {  # Table I
     "C-1": ("20130222_01_01_03", "20130222_01_02_03", "20130222_02_01_03"),

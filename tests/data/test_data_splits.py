@@ -20,8 +20,8 @@ from vehest.data.recording import Recording
 from vehest.data.split_files import Catalogue, dataset_names, split_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.windows import window_starts, windows_of
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
 CONFIGURATIONS = sorted((Path(__file__).parents[2] / "conf" / "split").glob("*.yaml"))

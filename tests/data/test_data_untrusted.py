@@ -17,7 +17,7 @@ from vehest.data.files import file_name, regular_file
 from vehest.data.limits import Limits, check_limit, check_unpacked, current_limits, limits_from_config, use_limits
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import parse_json, parse_yaml, read_text, read_yaml
-from vehest.stages.config import compose_config
+from vehest.run.config import compose_config
 
 
 @dataclass(frozen=True)

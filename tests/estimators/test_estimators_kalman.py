@@ -17,7 +17,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.kalman import KalmanFilter, KalmanSettings
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_levels import high_passed_level
-from vehest.stages.config import compose_config
+from vehest.run.config import compose_config
 from vehest.training.nothing import NoTraining
 from vehest.vehicle.parameters import FERRARI_250LM
 

@@ -18,7 +18,7 @@ from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter,
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import extended_filter
-from vehest.stages.config import compose_config
+from vehest.run.config import compose_config
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.training.search import optuna_search

@@ -18,7 +18,7 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn, KsnnSettings
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.networks.recurrent import RecurrentSettings
-from vehest.stages import group
+from vehest.run import group
 from vehest.training.members import FlatParameters, predict_members
 
 STRUCTURES = [

@@ -17,8 +17,8 @@ from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf, LearnedUkfSettin
 from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings

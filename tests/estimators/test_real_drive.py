@@ -15,8 +15,8 @@ from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 from vehest.training.search import DirectSearchSettings
 from vehest.training.supervised import SupervisedSettings
 

@@ -25,7 +25,7 @@ def weights(model) -> np.ndarray:
 
 
 def test_a_training_that_does_not_move_ends_with_the_weights_it_started_from(drives):
-    from vehest.stages.estimate import pretrained_folder
+    from vehest.run.estimate import pretrained_folder
 
     started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
     assert weights(started) == pytest.approx(weights(vehest.load_model()), abs=1e-6)
@@ -34,7 +34,7 @@ def test_a_training_that_does_not_move_ends_with_the_weights_it_started_from(dri
 
 
 def test_a_model_of_other_settings_is_refused_with_both(drives):
-    from vehest.stages.estimate import pretrained_folder
+    from vehest.run.estimate import pretrained_folder
 
     with pytest.raises(ConfigurationError, match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0"):
         vehest.train("ksnn", drives[:1], drives[1:], ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"])

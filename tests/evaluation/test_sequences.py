@@ -17,7 +17,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_estimate
 from vehest.evaluation.metrics import Protocol, reference_state, sequences
-from vehest.stages.evaluate import protocol_from_config
+from vehest.run.evaluate import protocol_from_config
 
 PAPER = {"rate_hz": 100, "warm_up_seconds": 0, "skip_seconds": 2, "sequence_seconds": 10, "initial_state": True}
 GIVEN = ["estimator=kalman", "estimator.noise.yaw_rate=0.01", "estimator.noise.ay=0.5", "estimator.noise.steer=0.01"]

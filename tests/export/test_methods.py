@@ -21,8 +21,8 @@ from vehest.estimators.filtering.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.export.method import FAMILIES, method_source
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings
 

@@ -36,7 +36,7 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
-from vehest.stages.downsample import transforms_of
+from vehest.run.downsample import transforms_of
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import GuardLimits, learn_limits
 from vehest.trust.watch import STARTED

@@ -47,7 +47,7 @@ def import_everything() -> None:
     for module in pkgutil.iter_modules(encodings.__path__):
         if module.name not in ("mbcs", "oem", "cp65001"):
             importlib.import_module(f"encodings.{module.name}")
-    from vehest.stages.artefacts import commit
+    from vehest.run.artefacts import commit
 
     commit()
     load_kernels()

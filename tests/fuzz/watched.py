@@ -56,7 +56,7 @@ MAKERS = (
     "llvmlite.",
     "rosbags.typesys.store",
     "rosbags.serde.",
-    "vehest.stages.code_version",
+    "vehest.run.code_version",
     "ast",
 )
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")

@@ -53,7 +53,7 @@ HEADER += ("leftovers", "outcome")
 HEAVY = (
     "mlflow",
     "matplotlib.pyplot",
-    "vehest.stages.pipeline",
+    "vehest.run.pipeline",
     "vehest.studies.drive",
     "vehest.report.document",
     "vehest.report.run_figures",
@@ -241,7 +241,7 @@ def artefacts(output: Path) -> Iterator[Path]:
 def broken(output: Path) -> list[str]:
     """Folders that are not whole."""
     from vehest.data.errors import VehestError
-    from vehest.stages.artefacts import read_artefact
+    from vehest.run.artefacts import read_artefact
 
     found = []
     for folder in artefacts(output):
@@ -266,8 +266,8 @@ def locks_held(output: Path) -> list[str]:
 
 def content(output: Path) -> dict[str, str]:
     """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that it publishes."""
-    from vehest.stages.artefacts import read_artefact
-    from vehest.stages.evaluate import TIMES
+    from vehest.run.artefacts import read_artefact
+    from vehest.run.evaluate import TIMES
 
     found = {}
     for folder in artefacts(output):

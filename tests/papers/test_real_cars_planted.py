@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from vehest.data.recording import Recording
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 from vehest_papers.real_cars.planted import Fault, detections, planted_faults
 
 LENGTH = 2000

@@ -20,11 +20,11 @@ from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
 from vehest.report.document import Document, Table, write_document
+from vehest.run.config import compose_config
+from vehest.run.config_files import choices
 from vehest.simulation.fleet import variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.sources.base import kind_of, open_source
-from vehest.stages.config import compose_config
-from vehest.stages.config_files import choices
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.sim_to_real import documents
 

@@ -15,11 +15,11 @@ from planted_logs import RADIUS, drive, usual, write
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.run.new_car import Vehicle, draft, examine
+from vehest.run.new_car_outcome import conclude
+from vehest.run.new_car_questions import questions_of
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
-from vehest.stages.new_car import Vehicle, draft, examine
-from vehest.stages.new_car_outcome import conclude
-from vehest.stages.new_car_questions import questions_of
 
 
 def proposed(file: Path) -> dict[str, Proposal]:

@@ -14,6 +14,7 @@ from test_simulation_vehicles import plant_of
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
+from vehest.run.config import compose_config
 from vehest.simulation.drive import drive, simulate_drive
 from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import HIGHEST_CORRECTION, LOWEST_CORRECTION, Hands
@@ -26,7 +27,6 @@ from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels, Tilt
 from vehest.simulation.sensors.recording import measure
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 LENGTHS = (0.4, 0.9)  # m, front and rear
 

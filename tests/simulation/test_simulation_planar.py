@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
+from vehest.run.config import compose_config
 from vehest.simulation.driving.freestyle import Freestyle
 from vehest.simulation.driving.manoeuvres import one_of
 from vehest.simulation.errors import SimulationError
@@ -36,7 +37,6 @@ from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar, planar_car
 from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.recording import PRESETS
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
 
 CONF = Path(__file__).parents[2] / "conf"
 CONFIGURATION: dict[str, Any] = yaml.safe_load((CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8"))

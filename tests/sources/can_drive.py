@@ -141,8 +141,8 @@ def _rows(signals: dict[str, Any]) -> Iterator[dict[str, float]]:
 
 def ferrari(start: float, stop: float) -> Recording:
     """A stretch of the real Ferrari's drive, as its data set declares it."""
+    from vehest.run.config import compose_config
     from vehest.sources.base import open_source
-    from vehest.stages.config import compose_config
 
     source = open_source(compose_config("ingest", ["dataset=ferrari_250lm"])["dataset"])
     recording = source.read(source.ids()[0])

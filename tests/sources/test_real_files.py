@@ -10,8 +10,8 @@ import pytest
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
+from vehest.run.config import compose_config
 from vehest.sources.base import Source, open_source
-from vehest.stages.config import compose_config
 
 F1TENTH = {  # file: rows, runs (the publishers' own counts)
     "iros_hoons_1_with_friction": (14_867, [0, 1, 2, 3, 4, 5, 6]),

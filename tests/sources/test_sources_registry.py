@@ -11,13 +11,13 @@ import yaml
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, MissingError
+from vehest.run.config import compose_config, missing_keys
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
 from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.recording import SensorLevels
 from vehest.sources.base import kind_of, open_source, source_module, source_names
 from vehest.sources.simulated import SimulatedSource
-from vehest.stages.config import compose_config, missing_keys
 
 CONF = Path(__file__).parents[2] / "conf"
 DATASETS = sorted((CONF / "dataset").glob("*.yaml"))

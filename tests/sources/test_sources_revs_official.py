@@ -21,9 +21,9 @@ from vehest.cli import main
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
+from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
-from vehest.stages.config import compose_config
 
 NAME = "20140222_01_01_03_250lm"
 SECONDS, BLANK = 4.0, 37

@@ -17,9 +17,9 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
+from vehest.run.config import compose_config
+from vehest.run.downsample import transforms_of
 from vehest.sources.base import open_source
-from vehest.stages.config import compose_config
-from vehest.stages.downsample import transforms_of
 from vehest.trust import health_kernel as kernel
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import usual_limits

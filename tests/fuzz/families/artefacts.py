@@ -145,7 +145,7 @@ def no_rights(case: Case) -> Command:
 @template
 def unfinished(folder: Path) -> None:
     """An output root with the checkpoint of a training that was killed."""
-    from vehest.stages import group
+    from vehest.run import group
 
     drives(folder)
     kept = group.drop_checkpoint

@@ -12,7 +12,7 @@ from fuzz.case import Case, Command, generator, template
 from fuzz.honest import KALMAN, KSNN, LUENBERGER, PIPELINE, SPLIT, run, write_yaml
 from fuzz.mutations import NAMES, hostile, spoil_items, spoil_key, spoil_tree, spoil_yaml
 from place import DATASET
-from vehest.stages.config_files import packaged_conf, packaged_pipelines
+from vehest.run.config_files import packaged_conf, packaged_pipelines
 
 HEAD = "# @package _global_\n"
 ESTIMATORS = (

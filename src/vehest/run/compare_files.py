@@ -1,0 +1,205 @@
+"""Estimates that were made elsewhere, scored beside each other and beside vehest's own on one recording with a reference."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.data.store import read_estimate
+from vehest.estimators.static_map import StaticMap, StaticMapSettings
+from vehest.evaluation.blocks import segments_of
+from vehest.evaluation.metrics import Protocol, Scored, accuracy, score
+from vehest.evaluation.ranking import Name, Ranking, rank
+from vehest.run.downsample import transforms_of
+from vehest.sources.base import read_single
+from vehest.sources.tabular import column_names
+from vehest.sources.unit_spellings import plain_unit
+from vehest.studies.kit.standing import standing_columns, verdict_sentences
+
+SPELLINGS = {
+    "vy_ref": {"vy", "v", "v_y", "vlat", "lateralvelocity", "lateral_velocity", "v_lat", "vy_est", "vy_hat"},
+    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "sideslip_angle", "beta_est", "beta_hat", "slip_angle"},
+}
+"""Channel that a quantity is read as -> how a table may call it."""
+USUAL_UNITS = {"vy_ref": "m/s", "sideslip_ref": "rad"}
+TIMES = {"time", "t", "timestamp", "zeit"}
+LEAST_SECONDS = 5.0
+
+
+@dataclass(frozen=True)
+class ComparedFiles:
+    """Estimates of one recording, ranked.
+
+    Args:
+        rows: one an estimate, the lowest RMSE(β) first: name, metrics, and where it stands.
+        verdict: in words.
+        start, stop: of what was scored [s].
+        rate_hz: at which it was.
+    """
+
+    rows: Sequence[Mapping[str, Any]]
+    verdict: str
+    start: float
+    stop: float
+    rate_hz: float
+
+
+def read_estimate_table(file: Path, vx: Recording) -> Estimate:
+    """Read v or β from a table that any tool wrote, or from what ``vehest estimate`` did.
+
+    Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
+    β is there, v = u tan β with the recording's u.
+
+    Args:
+        file: table with a column of time, on the recording's clock.
+        vx: the recording.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it has neither v nor β, or no time, or cannot be read.
+    """
+    if file.suffix == ".parquet":
+        with suppress(DataError):  # a table of another tool's
+            return read_estimate(file)
+    names = column_names(file, {})
+    time = _column_like(names, TIMES)
+    found = {channel: _column_like(names, spellings) for channel, spellings in SPELLINGS.items()}
+    channel = next((channel for channel, column in found.items() if column is not None), None)
+    if time is None or channel is None:
+        what = "a column of time [s]" if time is None else "a column vy [m/s] or sideslip [rad]"
+        listed = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
+        raise DataError(f"'{file}' has no {what.removeprefix('a ')} (it has {listed}); name one so")
+    column = str(found[channel])
+    dataset = {
+        "name": file.stem,
+        "source": "tabular",
+        "kind": "real",
+        "vehicle": "unknown",
+        "time": {"column": time, "unit": _unit_in(time) or "s"},
+        "clock": "interpolate",
+        "gappy": [channel],
+        "channels": {channel: {"column": column, "unit": _unit_in(column) or USUAL_UNITS[channel]}},
+    }
+    table = read_single(dataset, file)
+    values = table[channel]
+    if channel == "sideslip_ref":
+        values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
+    return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
+
+
+def _column_like(names: Sequence[str], spellings: set[str]) -> str | None:
+    """The first column that is called so, what stands in brackets and the case left aside."""
+    bare = {name: re.sub(r"[\[(].*?[\])]", "", name).strip().lower().replace(" ", "_") for name in names}
+    return next((name for name in names if bare[name] in spellings or bare[name].replace("_", "") in spellings), None)
+
+
+def _unit_in(name: str) -> str | None:
+    """A unit in brackets behind a name, as vehest spells it."""
+    written = re.search(r"[\[(](.*?)[\])]", name)
+    if written is None:
+        return None
+    return written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
+
+
+def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_hz: float = 20.0) -> ComparedFiles:
+    """Score estimates where all of them are there, with v = 0 and a static map beside them.
+
+    The map is fitted on one half of the scored range and judged on the other, and the other way round, so that it knows no sample that it
+    is judged by.
+
+    Args:
+        drive: with ``vx``, ``vy_ref`` and, for the map, ``yaw_rate``.
+        estimates: name -> estimate on the clock of ``drive``.
+        rate_hz: at which all are read.
+
+    Raises:
+        DataError: no reference, too little in common, or gaps within what is in common.
+        ConfigurationError: there is nothing to compare, or a name is that of a baseline.
+    """
+    for name in ("vx", "vy_ref"):
+        if name not in drive:
+            raise DataError(f"recording '{drive.id}' has no channel '{name}', which estimates are scored by")
+    if not estimates:
+        raise ConfigurationError("name at least one estimate to compare")
+    if taken := {"zero", "static_map"} & set(estimates):
+        raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
+    channels = [name for name in ("vx", "vy_ref", "ay", "yaw_rate") if name in drive]
+    reference = drive.select(channels)
+    for transform in transforms_of({"rate_hz": min(rate_hz, drive.rate_hz), "method": "polyphase", "transforms": []}):
+        reference = transform(reference)
+    start, stop = _in_common(reference, estimates)
+    span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
+    everyone = {**estimates, **_baselines(reference, start, stop)}
+    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in everyone.items()}
+    ranking = rank({name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()}, reference.rate_hz)
+    return ComparedFiles(_rows(ranking, scored), _verdict(ranking), start, stop, reference.rate_hz)
+
+
+def _rows(ranking: Ranking, scored: Mapping[Name, Scored]) -> list[dict[str, Any]]:
+    rows = []
+    for name in ranking.order:
+        errors = accuracy([scored[name]])
+        rows.append({"estimate": name[0], **{key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}})
+        rows[-1] |= standing_columns(ranking, name)
+    return rows
+
+
+def _verdict(ranking: Ranking) -> str:
+    titles = {name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0]) for name in ranking.order}
+    return (
+        verdict_sentences(ranking, titles, "this recording").replace("**", "").replace(" over its seeds", "").replace(" and over seeds", "")
+    )
+
+
+def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
+    """From when to when every estimate and the reference are there [s]."""
+    known = np.flatnonzero(np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"]))
+    if not len(known):
+        raise DataError(f"recording '{reference.id}': channel 'vy_ref' has no sample")
+    start, stop = float(reference.time[known[0]]), float(reference.time[known[-1]])
+    for name, estimate in estimates.items():
+        there = np.flatnonzero(np.isfinite(estimate["vy"]))
+        if not len(there):
+            raise DataError(f"'{name}' has no estimate at all")
+        start, stop = max(start, float(estimate.time[there[0]])), min(stop, float(estimate.time[there[-1]]))
+        if stop - start < LEAST_SECONDS:
+            raise DataError(
+                f"'{name}' goes from {estimate.time[there[0]]:.6g} to {estimate.time[there[-1]]:.6g} s, which leaves less than "
+                f"{LEAST_SECONDS:g} s in common with the recording ({reference.time[known[0]]:.6g} to {reference.time[known[-1]]:.6g} s); "
+                f"are the clocks the same?"
+            )
+    return start, stop
+
+
+def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
+    """v = 0, and the static map where the car turns enough for one."""
+
+    def made(name: str, vy: FloatArray) -> Estimate:
+        return Estimate(reference.id, name, reference.rate_hz, reference.start_time, {"vy": vy, "sideslip": np.zeros_like(vy)})
+
+    found = {"zero": made("zero", np.zeros(len(reference)))}
+    if "yaw_rate" not in reference:
+        return found
+    middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
+    for learnt, told in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
+        part = reference.cut(*learnt)
+        mapped = StaticMap(StaticMapSettings(reference.rate_hz))
+        clean = np.isfinite(np.stack([part[name] for name in ("yaw_rate", "vx", "vy_ref")])).all(axis=0)
+        kept = {name: part[name][clean] for name in ("yaw_rate", "vx", "vy_ref")}
+        try:
+            mapped.values = mapped.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
+        except DataError:
+            return found
+        vy[told] = mapped.lateral_velocity({name: reference[name][told] for name in mapped.channels})
+    return found | {"static_map": made("static_map", vy)}

@@ -1,0 +1,62 @@
+"""Before the first stage: fetch a data set's files into its folder."""
+
+from __future__ import annotations
+
+from vehest.data.errors import ConfigurationError
+from vehest.run.config import Config, compose_config
+from vehest.run.config_files import choices
+from vehest.run.workshop import NotThereYet, Workshop
+from vehest.sources.base import open_source
+from vehest.sources.download import Outcome, download_of
+
+
+def download_files(config: Config, workshop: Workshop) -> None:
+    """Fetch what is missing of a data set's files, and record or compare the checksums of the others.
+
+    Args:
+        config: as composed for ``ingest``.
+        workshop: whose messages and dry run apply.
+
+    Raises:
+        ConfigurationError: the data set does not say where its files come from.
+        DataError: a file has other bytes than recorded.
+        MissingError: no data root is set, the server is out of reach or lacks a file, or the disk is full.
+        NotThereYet: in a dry run, if a file would have to be fetched.
+    """
+    source = open_source(config["dataset"])
+    if source.dataset.get("download") is None:
+        raise ConfigurationError(
+            f"data set '{source.name}' does not say where its files can be fetched from (download); "
+            f"data sets that do: {', '.join(_downloadable()) or 'none'}"
+        )
+    download = download_of(source)
+    if workshop.dry_run:
+        missing = download.missing()
+        for name in missing:
+            workshop.messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
+        if missing:
+            workshop.messages.line("plan", "ingest", source.name, "then")
+            raise NotThereYet
+        return
+    with workshop.messages.bars() as bars:
+
+        def progress(name: str, done: int, total: int | None) -> None:
+            bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
+
+        for outcome in download.fetch(progress):
+            bars.close(f"download {outcome.name}")
+            workshop.messages.line("skip" if outcome.what == "matched" else "done", "download", outcome.name, _detail(outcome))
+
+
+def _detail(outcome: Outcome) -> str:
+    if outcome.what == "matched":
+        return "is there, with the recorded checksum"
+    if outcome.what == "recorded":
+        return f"was there; its checksum is now recorded: sha256 {outcome.sha256}"
+    went_on = f", went on after {outcome.resumed_at / 1e6:.1f} MB" if outcome.resumed_at else ""
+    return f"{outcome.size / 1e6:.1f} MB{went_on}, sha256 {outcome.sha256}"
+
+
+def _downloadable() -> list[str]:
+    """Data sets that say where their files come from."""
+    return [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]

@@ -1,0 +1,251 @@
+"""What one worker does: train the members of a group together, then calibrate and evaluate each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from vehest.data.splits import Split
+from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.evaluation.metrics import Protocol
+from vehest.run.artefacts import Artefact, Status, ensured, find, make
+from vehest.run.calibrate import STAGE, CalibrateJob, plan_calibrate, write_calibration
+from vehest.run.evaluate import plan_evaluate
+from vehest.run.evaluate_faults import FaultedJob, write_faulted
+from vehest.run.faults import FaultSettings
+from vehest.run.locks import Waiting, held, held_at_once
+from vehest.run.train import TrainJob, fit_jobs, write_model
+from vehest.training.checkpoints import drop_checkpoint, resume_epoch
+from vehest.training.context import FitContext, Progress
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How the members of a group are to be evaluated.
+
+    Args:
+        split: its validation range and tests are scored.
+        data: data set -> recordings at the estimator's rate.
+        references: data set -> recordings at the evaluation rate.
+        kinds: data set -> ``real`` or ``simulated``.
+        protocol: how estimates are scored.
+        output: the output root.
+        faults: under which they are evaluated too.
+    """
+
+    split: Split
+    data: Mapping[str, Artefact]
+    references: Mapping[str, Artefact]
+    kinds: Mapping[str, str]
+    protocol: Protocol
+    output: Path
+    faults: tuple[FaultSettings, ...] = ()
+
+    def of(self, model: Artefact, calibration: Artefact | None) -> FaultedJob:
+        """The evaluation of a model that was calibrated, or not."""
+        job = plan_evaluate(model, self.split, self.data, self.references, self.kinds, self.protocol, self.output, calibration)
+        return FaultedJob(job, self.faults)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members that fit one batch, and what is to be done with them.
+
+    Args:
+        jobs: in the order of the pipeline.
+        evaluation: none if they are trained only.
+        force: stages to run although their artefacts are there.
+        label: what its members have in common, for people; the estimator and its variant if empty.
+        split: that members are calibrated on where they are trained only; none if they are not.
+    """
+
+    jobs: Sequence[TrainJob]
+    evaluation: Evaluation | None = None
+    force: frozenset[str] = frozenset()
+    label: str = ""
+    split: Split | None = None
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        seeds = [str(job.seed) for job in self.jobs]
+        label = self.label or self.jobs[0].plan.label.rsplit("-seed", 1)[0]
+        return f"{label} seed {seeds[0]}" if len(seeds) == 1 else f"{label} seeds {', '.join(seeds)}"
+
+    @property
+    def split_of_bands(self) -> Split | None:
+        """Whose validation range members are calibrated on."""
+        return self.split if self.evaluation is None else self.evaluation.split
+
+
+@dataclass(frozen=True)
+class Member:
+    """What became of one member: its model, its calibration and its evaluation, where they are there."""
+
+    job: TrainJob
+    model: Artefact | None = None
+    evaluation: Artefact | None = None
+    calibration: Artefact | None = None
+
+
+def existing(group: Group) -> list[Member]:
+    """What of a group is there already."""
+    members = []
+    for job in group.jobs:
+        model = None if "train" in group.force else find(job.plan)
+        calibration = _found_calibration(group, job, model)
+        members.append(Member(job, model, _found_evaluation(group, job, model, calibration), calibration))
+    return members
+
+
+def is_finished(group: Group, member: Member) -> bool:
+    """Whether nothing is left to do for a member."""
+    if member.model is None or (group.evaluation is not None and member.evaluation is None):
+        return False
+    return member.calibration is not None or calibration_job(group, member.job, member.model) is None
+
+
+def is_calibrated(group: Group) -> bool:
+    """Whether there is anything to calibrate the members of a group by."""
+    return group.split_of_bands is not None and bool(group.split_of_bands.validation)
+
+
+def drop_finished_checkpoint(job: TrainJob) -> None:
+    """Remove the checkpoint of a model that is there, which a killed process left; not while somebody trains it."""
+    if job.plan.checkpoint_folder.exists():
+        with held_at_once(job.plan.lock) as free:
+            if free:
+                drop_checkpoint(job.plan.checkpoint_folder)
+
+
+def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
+    """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+
+    What another process is making is taken from it once it is done; what nobody makes is made first.
+
+    On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
+    """
+    torch.set_num_threads(1)
+    with one_blas_thread():
+        return _run_group(group, should_stop, on_progress)
+
+
+def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
+    models = {member.job.plan.key: member.model for member in existing(group)}
+    forced = "train" in group.force
+    waiting = [job for job in group.jobs if models[job.plan.key] is None]
+    while waiting and not should_stop():
+        with _held(waiting, should_stop, on_progress) as jobs:
+            missing = []
+            for job in jobs:
+                if forced:
+                    drop_checkpoint(job.plan.checkpoint_folder)
+                else:
+                    models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
+                if models[job.plan.key] is None:
+                    missing.append(job)
+            for together in _together(missing):
+                if should_stop():
+                    break
+                for artefact in _train(together, should_stop, on_progress):
+                    models[artefact.key] = artefact
+        waiting = [job for job in waiting if job not in jobs]
+    members = []
+    for job in group.jobs:
+        model = models[job.plan.key]
+        calibration = evaluation = None
+        if model is not None and model.status == "complete" and not should_stop():
+            calibrating = calibration_job(group, job, model)
+            if calibrating is not None:
+                calibration = _calibrated(group, job, calibrating, should_stop, on_progress)
+            if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
+                evaluation = _evaluated(group, job, model, calibration, should_stop, on_progress)
+        members.append(Member(job, model, evaluation, calibration))
+    return members
+
+
+@contextmanager
+def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Iterator[list[TrainJob]]:
+    """Hold the locks of those trainings that nobody is at; where somebody is at all of them, wait for the first.
+
+    Whoever waits holds no other training, so that two processes never wait for each other.
+    """
+    with ExitStack() as stack:
+        free = [job for job in jobs if stack.enter_context(held_at_once(job.plan.lock))]
+        if not free and stack.enter_context(held(jobs[0].plan.lock, should_stop, say)):
+            free = [jobs[0]]
+        yield free
+
+
+def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
+    """Jobs that can go on together: those whose checkpoints, if any, stand at the same epoch."""
+    batches: dict[int, list[TrainJob]] = {}
+    for job in jobs:
+        batches.setdefault(resume_epoch(job.plan.checkpoint_folder), []).append(job)
+    return list(batches.values())
+
+
+def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Artefact]:
+    folders = [job.plan.checkpoint_folder for job in jobs]
+    context = FitContext(checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress)
+    artefacts = []
+    for job, (estimator, record) in zip(jobs, fit_jobs(jobs, context), strict=True):
+        if record.interrupted and not record.metrics.get("best_epoch", 1):
+            continue  # nothing learnt yet; the checkpoint knows where to go on
+
+        def write(folder: Path, job: TrainJob = job, estimator=estimator, record=record) -> Status:  # type: ignore[no-untyped-def]
+            write_model(job, estimator, record, folder)
+            return "interrupted" if record.interrupted else "complete"
+
+        artefacts.append(make(job.plan, write))
+        if not record.interrupted:
+            drop_checkpoint(job.plan.checkpoint_folder)
+    return artefacts
+
+
+def calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
+    """How a model is calibrated; none where it is not, or there is nothing to calibrate it by."""
+    split = group.split_of_bands
+    return None if split is None else plan_calibrate(model, split, job.data, job.plan.output)
+
+
+def _found_calibration(group: Group, job: TrainJob, model: Artefact | None) -> Artefact | None:
+    calibrating = None if model is None or STAGE in group.force else calibration_job(group, job, model)
+    return None if calibrating is None else find(calibrating.plan)
+
+
+def _calibrated(
+    group: Group, job: TrainJob, calibrating: CalibrateJob, should_stop: Callable[[], bool], say: Callable[[Waiting], None]
+) -> Artefact | None:
+    """The calibration of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
+    return _found_calibration(group, job, calibrating.model) or ensured(
+        calibrating.plan, lambda folder: write_calibration(calibrating, folder), STAGE in group.force, should_stop, say
+    )
+
+
+def _found_evaluation(group: Group, job: TrainJob, model: Artefact | None, calibration: Artefact | None) -> Artefact | None:
+    if model is None or group.evaluation is None or "evaluate" in group.force:
+        return None
+    if calibration is None and calibration_job(group, job, model) is not None:
+        return None
+    return find(group.evaluation.of(model, calibration).plan)
+
+
+def _evaluated(
+    group: Group,
+    job: TrainJob,
+    model: Artefact,
+    calibration: Artefact | None,
+    should_stop: Callable[[], bool],
+    say: Callable[[Waiting], None],
+) -> Artefact | None:
+    """The evaluation of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
+    assert group.evaluation is not None
+    scoring = group.evaluation.of(model, calibration)
+    return _found_evaluation(group, job, model, calibration) or ensured(
+        scoring.plan, lambda folder: write_faulted(scoring, folder), "evaluate" in group.force, should_stop, say
+    )

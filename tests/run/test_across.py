@@ -1,0 +1,156 @@
+"""Studies across folds and across vehicles, run from the command line on a small data set."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from place import Place, write_csv
+from vehest.data.store import read_estimate, read_recording
+from vehest.run.pipeline import read_pipeline
+
+PLAIN = ["estimator=zero,static_map,kinematic"]
+LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
+LACKING = ["estimator=kalman"]  # there is no steering angle
+
+
+@pytest.fixture
+def across(place) -> Place:
+    """A place with a split in three folds, two vehicles, and a pipeline of either kind."""
+    for seed, name in enumerate(("one", "two", "three"), 1):
+        write_csv(place.folder / "raw" / f"{name}.csv", seed, 60.0)
+    conf = place.folder / "conf" / "split"
+    (conf / "folded.yaml").write_text("name: folded\ndataset: mine\nfolds: {number: 3, of: recordings}\n")
+    for name, train, test in (("forth", "one", "three"), ("back", "three", "one")):
+        ranges = {"train": [{"recording": train}], "validation": [{"recording": "two"}], "tests": {"unseen": [{"recording": test}]}}
+        (conf / f"{name}.yaml").write_text(yaml.safe_dump({"name": name, "dataset": "mine", **ranges}))
+    folds = {"study": "folds_of_mine", "report": "folds", "split": "folded", "publish": True, "sweeps": [PLAIN, LUENBERGER]}
+    parts = {name: {"title": name, "split": name, "sweeps": [PLAIN, LUENBERGER, LACKING]} for name in ("forth", "back")}
+    vehicles = {"study": "vehicles", "report": "transfer", "parts": parts}
+    for study in (folds, vehicles):
+        (place.folder / "pipelines" / f"{study['study']}.yaml").write_text(yaml.safe_dump(study))
+    return place
+
+
+def rmse_by_hand(output: Path, models: str, protocol_skip: float = 1.5) -> float:
+    """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings [deg], with NumPy alone."""
+    errors = []
+    folders = sorted((output / "evaluate").glob(f"{models}-on-folded_fold_*"))
+    assert len(folders) == 3
+    for folder in folders:
+        estimate = read_estimate(folder / "test" / "0.parquet")
+        file = next((output / "downsample").glob("mine-20hz-*")) / f"{estimate.recording_id}.parquet"
+        recording = read_recording(file)
+        late = recording.time >= recording.start_time + protocol_skip - 1e-9
+        vy = estimate.held_at(recording.time[late], "vy")
+        truth = np.arctan2(recording["vy_ref"][late], recording["vx"][late])
+        errors.append(np.degrees(np.arctan2(vy, recording["vx"][late]) - truth))
+    return float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
+
+
+def test_errors_of_all_folds_count_together(across) -> None:
+    code, out, err = across("run", "folds_of_mine", "tracking=none", "output=out", "--json")
+    assert code == 0, err
+    rows = {row["title"]: row for row in json.loads(out)["overview"]}
+    assert len(rows) == 4
+    output = across.folder / "out"
+    for title, models in (("Luenberger", "luenberger-luenberger-seed0"), ("Static map", "static_map-static_map-seed0")):
+        row = rows[title]
+        assert row["rmse_sideslip"] == pytest.approx(rmse_by_hand(output, models), rel=1e-9)
+        assert row["rmse_sideslip_low"] < row["rmse_sideslip"] < row["rmse_sideslip_high"]
+        folds = [row[f"fold_{fold}"] for fold in (1, 2, 3)]
+        assert min(folds) <= row["rmse_sideslip"] <= max(folds)
+    report = (across.folder / "results" / "folds_of_mine" / "report.md").read_text(encoding="utf-8")
+    assert "all 3 folds (simulated data), each estimated by models that had not seen it" in report
+    metrics = pd.read_csv(across.folder / "results" / "folds_of_mine" / "metrics.csv")
+    assert {name.split("/")[1] for name in metrics["trained_on"].unique()} == {"fold_1", "fold_2", "fold_3"}
+    before = {file: file.read_bytes() for file in (across.folder / "results").rglob("*") if file.is_file()}
+    assert across("run", "folds_of_mine", "tracking=none", "output=out")[0] == 0
+    assert before == {file: file.read_bytes() for file in (across.folder / "results").rglob("*") if file.is_file()}
+
+
+def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> None:
+    code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
+    assert code == 5, err
+    assert "steer" in err
+    found = json.loads(out)
+    titles = [row["estimator"] for row in found["overview"]]
+    assert titles[:2] == ["Zero (v = 0)", "Static map"]
+    assert "Luenberger" in titles
+    assert any("kalman" in name for name in found["failed"])
+    report = next((across.folder / "out" / "report").glob("vehicles-*")) / "report.md"
+    text = report.read_text(encoding="utf-8")
+    assert "kalman" in text
+    assert "is left out" in text
+    board = pd.read_csv(report.parent / "tables" / "leaderboard_forth.csv")
+    assert math.isclose(board.loc[board["estimator"] == "zero", "rmse_sideslip"].item(), board["rmse_sideslip"].max(), rel_tol=0.2)
+
+
+def test_bands_and_faults_are_told_apart_by_car(across) -> None:
+    other = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
+    other = {**other, "name": "other", "vehicle": "another car"}
+    (across.folder / "conf" / "dataset" / "other.yaml").write_text(yaml.safe_dump(other, allow_unicode=True), encoding="utf-8")
+    split = yaml.safe_load((across.folder / "conf" / "split" / "back.yaml").read_text())
+    split["tests"] = {"unseen": [{"dataset": "other", "recording": "one"}]}
+    (across.folder / "conf" / "split" / "back.yaml").write_text(yaml.safe_dump({**split, "train": [{"recording": "three"}]}))
+    parts = {name: {"title": name, "split": name, "sweeps": [PLAIN, LUENBERGER]} for name in ("forth", "back")}
+    study = {"study": "trusted", "report": "trust", "parts": parts}
+    (across.folder / "pipelines" / "trusted.yaml").write_text(yaml.safe_dump(study))
+    code, out, err = across("run", "trusted", "tracking=none", "output=out", "--json")
+    assert code == 0, err
+    rows = json.loads(out)["overview"]
+    assert {row["where"] for row in rows} == {"forth, unseen"}
+    assert all(0.0 <= row["coverage_90"] <= 100.0 and row["width_90"] > 0.0 for row in rows)
+    folder = next((across.folder / "out" / "report").glob("trusted-*"))
+    elsewhere = pd.read_csv(folder / "tables" / "bands_elsewhere.csv")
+    assert set(elsewhere["title"]) == {"back"}
+    assert (elsewhere["without_widening"] <= elsewhere["coverage_90"]).all()
+    faults = pd.read_csv(folder / "tables" / "faults.csv")
+    assert set(faults["part"]) == {"forth"}, "faults are tried on the car that was learnt on"
+    assert set(faults["channel"]) == {"yaw_rate", "vx", "ay", "ax"}
+    assert faults.groupby(["fault", "channel"])["severity"].nunique().eq(3).all()
+    assert (faults.loc[faults["in_time"], "delay"] <= 2.0 * faults.loc[faults["in_time"], "oracle_delay"] + 0.5).all()
+    severe = faults[(faults["severity"] == "severe") & faults["fault"].isin(["bias", "nan", "inf", "huge"])]
+    assert severe["visible"].all()
+    assert severe["flagged"].mean() > 0.7
+
+
+def test_missing_files_are_said_before_anything_is_made(across) -> None:
+    dataset = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
+    elsewhere = {**dataset, "name": "elsewhere", "path": "${root}/elsewhere"}
+    (across.folder / "conf" / "dataset" / "elsewhere.yaml").write_text(yaml.safe_dump(elsewhere, allow_unicode=True), encoding="utf-8")
+    split = yaml.safe_load((across.folder / "conf" / "split" / "back.yaml").read_text())
+    (across.folder / "conf" / "split" / "back.yaml").write_text(yaml.safe_dump({**split, "dataset": "elsewhere"}))
+    code, out, err = across("run", "vehicles", "tracking=none", "output=out")
+    assert (code, out) == (4, "")
+    assert err.startswith("error: data set 'elsewhere': there is no folder")
+    assert len(err.strip().splitlines()) == 1
+    assert not (across.folder / "out" / "ingest").exists()
+
+
+def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
+    parts = read_pipeline("folds_of_mine").parts
+    assert [(part.name, part.overrides) for part in parts] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ({"report": "folds", "split": "mine", "sweeps": [PLAIN]}, "split 'mine' says no folds: {number: 5, of: laps}"),
+        ({"report": "drive", "parts": {"one": {"split": "mine", "sweeps": [PLAIN]}}}, "draws its report from split and sweeps"),
+        ({"report": "folds", "parts": {"one": {"split": "folded", "sweeps": [PLAIN]}}}, "split and sweeps, where the split has folds"),
+    ],
+    ids=str,
+)
+def test_a_report_that_does_not_suit_is_refused_in_one_line(across, content: dict[str, object], what: str) -> None:
+    (across.folder / "pipelines" / "odd.yaml").write_text(yaml.safe_dump({"study": "odd", **content}))
+    code, out, err = across("run", "odd")
+    assert (code, out) == (2, "")
+    assert what in err
+    assert len(err.strip().splitlines()) == 1

@@ -1,0 +1,149 @@
+"""Calibration as a stage: between training and evaluation, found by its model, and left out where there is nothing to calibrate by."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from place import Place
+from vehest.data.store import read_estimate
+from vehest.run.artefacts import read_artefact
+from vehest.run.calibrate import STAGE, calibration_of, trust_of
+from vehest.trust.bands import LEVELS
+from vehest.trust.record import About, Trust, write_trust
+
+TRAIN = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+
+
+def metrics_of(folder: Path) -> dict[tuple[str, str, str], dict[str, str]]:
+    """(test set, subset, metric) -> row."""
+    with open(folder / "metrics.csv", encoding="utf-8") as stream:
+        return {(row["test_set"], row["subset"], row["metric"]): row for row in csv.DictReader(stream) if row["condition"] == "nominal"}
+
+
+def without_validation(place: Place) -> None:
+    split = {"name": "blind", "dataset": "mine", "train": [], "validation": [], "tests": {"test": [{"recording": "three"}]}}
+    (place.folder / "conf" / "split" / "blind.yaml").write_text(yaml.safe_dump(split))
+
+
+@pytest.fixture
+def evaluated(place) -> tuple[Place, Path, Path]:
+    """A place, a model and its evaluation."""
+    _, out, err = place("train", *TRAIN, "--json")
+    assert "calibrate  luenberger-luenberger-seed0-trust bands by" in err
+    return place, Path(json.loads(out)["model"]), Path(json.loads(place("eval", *TRAIN, "--json")[1])["folder"])
+
+
+def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
+    place, model, evaluation = evaluated
+    outputs = place.folder / "outputs"
+    found = calibration_of(model, outputs)
+    assert [folder.name for folder in (outputs / STAGE).iterdir()] == [found.folder.name]
+    assert found.inputs["model"] == read_artefact(model).digest
+    assert read_artefact(evaluation).inputs["calibration"] == found.digest
+    trust = trust_of(model, outputs)
+    assert trust.bands.vehicles == ("my car",)
+    assert trust.bands.calibrated_on == ("two (all)",)
+    assert trust.bands.scaled_on == ("one (all)",)
+
+
+def test_estimates_hold_the_bands_of_the_calibration(evaluated):
+    place, model, evaluation = evaluated
+    estimate = read_estimate(evaluation / "test" / "0.parquet")
+    assert np.array_equal(np.isfinite(estimate["band_vy"]), np.isfinite(estimate["vy"]))
+    floors = trust_of(model, place.folder / "outputs").bands
+    which = LEVELS.index(0.9)
+    assert estimate["band_vy"].min() >= floors.vy.factors[which] * floors.vy.floor
+    assert estimate["band_sideslip"].max() <= math.pi
+
+
+def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleration(evaluated):
+    rows = metrics_of(evaluated[2])
+    for metric in ("coverage_50", "coverage_68", "coverage_90", "coverage_95"):
+        for suffix in ("", "_vy"):
+            row = rows["test", "all", metric + suffix]
+            assert 0.0 <= float(row["low"]) <= float(row["value"]) <= float(row["high"]) <= 1.0
+    shares = [float(rows["test", "all", f"coverage_{level}"]["value"]) for level in (50, 68, 90, 95)]
+    assert shares == sorted(shares)
+    assert float(rows["test", "all", "interval_score"]["value"]) >= float(rows["test", "all", "width_90"]["value"])
+    assert ("test", "ay_2_4", "coverage_90") in rows
+    assert ("validation", "all", "coverage_90") in rows
+
+
+def test_a_run_calibrates_each_model_once_and_shows_it(place):
+    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 0, err
+    assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == ["done"] * 4
+    [report] = (place.folder / "outputs" / "report").iterdir()
+    assert (report / "tables" / "bands_test.csv").is_file()
+    assert "reliability_test" in (report / "report.md").read_text()
+    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert {line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE} == {"skipped"}
+
+
+def test_a_calibration_that_is_gone_is_made_again_and_nothing_is_trained(evaluated):
+    place, model, evaluation = evaluated
+    found = calibration_of(model, place.folder / "outputs")
+    (found.folder / "trust.yaml").unlink()
+    before = (model / "manifest.json").stat().st_mtime_ns
+    code, out, err = place("eval", *TRAIN, "--json")
+    assert code == 0, err
+    assert json.loads(out) | {"skipped": True} == json.loads(out), "the same calibration leaves the evaluation up to date"
+    assert Path(json.loads(out)["folder"]) == evaluation
+    assert (model / "manifest.json").stat().st_mtime_ns == before
+
+
+def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_along(evaluated):
+    place, model, _ = evaluated
+    without_validation(place)
+    code, out, err = place("eval", "--model", str(model), "split=blind", "tracking=none", "--json")
+    assert code == 0, err
+    folder = Path(json.loads(out)["folder"])
+    assert read_artefact(folder).inputs["calibration"] == calibration_of(model, place.folder / "outputs").digest
+
+
+def test_bands_are_twice_as_wide_on_a_test_set_that_is_said_to_be_elsewhere(evaluated):
+    place, _, evaluation = evaluated
+    out = place("eval", *TRAIN, "evaluation.elsewhere='other, test'", "--json")[1]
+    here, there = (read_estimate(folder / "test" / "0.parquet") for folder in (evaluation, Path(json.loads(out)["folder"])))
+    np.testing.assert_allclose(there["band_vy"], 2.0 * here["band_vy"])
+
+
+def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place):
+    without_validation(place)
+    zero = ("estimator=zero", "split=blind", "tracking=none")
+    assert place("train", *zero)[0] == 0
+    code, out, err = place("eval", *zero, "--json")
+    assert code == 0
+    assert "note    calibrate  zero-zero-seed0 has no calibration, so its estimates have no bands" in err
+    folder = Path(json.loads(out)["folder"])
+    assert ("test", "all", "coverage_90") not in metrics_of(folder)
+    assert "band_vy" not in read_estimate(folder / "test" / "0.parquet").channels
+    assert not (place.folder / "outputs" / STAGE).exists()
+
+
+def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_have_seen_the_test(place):
+    split = {"name": "seen", "dataset": "mine", "train": [{"recording": "one"}], "validation": [{"recording": "three"}]}
+    split["tests"] = {"test": [{"recording": "two"}]}
+    (place.folder / "conf" / "split" / "seen.yaml").write_text(yaml.safe_dump(split))
+    without_validation(place)
+    model = json.loads(place("train", "estimator=zero", "split=seen", "tracking=none", "--json")[1])["model"]
+    assert calibration_of(Path(model), place.folder / "outputs") is not None
+    out = place("eval", "--model", model, "split=blind", "tracking=none", "--json")[1]
+    assert "calibration" not in read_artefact(Path(json.loads(out)["folder"])).inputs
+
+
+def test_trust_in_the_model_s_own_folder_comes_first(evaluated):
+    place, model, _ = evaluated
+    write_trust(Trust(About("luenberger", note="mine")), model)
+    assert trust_of(model, place.folder / "outputs").about.note == "mine"
+
+
+def test_a_folder_without_a_calibration_has_no_trust(tmp_path):
+    assert trust_of(tmp_path, tmp_path) is None

@@ -1,0 +1,639 @@
+"""The command line from end to end, on a small data set of its own: what runs, what is skipped, what is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+import yaml
+
+import vehest
+from conftest import planar_drive
+from place import DATASET, PIPELINE, Place, write_csv
+from vehest.data.files import ASIDE_PREFIX
+from vehest.data.store import read_recording
+from vehest.run import workshop
+from vehest.run.artefacts import read_artefact
+from vehest.run.signals import TimeLimit
+from vehest.trust.verdict import reason_in_words
+
+
+def _statuses(err: str) -> list[tuple[str, str]]:
+    return [tuple(line.split()[:2]) for line in err.splitlines() if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")]  # type: ignore[misc]
+
+
+def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
+    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 0, err
+    assert "KS-NN linear no bias, P = 2" in out
+    assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
+    made = place.files()
+
+    code, again, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert {status for status, _ in _statuses(err)} == {"skipped"}
+    assert again == out
+    assert place.files() == made
+
+    (place.folder / "README.md").write_text("changed")
+    dataset = {**DATASET, "citation": "somebody else", "licence": "another"}
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
+    _, _, err = place("run", "small", "tracking=none", "--dry-run")
+    assert {status for status, _ in _statuses(err)} == {"skipped"}
+
+    _, _, err = place("run", "small", "--jobs", "1", "tracking=none", "training.learning_rate=0.002")
+    done = [line for line in err.splitlines() if line.startswith("done")]
+    assert not any("luenberger" in line for line in done), "its training has no learning rate"
+    assert sum(" train " in line for line in done) == 3
+    assert not any(" ingest " in line or " downsample " in line for line in done)
+
+
+def test_dry_run_tells_and_makes_nothing(place):
+    code, _, err = place("run", "small", "--dry-run")
+    assert code == 0
+    assert ("would", "ingest") in _statuses(err)
+    assert place.files() == set()
+
+
+def test_two_processes_give_the_same_numbers_as_one(place):
+    place("run", "small", "--jobs", "1", "tracking=none", "output=one")
+    code, _, err = place("run", "small", "--jobs", "2", "tracking=none", "output=two")
+    assert code == 0, err
+    for model in (place.folder / "one" / "train").iterdir():
+        other = place.folder / "two" / "train" / model.name
+        assert (model / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
+
+
+def test_a_failed_job_is_reported_and_the_others_are_kept(place):
+    sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
+    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 5
+    assert "1 of 4 groups of jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert "Traceback" not in err
+    kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
+    assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}
+    assert "GRU, 2 states" in out
+    assert "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss" in out
+    (report,) = (place.folder / "outputs").glob("report/*/report.md")
+    assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
+    assert not (place.folder / "results").exists()
+
+
+def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
+    code, _, err = place("run", "small", "tracking=none")
+    assert code == 0, err
+    shutil.rmtree(next((place.folder / "outputs" / "train").glob("gru-*")))
+    code, out, err = place("report", "small", "tracking=none", "--json")
+    assert code == 5
+    assert "run 'vehest run" in err
+    drawn = json.loads(out)
+    assert {row["estimator"] for row in drawn["leaderboard"]} == {"luenberger", "ksnn"}
+    ((name, reason),) = drawn["failed"].items()
+    assert name.startswith("gru-states_2")
+    assert "has not been trained and evaluated" in reason
+
+
+def test_train_eval_estimate_report_one_by_one(place):
+    arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
+    code, out, err = place("train", *arguments, "--json")
+    assert code == 0, err
+    trained = json.loads(out)
+    assert trained["status"] == "complete"
+    assert trained["n_parameters"] == 28
+    assert json.loads(place("train", *arguments, "--json")[1])["skipped"] is True
+    assert json.loads(place("train", *arguments, "--json", "--force")[1])["skipped"] is False
+
+    code, out, err = place("eval", *arguments, "--json")
+    assert code == 0, err
+    by_overrides = json.loads(out)
+    name = Path(trained["model"]).name
+    code, out, err = place("eval", "--model", name, "split=mine", "tracking=none", "--json")
+    assert code == 0, err
+    assert json.loads(out)["rmse_sideslip.test"] == by_overrides["rmse_sideslip.test"]
+
+    table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
+    table.to_csv(place.folder / "lap.csv", index=False)
+    (place.folder / "conf" / "dataset" / "lap.yaml").write_text(
+        yaml.safe_dump(
+            {**DATASET, "name": "lap", "channels": {k: v for k, v in DATASET["channels"].items() if k != "vy_ref"}}, allow_unicode=True
+        )
+    )
+    for suffix in (".parquet", ".csv"):
+        code, out, err = place("estimate", name, "lap.csv", "dataset=lap", "-o", f"out{suffix}", "--json")
+        assert code == 0, err
+        assert json.loads(out)["estimated"] == 600 - 30
+    frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
+    assert list(frame.columns) == ["time", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"]
+    for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
+        assert np.allclose(frame[column], text[column], equal_nan=True), column
+    assert [reason_in_words(code) for code in frame["health_reason"]] == text["health_reason"].fillna("").tolist()
+
+    model = vehest.load_model(trained["model"])
+    estimate = vehest.estimate(model, vehest.read_recording("lap.csv", ["dataset=lap"]))
+    vehest.write_estimate(estimate, "api.parquet")
+    assert np.array_equal(estimate["vy"], frame["vy"], equal_nan=True)
+
+
+def test_report_draws_what_is_there_and_asks_for_what_is_not(place):
+    code, line = place.refused("report", "small", "tracking=none")
+    assert code == 4
+    assert "run 'vehest run" in line
+    place("run", "small", "--jobs", "1", "tracking=none")
+    code, out, err = place("report", "small", "tracking=none", "--json")
+    assert code == 0, err
+    assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
+    metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
+    assert list(metrics.columns[:6]) == ["study", "estimator", "variant", "trained_on", "dataset", "kind"]
+    assert set(metrics["kind"]) == {"simulated"}
+    assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs"} <= set(metrics["metric"])
+    assert not any("seconds" in metric for metric in set(metrics["metric"]))
+
+
+def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
+    code, out, err = place("ingest", "mine", "--json")
+    assert code == 0, err
+    recording = read_recording(Path(json.loads(out)["folder"]) / "one.parquet")
+    truth = planar_drive(30.0, 100.0, seed=1, noise=0.02)
+    for name in ("vx", "yaw_rate", "ay", "ax", "vy_ref"):
+        assert np.allclose(recording[name], truth[name], rtol=0, atol=1e-9), name
+    code, out, err = place("downsample", "mine", "rate_hz=20", "--json")
+    assert code == 0, err
+    assert read_recording(Path(json.loads(out)["folder"]) / "one.parquet").rate_hz == 20.0
+
+
+def test_data_commands_list_show_and_check(place):
+    rows = json.loads(place("data", "list", "--json")[1])
+    assert {"mine", "ferrari_250lm", "sim_quickstart"} <= {row["dataset"] for row in rows}
+    assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
+    assert all(row["licence"] and row["citation"] for row in rows)
+    assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
+    shown = json.loads(place("data", "show", "mine", "--json")[1])
+    assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
+    assert shown["recordings"][0]["rate_hz"] == 100.0
+    code, out, _ = place("data", "check", "mine")
+    assert code == 0
+    assert "follows ay - vx·yaw_rate" in out
+    assert "yaw_rate" in place("data", "channels")[1]
+    assert "one: simulated" in place("data", "show", "mine")[1]
+    frame = pd.DataFrame({"time": 1672875115.4 + np.arange(100) / 100.0, "vx": np.linspace(20.0, 21.0, 100)})
+    frame.to_csv(place.folder / "unix.csv", index=False)
+    assert "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples" in place("data", "show", "unix.csv")[1]
+
+
+def test_check_reports_a_reference_that_points_the_wrong_way(place):
+    (place.folder / "conf" / "dataset" / "mirrored.yaml").write_text(
+        yaml.safe_dump(
+            {**DATASET, "channels": {**DATASET["channels"], "vy_ref": {"column": "Vy", "unit": "m/s", "sign": -1}}}, allow_unicode=True
+        )
+    )
+    code, out, _ = place("data", "check", "mirrored")
+    assert code == 0
+    assert "d(vy_ref)/dt and ay - vx·yaw_rate disagree in sign" in out
+
+
+def test_config_prints_what_a_command_would_use(place):
+    shown = yaml.safe_load(place("config", "train", "estimator=lstm", "seed=4")[1])
+    assert shown["estimator"]["name"] == "lstm"
+    assert shown["seed"] == 4
+    assert json.loads(place("config", "ingest", "dataset=mine", "--json")[1])["dataset"]["source"] == "tabular"
+
+
+def test_doctor_finds_this_machine_fit(place):
+    code, out, _ = place("doctor", "--json")
+    assert code == 0
+    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
+
+
+def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "gtsam" else find(name, *rest) or find("vehest"))
+    code, out, _ = place("doctor", "--json")
+    assert code == 0
+    (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
+    assert (extras["level"], extras["message"]) == (
+        "warning",
+        "factor graphs need 'vehest[factor-graph]': pip install it where you need it",
+    )
+
+
+def test_help_shows_choices_and_answers_quickly(place):
+    _, out, _ = place("train", "--help")
+    assert "luenberger" in out
+    assert "ferrari_drive" in out
+    code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
+    code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
+
+
+# --- input that cannot be used -------------------------------------------------------------------------------------
+
+
+def _rewrite(place: Place, change) -> None:
+    path = place.folder / "raw" / "one.csv"
+    table = pd.read_csv(path)
+    change(table).to_csv(path, index=False)
+
+
+def _with(column, row, value):
+    def change(table):
+        table = table.astype({column: object})
+        table.loc[row, column] = value
+        return table
+
+    return change
+
+
+BAD_TABLES = {
+    "missing column": (lambda t: t.drop(columns="Yaw"), r"has no column 'Yaw' \(it has Time, Speed"),
+    "NaN": (_with("LatAcc", 500, np.nan), r"one\.csv.*channel 'ay' holds 1 NaN between 5 s and 5 s"),
+    "text": (_with("Speed", 41, "fast"), r"one\.csv': column 'Speed' holds the text 'fast' in data row 42"),
+    "repeated time": (_with("Time", 10, 0.09), r"one\.csv': time repeats 1 times, first at sample 10"),
+    "backward time": (_with("Time", 10, 0.05), r"one\.csv': time goes backwards 1 times"),
+    "gap": (lambda t: t.drop(index=range(100, 200)), r"one\.csv': 1 gaps, the longest of 1\.01 s after 0\.99 s.*clock: interpolate"),
+    "header only": (lambda t: t.iloc[:0], r"one\.csv' has a header and no rows"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD_TABLES)
+def test_bad_tables_are_one_clear_line(place, fault):
+    import re
+
+    change, message = BAD_TABLES[fault]
+    _rewrite(place, change)
+    for command in (("ingest", "mine"), ("train", "split=mine", "tracking=none"), ("run", "small", "tracking=none")):
+        code, line = place.refused(*command)
+        assert code in (3, 4)
+        assert re.search(message, line), line
+    assert place.files() == set()
+
+
+def test_degrees_taken_as_radians_are_one_clear_line(place):
+    content = yaml.safe_load((place.folder / "conf" / "dataset" / "mine.yaml").read_text())
+    content["channels"]["yaw_rate"]["unit"] = "rad/s"
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+    code, line = place.refused("ingest", "mine")
+    assert code == 3
+    assert "recording 'one': channel 'yaw_rate'" in line
+    assert "degrees" in line
+    assert place.files() == set()
+    code, out, _ = place("data", "check", "mine")
+    assert code == 3
+    assert "degrees" in out
+
+
+def test_empty_and_truncated_files_are_one_clear_line(place):
+    path = place.folder / "raw" / "one.csv"
+    pd.read_csv(path).to_parquet(place.folder / "raw" / "one.parquet")
+    path.write_text("")
+    assert "one.csv' is empty" in place.refused("ingest", "mine")[1]
+    whole = (place.folder / "raw" / "one.parquet").read_bytes()
+    (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
+    code, line = place.refused("ingest", "mine", "dataset.files=one.parquet")
+    assert code == 3
+    assert "one.parquet' is truncated or damaged" in line
+    assert "truncated" in line
+
+
+def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place, monkeypatch):
+    code, line = place.refused("ingest", "mine", "root=/no/such/folder")
+    assert code == 4
+    assert "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA" in line
+    assert place.refused("ingest", "mine", "dataset.colour=red")[0] == 2
+    assert "choices" in place.refused("train", "estimator=transformer")[1]
+    assert "unknown option 'estimator.depth'" in place.refused("train", "estimator.depth=3")[1]
+    assert place.refused("eval", "split=mine", "tracking=none")[0] == 4
+    assert place.refused("estimate", "nothing", "lap.csv")[0] == 4
+    assert "has no recording 'four'" in place.refused("train", "split=mine", "split.train=[{recording: four}]", "tracking=none")[1]
+    overlapping = "split.tests.test=[{recording: one, start: 5, stop: 10}]"
+    assert "share samples of recording 'one'" in place.refused("train", "split=mine", overlapping, "tracking=none")[1]
+    monkeypatch.delenv("VEHEST_DATA")
+    code, line = place.refused("ingest", "mine")
+    assert code == 4
+    assert "no data root is set" in line
+
+
+def test_estimate_refuses_a_recording_it_cannot_use(place):
+    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    drive = planar_drive(10.0, 20.0).without_references()
+    slow = pd.DataFrame({"time": drive.time, **drive.channels})
+    slow.to_csv("slow.csv", index=False)
+    assert "below the 100 Hz" in place.refused("estimate", "luenberger", "slow.csv", "-o", "out.parquet")[1]
+    slow.drop(columns="ax").to_csv("less.csv", index=False)
+    assert "no channel 'ax'" in place.refused("estimate", "luenberger", "less.csv", "-o", "out.parquet")[1]
+    assert "must end in .parquet or .csv" in place.refused("estimate", "luenberger", "slow.csv", "-o", "out.xlsx")[1]
+    assert not Path("out.parquet").exists()
+
+
+def test_truncated_artefact_is_made_again(place):
+    arguments = ("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")
+    model = Path(json.loads(place(*arguments)[1])["model"])
+    weights = model / "model.safetensors"
+    whole = weights.read_bytes()
+    weights.write_bytes(whole[:50])
+    code, out, _ = place(*arguments)
+    assert code == 0
+    assert json.loads(out)["skipped"] is False
+    assert weights.read_bytes() == whole
+
+
+def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(place, monkeypatch):
+    outputs = place.folder / "outputs"
+
+    class OneEvaluation(TimeLimit):
+        """A time that is up once one evaluation is there."""
+
+        def requested(self) -> bool:
+            return any((outputs / "evaluate").glob("*/manifest.json"))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(workshop, "TimeLimit", OneEvaluation)
+        code, out, err = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+    assert code == 0, err
+    assert "Luenberger" in out
+    assert "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on" in out
+    code, out, _ = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+    assert code == 0
+    assert "not done yet" not in out
+    assert "GRU" in out
+
+
+def test_a_time_in_which_nothing_can_be_done_is_said(place):
+    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none", "--minutes", "0.000001")
+    assert code == 3
+    assert "no estimator was done in this time; the same command goes on with: luenberger-luenberger-seed0" in line
+    assert place.refused("run", "small", "--minutes", "0")[1] == "error: --minutes must be positive, not 0"
+
+
+# --- what must not happen by accident -----------------------------------------------------------------------------
+
+
+def test_only_the_study_as_it_is_written_is_published(place):
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True}))
+    results = place.folder / "results" / "small"
+    assert place("run", "small", "--jobs", "1", "tracking=none", "training.max_epochs=1")[0] == 0
+    assert not results.exists(), "overrides changed the outcome"
+    assert place("run", "small", "--jobs", "1", "tracking=none")[0] == 0
+    assert (results / "metrics.csv").is_file()
+    assert not (results / "report.html").exists()
+    text = (results / "report.md").read_text()
+    assert "`vehest run pipelines/small.yaml`" in text
+    assert str(place.folder) not in text + (results / "provenance.json").read_text()
+    (results / "metrics.csv").unlink()
+    (results / "provenance.json").unlink()
+    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 2
+    assert "holds files that vehest did not publish" in line
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"study": "../elsewhere"}, "becomes part of file names"),
+        ({"study": ""}, "becomes part of file names"),
+        ({"sweeps": [["estimator=gru"], ["estimator=lstm", "evaluation.rate_hz=10"]]}, "must agree in 'evaluation'"),
+        ({"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]}, "two jobs are both called gru-states_5-seed0"),
+    ],
+)
+def test_pipelines_that_would_mix_or_lose_results_are_refused(place, change, message):
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, **change}))
+    code, line = place.refused("run", "small", "tracking=none")
+    assert code == 2
+    assert message in line
+
+
+@pytest.mark.parametrize(
+    ("tests", "message"),
+    [
+        ({"validation": [{"recording": "three"}]}, "a test set cannot be called 'validation'"),
+        ({"../x": [{"recording": "three"}]}, "becomes part of file names"),
+        ({"t": []}, "test set 't' is empty"),
+    ],
+)
+def test_splits_that_would_mix_test_and_validation_are_refused(place, tests, message):
+    file = place.folder / "conf" / "split" / "mine.yaml"
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "tests": tests}))
+    code, line = place.refused("train", "split=mine", "tracking=none")
+    assert code == 2
+    assert message in line
+
+
+def test_a_model_is_not_tested_on_what_it_learnt_from(place):
+    model = json.loads(place("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
+    swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
+    code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
+    assert code == 2
+    assert "shares samples with what" in line
+
+
+def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
+    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    drive = planar_drive(10.0, 100.0).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    Path("parts.parquet").mkdir()
+    Path("parts.parquet/part").write_text("keep")
+    assert "is a folder" in place.refused("estimate", "luenberger", "lap.csv", "-o", "parts.parquet")[1]
+    assert Path("parts.parquet/part").read_text() == "keep"
+    assert "is the recording itself" in place.refused("estimate", "luenberger", "lap.csv", "-o", "lap.csv")[1]
+
+
+def test_a_model_remembers_how_its_recordings_were_prepared(place):
+    arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
+    filtered = (*arguments, "downsample.transforms=[{name: low_pass, cutoff_hz: 0.3}]")
+    model = json.loads(place("train", *filtered, "--json")[1])["model"]
+    by_overrides = json.loads(place("eval", *filtered, "--json")[1])
+    by_name = json.loads(place("eval", "--model", model, *arguments, "--json")[1])
+    assert by_name["folder"] == by_overrides["folder"]
+    unfiltered = json.loads(place("eval", "--model", model, *arguments, "downsample.transforms=[]", "--json")[1])
+    assert unfiltered["rmse_sideslip.test"] != by_name["rmse_sideslip.test"]
+    references = {json.dumps(read_artefact(Path(outcome["folder"])).inputs["reference of mine/three"]) for outcome in (by_name, unfiltered)}
+    assert len(references) == 1, "what is scored against is never filtered"
+
+
+def test_force_trains_from_the_start_again(place):
+    process = _start(place, "train", *LONG)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 300)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    reached = _checkpoint_epoch(place)
+    assert reached >= 300, "so many that the second training cannot pass them unseen"
+    process = _start(place, "train", *LONG, "--force")
+    _wait_for(process, lambda: 0 < _checkpoint_epoch(place) < reached)
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "output=null"),
+        ("train", "output=''"),
+        ("train", "seed=-1"),
+        ("train", "seed=1.5"),
+        ("train", "training.max_epochs=.inf"),
+        ("train", "estimator.rate_hz=abc"),
+        ("train", "estimator.rate_hz=200"),
+        ("train", "downsample.transforms=[1]"),
+        ("run", "small", "evaluation.rate_hz=abc"),
+        ("run", "small", "split=quickstart"),
+        ("downsample", "mine"),
+    ],
+)
+def test_odd_values_are_refused_in_one_line(place, arguments):
+    split = ("split=mine", "tracking=none") if arguments[0] == "train" else ()
+    code, line = place.refused(*arguments, *split)
+    assert code in (2, 3), line
+    assert "defect" not in line
+    assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
+
+
+# --- signals, kills and full disks -----------------------------------------------------------------------------------
+
+LONG = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none", "split=mine")
+
+
+def _start(place: Place, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "vehest", *arguments], cwd=place.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def _wait_for(process: subprocess.Popen[str], condition, seconds: float = 90.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.02)
+
+
+def _checkpoint_epoch(place: Place) -> int:
+    from vehest.training.checkpoints import resume_epoch
+
+    return max((resume_epoch(folder) for folder in (place.folder / "outputs" / "checkpoints").glob("*")), default=0)
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(place, number, code):
+    process = _start(place, "train", *LONG)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == code, err
+    assert "the best so far is kept in" in err
+    (model,) = (place.folder / "outputs" / "train").iterdir()
+    assert read_artefact(model).status == "interrupted"
+    assert not any(ASIDE_PREFIX in name for name in place.files())
+    reached = _checkpoint_epoch(place)
+    process = _start(place, "train", *LONG)
+    seen = [reached]
+
+    def went_on() -> bool:
+        seen.append(_checkpoint_epoch(place))
+        return seen[-1] > reached
+
+    _wait_for(process, went_on)
+    process.kill()
+    process.communicate()
+    assert min(seen) == reached, "it must go on from the checkpoint, not from the start"
+
+
+def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place):
+    budget = ("split=mine", "training.max_epochs=400", "training.patience=400", "training.checkpoint_seconds=0", "tracking=none", "--json")
+    process = _start(place, "train", *budget)
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
+    process.kill()
+    process.communicate()
+    assert not list((place.folder / "outputs").glob("train/[!.]*"))
+    code, out, err = place("train", *budget)
+    assert code == 0, err
+    resumed = json.loads(out)
+    code, out, err = place("train", *budget, "output=undisturbed")
+    whole = json.loads(out)
+    assert resumed["epochs"] == whole["epochs"] == 400
+    weights = [(Path(model) / "model.safetensors").read_bytes() for model in (resumed["model"], whole["model"])]
+    assert weights[0] == weights[1]
+    assert not any("checkpoint" in name for name in place.files())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, number):
+    for seed in range(40):
+        write_csv(place.folder / "raw" / f"more_{seed}.csv", seed, 60.0)
+    process = _start(place, "ingest", "mine")
+    _wait_for(process, lambda: len(list((place.folder / "outputs" / "ingest").glob(f"{ASIDE_PREFIX}*/*.parquet"))) > 2)
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == (143 if number == signal.SIGTERM else -signal.SIGKILL), err
+    assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
+    if number == signal.SIGTERM:
+        assert not any(ASIDE_PREFIX in name for name in place.files())
+    code, out, err = place("ingest", "mine", "--json")
+    assert code == 0, err
+    assert len(json.loads(out)["recordings"]) == 43
+    assert not any(ASIDE_PREFIX in name for name in place.files()), "what the killed run left is cleared away"
+
+
+def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
+    process = _start(place, "run", "small", "--jobs", "2", *LONG[:4])
+    _wait_for(process, lambda: _checkpoint_epoch(place) >= 2)
+    children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+    assert children
+    process.kill()
+    process.communicate()
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2] for pid in children):
+        assert time.monotonic() < deadline, "workers must end with their parent"
+        time.sleep(0.1)
+    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    assert code == 0, err
+
+
+def _limited(place: Place, limit: int, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run a command whose files may not grow beyond ``limit`` bytes: every larger write fails as on a full disk."""
+    program = (
+        f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.argv = {['vehest', *arguments]!r}\n"
+    )
+    program += "from vehest.cli import main\nmain()"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(place.folder / "numba")}
+    return subprocess.run([sys.executable, "-c", program], cwd=place.folder, capture_output=True, text=True, timeout=120, env=environment)
+
+
+def test_a_full_disk_in_ingest_and_train_is_one_line_and_leaves_nothing(place):
+    result = _limited(place, 10_000, "ingest", "mine")
+    assert result.returncode == 4
+    assert result.stderr.startswith("error: no room left to write")
+    assert place.files() == set()
+    assert place("ingest", "mine")[0] == 0
+    assert place("downsample", "mine", "rate_hz=20")[0] == 0
+    before = place.files()
+    result = _limited(place, 400, "train", "split=mine", "training.max_epochs=1", "training.compiled=false", "tracking=none")
+    assert result.returncode == 4, result.stderr
+    assert "no room left to write" in result.stderr.splitlines()[-1]
+    assert place.files() == before
+    assert place("train", "split=mine", "training.max_epochs=1", "tracking=none")[0] == 0
+
+
+def test_a_really_full_disk_is_one_line_and_leaves_nothing(place):
+    disk = place.folder / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=120k", "tmpfs", str(disk)], capture_output=True)
+    if mounted.returncode:
+        pytest.skip("a small file system cannot be mounted here (needs root)")
+    try:
+        code, line = place.refused("ingest", "mine", f"output={disk}")
+        assert code == 4
+        assert "no room left to write" in line
+        assert list(disk.rglob("*.parquet")) == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

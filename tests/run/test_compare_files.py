@@ -1,0 +1,101 @@
+"""Estimates made elsewhere stand beside each other, v = 0 and a static map on one recording."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from conftest import planar_drive
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.run.compare_files import compare_estimates, read_estimate_table
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    return planar_drive(120.0, 50.0, seed=3)
+
+
+def written(folder, name: str, drive: Recording, error: float, **columns: np.ndarray):
+    rng = np.random.default_rng(1)
+    table = {"time": drive.time, "vy": drive["vy_ref"] + error * np.sin(2.0 * drive.time + rng.uniform(0, 6.0))}
+    file = folder / f"{name}.csv"
+    pd.DataFrame(table | columns).to_csv(file, index=False)
+    return file
+
+
+def test_errors_are_those_that_were_put_in(drive, tmp_path):
+    file = written(tmp_path, "mine", drive, 0.2)
+    found = compare_estimates(drive, {"mine": read_estimate_table(file, drive)})
+    row = next(row for row in found.rows if row["estimate"] == "mine")
+    assert row["rmse_vy"] == pytest.approx(0.2 / math.sqrt(2.0), rel=0.05)
+    assert found.stop - found.start == pytest.approx(120.0, abs=0.2)
+
+
+def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_path):
+    vy = drive["vy_ref"] + 0.1
+    beta = np.degrees(np.arctan2(vy, drive["vx"]))
+    pd.DataFrame({"Time [s]": drive.time, "Beta [deg]": beta}).to_csv(tmp_path / "angle.csv", index=False)
+    pd.DataFrame({"t": drive.time, "V_y": vy}).to_csv(tmp_path / "speed.csv", index=False)
+    angle, speed = (read_estimate_table(tmp_path / f"{name}.csv", drive) for name in ("angle", "speed"))
+    assert angle["vy"] == pytest.approx(speed["vy"], abs=1e-9)
+
+
+def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):
+    estimates = {name: read_estimate_table(written(tmp_path, name, drive, size), drive) for name, size in (("good", 0.01), ("bad", 0.6))}
+    found = compare_estimates(drive, estimates)
+    assert found.rows[0]["estimate"] == "good"
+    assert {row["estimate"] for row in found.rows} == {"good", "bad", "zero", "static_map"}
+    assert "On this recording good has the lowest sideslip error" in found.verdict
+    alike = compare_estimates(drive, {"one": estimates["good"], "other": estimates["good"]})
+    assert "no estimator can be called best" in alike.verdict
+
+
+def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
+    """With lateral velocity turned in the second half, a map of the other half is wrong in both."""
+    turned = np.where(drive.time < drive.start_time + 60.0, drive["vy_ref"], -drive["vy_ref"])
+    other = Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, {**drive.channels, "vy_ref": turned})
+    estimate = read_back(other)
+    rows = {row["estimate"]: row["rmse_vy"] for row in compare_estimates(other, {"true": estimate}).rows}
+    assert rows["static_map"] > rows["zero"] > rows["true"]
+
+
+def read_back(drive: Recording):
+    from vehest.data.estimate import Estimate
+
+    return Estimate(drive.id, "true", drive.rate_hz, drive.start_time, {"vy": drive["vy_ref"], "sideslip": np.zeros(len(drive))})
+
+
+def test_other_clocks_and_gaps_are_refused_with_the_file_that_has_them(drive, tmp_path):
+    late = written(tmp_path, "late", drive, 0.1, time=drive.time + 1.7e9)
+    with pytest.raises(DataError, match=r"'late' goes from .* are the clocks the same"):
+        compare_estimates(drive, {"late": read_estimate_table(late, drive)})
+    with pytest.raises(DataError, match=r"has no column vy \[m/s\]"):
+        read_estimate_table(written(tmp_path, "none", drive, 0.1).rename(tmp_path / "x.csv") and _without(tmp_path / "x.csv"), drive)
+
+
+def _without(file):
+    pd.read_csv(file)[["time"]].assign(other=1.0).to_csv(file, index=False)
+    return file
+
+
+def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):
+    table = pd.read_csv(place.folder / "raw" / "three.csv")
+    pd.DataFrame({"time": table["Time"], "vy": table["Vy"] + 0.1}).to_csv(tmp_path / "mine.csv", index=False)
+    assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "tracking=none")[0] == 0
+    raw = str(place.folder / "raw")
+    code, out, err = place(
+        "compare", f"{raw}/three.csv", str(tmp_path / "mine.csv"), "dataset=mine", "-m", "luenberger", "-m", "pretrained", "--json"
+    )
+    assert code == 0, err
+    rows = {row["estimate"] for row in json.loads(out)["rows"]}
+    assert rows == {"mine", "luenberger", "pretrained", "zero", "static_map"}
+    assert "learnt on this recording" not in err
+    code, out, err = place("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
+    assert code == 0
+    assert "warning: 'luenberger' learnt on this recording: its row is no test" in err
+    assert place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1] == "error: name at least one estimate to compare"

@@ -1,0 +1,180 @@
+"""Configuration: overrides, choices, sweeps, local files first, errors of one line, completion."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vehest.data.errors import ConfigurationError, MissingError
+from vehest.run.completion import complete_override
+from vehest.run.config import compose_config, expand
+from vehest.run.config_files import choices
+from vehest.run.pipeline import pipeline_configs, read_pipeline
+
+
+@pytest.fixture
+def elsewhere(tmp_path, monkeypatch) -> Path:
+    """An empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_estimator_chooses_its_training_and_the_user_may_choose_another(elsewhere):
+    assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
+    assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
+    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
+
+
+def test_every_estimator_and_split_composes(elsewhere):
+    estimators, splits = choices("estimator"), choices("split")
+    for at in range(max(len(estimators), len(splits))):
+        estimator, split = estimators[at % len(estimators)], splits[at % len(splits)]
+        config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])
+        assert config["estimator"]["name"] == estimator
+        assert config["split"]["name"] == split
+
+
+def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
+    (elsewhere / "conf" / "estimator").mkdir(parents=True)
+    (elsewhere / "conf" / "estimator" / "gru.yaml").write_text("name: gru\nrate_hz: 20\nwindow: 10\nn_states: 3\n")
+    (elsewhere / "conf" / "estimator" / "mine.yaml").write_text("# My own.\nname: ksnn\nn_local: 4\n")
+    assert compose_config("train", ["estimator=gru"])["estimator"]["window"] == 10
+    assert compose_config("train", ["estimator=mine"])["estimator"]["n_local"] == 4
+    assert compose_config("train", ["estimator=lstm"])["estimator"]["window"] == 30
+    assert {"mine", "gru", "luenberger"} <= set(choices("estimator"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, "),
+        (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
+        (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
+        (["colour=red"], "unknown option 'colour'"),
+        (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),
+        (["quickly"], "'quickly' is not an override; write key=value"),
+        (["seed=1,2"], "names several values"),
+    ],
+)
+def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        compose_config("train", overrides)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_choice_names_the_choices(elsewhere):
+    with pytest.raises(ConfigurationError, match=r"say which dataset: dataset=… \(choices: .*tabular"):
+        compose_config("ingest")
+
+
+def test_sweeps_expand_to_every_combination():
+    jobs = expand(["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"])
+    assert len(jobs) == 12
+    assert jobs[0] == ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"]
+    assert len({tuple(job) for job in jobs}) == 12
+
+
+def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
+    configs = pipeline_configs(read_pipeline("ferrari_drive"), [])[""]
+    names = [config["estimator"]["name"] for config in configs]
+    baselines = {"zero": 1, "kinematic": 1, "data_sheet": 1, "static_map": 1}
+    assert {name: names.count(name) for name in set(names)} == {**baselines, "luenberger": 1, "ksnn": 20, "gru": 5, "lstm": 5}
+    assert all(config["evaluation"]["rate_hz"] == 20 for config in configs)
+    assert [span["start"] for span in configs[0]["split"]["train"]] == [150]
+
+
+SHIPPED = {file.stem for file in (Path(__file__).parents[2] / "pipelines").glob("*.yaml")}
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED - {"ksnn", "ksnn_revs"}))  # these two: test_parts
+def test_first_and_last_job_of_every_sweep_of_shipped_pipelines_compose(elsewhere, name):
+    pipeline = read_pipeline(name)
+    if pipeline.datasets:
+        assert pipeline_configs(pipeline, [])
+    ends = {(part.split, *job) for part in pipeline.parts for sweep in part.sweeps for job in (expand(sweep)[0], expand(sweep)[-1])}
+    for split, *job in sorted(ends):
+        assert compose_config("eval", [f"split={split}", *pipeline.evaluation, *job])["split"]["name"] == split
+
+
+def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
+    configs = pipeline_configs(read_pipeline("quickstart"), ["training.learning_rate=0.01"])[""]
+    rates = {config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs}
+    fitted_otherwise = dict.fromkeys(("zero", "kinematic", "data_sheet", "static_map", "luenberger"))
+    assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
+    seeds = [c["seed"] for c in pipeline_configs(read_pipeline("quickstart"), ["seed=7"])[""]]
+    assert set(seeds) == {7}
+    with pytest.raises(ConfigurationError, match=r"suits no sweep"):
+        pipeline_configs(read_pipeline("quickstart"), ["training.momentum=0.9"])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("study: x\n", "it needs study, report and one of: split and sweeps"),
+        ("[1, 2", "cannot be read"),
+        ("study: x\nreport: drive\nsplit: quickstart\nsweeps: [estimator=gru]\n", r"sweeps\.0 must be a list of overrides, not 'est"),
+        ("study: x\nreport: drive\nsplit: quickstart\nsweeps: gru\n", "sweeps must be a list of lists of overrides, not 'gru'"),
+        ("study: x\nreport: no_such\nsplit: quickstart\nsweeps: [[estimator=gru]]\n", "no study module 'no_such'"),
+        ("study: x\nreport: drive\nsplit: quickstart\nsweep: [[estimator=gru]]\n", "unknown key 'sweep'"),
+    ],
+)
+def test_wrong_pipelines_are_one_line_that_helps(elsewhere, text, message):
+    (elsewhere / "mine.yaml").write_text(text)
+    with pytest.raises(ConfigurationError, match=message):
+        read_pipeline("mine.yaml")
+
+
+def test_unknown_pipeline_names_the_nearest(elsewhere):
+    with pytest.raises(MissingError, match=r"did you mean pipelines/quickstart\.yaml\?"):
+        read_pipeline("quikstart")
+
+
+def test_completion_offers_groups_options_and_values(elsewhere):
+    offered = dict(complete_override("train", [], ""))
+    assert {"estimator=ksnn", "split=ferrari_drive", "seed=0", "training.patience=25", "estimator.bias=true"} <= set(offered)
+    assert "Gated recurrent unit" in offered["estimator=gru"]
+    assert [text for text, _ in complete_override("train", ["estimator=gru"], "estimator.n")] == ["estimator.n_states=5"]
+    assert [text for text, _ in complete_override("train", ["estimator=luenberger"], "estimator.")] == ["estimator.rate_hz=100"]
+    assert [text for text, _ in complete_override("train", ["estimator=kalman"], "estimator.car.m")] == ["estimator.car.mass=982"]
+
+
+def _bash_completion(words: list[str], position: int, cwd: Path) -> list[str]:
+    environment = {**os.environ, "COMP_WORDS": " ".join(words), "COMP_CWORD": str(position), "_VEHEST_COMPLETE": "complete_bash"}
+    code = "import sys; sys.argv = ['vehest']; from vehest.cli import main; main()"
+    result = subprocess.run([sys.executable, "-c", code], env=environment, cwd=cwd, capture_output=True, text=True, timeout=60)
+    return result.stdout.split()
+
+
+def test_bash_completes_after_the_equals_sign_where_it_breaks_words(elsewhere):
+    assert "estimator=ksnn" in _bash_completion(["vehest", "train", "est"], 2, elsewhere)
+    assert _bash_completion(["vehest", "train", "estimator", "=", "ks"], 4, elsewhere) == ["ksnn"]
+    assert set(_bash_completion(["vehest", "train", "estimator", "="], 3, elsewhere)) >= {"gru", "ksnn", "lstm", "luenberger"}
+    assert "train" in _bash_completion(["vehest", "tr"], 1, elsewhere)
+    assert "sim_quickstart" in _bash_completion(["vehest", "ingest", "sim"], 2, elsewhere)
+
+
+def test_bash_completes_the_studies_to_check(elsewhere):
+    assert "--check" in _bash_completion(["vehest", "report", "--ch"], 2, elsewhere)
+    assert "ferrari_drive" in _bash_completion(["vehest", "report", "--check", "fer"], 3, elsewhere)
+    assert "quickstart" in _bash_completion(["vehest", "report", "--check", "ferrari_drive", "quick"], 4, elsewhere)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_real_bash_completes_after_the_equals_sign(elsewhere):
+    script = (
+        "from typer._completion_shared import get_completion_script as g;"
+        "print(g(prog_name='vehest', complete_var='_VEHEST_COMPLETE', shell='bash'))"
+    )
+    source = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    runner = elsewhere / "vehest"
+    runner.write_text(f"#!{sys.executable}\nfrom vehest.cli import main\nmain()\n")
+    runner.chmod(0o755)
+    program = f"{source}\nCOMP_WORDS=(vehest train estimator = g); COMP_CWORD=4; _vehest_completion vehest; echo ${{COMPREPLY[@]}}"
+    environment = {**os.environ, "PATH": f"{elsewhere}:{os.environ['PATH']}"}
+    result = subprocess.run(["bash", "-c", program], env=environment, cwd=elsewhere, capture_output=True, text=True, timeout=60)
+    assert result.stdout.split() == ["gru"], result.stderr

@@ -1,0 +1,157 @@
+"""A finished study is recognised by what it was made from, and prints what the whole way would print."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from place import PIPELINE
+from vehest.run.finished import ABSENT, Asked, recall, stamp_of
+
+HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
+WORDS = ("small", "tracking=none")
+SWEEP = ("estimator=luenberger", "training.grid=1", "training.max_evaluations=5,6", "split=mine", "tracking=none")
+
+
+@pytest.fixture
+def study(place):
+    """A place with a small study that has just been run."""
+    quick = PIPELINE | {"sweeps": [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]}
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(quick))
+    code, _, err = place("run", *WORDS, "--jobs", "1")
+    assert code == 0, err
+    return place
+
+
+def asked() -> Asked:
+    return Asked(("run", *WORDS), WORDS[1:], "small")
+
+
+def forget(place) -> None:
+    for record in (place.folder / "outputs" / "finished").iterdir():
+        record.unlink()
+
+
+@pytest.mark.parametrize("options", [(), ("--json",), ("--dry-run",), ("--quiet",)])
+def test_a_finished_study_prints_what_the_whole_way_prints(study, options):
+    assert recall(asked()) is not None
+    recognised = study("run", *WORDS, *options)
+    forget(study)
+    assert study("run", *WORDS, *options) == recognised
+    assert recognised[0] == 0
+    assert ("skipped report" in recognised[2]) == (options != ("--quiet",))
+
+
+def test_report_recognises_a_finished_study_too(study):
+    recognised = study("report", *WORDS)
+    forget(study)
+    assert study("report", *WORDS) == recognised
+
+
+def test_a_finished_study_imports_nothing_that_made_it(study):
+    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+    command = [sys.executable, "-c", program, "run", *WORDS, "--quiet"]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    assert "test set 'test'" in result.stdout
+    assert not {name.split(".")[0] for name in result.stderr.split()} & set(HEAVY)
+
+
+def test_a_finished_sweep_prints_what_the_whole_way_prints(place):
+    code, first, err = place("sweep", *SWEEP, "--jobs", "1")
+    assert code == 0, err
+    assert recall(Asked(("sweep", "", *SWEEP), SWEEP)) is not None
+    recognised = place("sweep", *SWEEP)
+    assert recognised[1] == first
+    forget(place)
+    assert place("sweep", *SWEEP) == recognised
+    assert json.loads(place("sweep", *SWEEP, "--json")[1])["skipped"] is True
+
+
+def test_a_published_copy_that_is_gone_is_published_again(study):
+    content = yaml.safe_load((study.folder / "pipelines" / "small.yaml").read_text())
+    (study.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(content | {"publish": True}))
+    assert study("run", *WORDS)[0] == 0
+    published = study.folder / "results" / "small" / "metrics.csv"
+    assert published.is_file()
+    published.unlink()
+    assert recall(asked()) is not None
+    code, out, err = study("run", *WORDS)
+    assert code == 0, err
+    assert published.is_file()
+    assert "published: results/small" in out
+    assert "publish" in err
+
+
+def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
+    def changed(file: Path, content: bytes) -> None:
+        former, about = file.read_bytes(), file.stat()
+        file.write_bytes(content)
+        os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
+        assert recall(asked()) is None, file
+        file.write_bytes(former)
+
+    assert recall(asked()) is not None
+    for file in [study.folder / "conf" / "split" / "mine.yaml", study.folder / "pipelines" / "small.yaml"]:
+        changed(file, file.read_bytes() + b"\n# a comment\n")
+    manifest = next((study.folder / "outputs" / "evaluate").glob("*/manifest.json"))
+    changed(manifest, manifest.read_bytes().replace(b'"sha256": "', b'"sha256": "0', 1))
+    estimate = next((study.folder / "outputs" / "evaluate").glob("*/test/0.parquet"))
+    changed(estimate, b"")
+    record = next((study.folder / "outputs" / "finished").glob("*.json"))
+    changed(record, b'{"format": 1}')
+    assert recall(asked()) is not None
+    with monkeypatch.context() as patch:
+        patch.setenv("VEHEST_DATA", "/elsewhere")
+        assert recall(asked()) is None
+    (study.folder / "raw" / "four.csv").write_text("Time\n")
+    assert recall(asked()) is None
+    (study.folder / "raw" / "four.csv").unlink()
+    assert recall(asked()) is not None
+    raw = study.folder / "raw" / "one.csv"
+    changed(raw, raw.read_bytes().replace(b"1", b"2", 1))
+    assert recall(asked()) is None  # its time of change stays; only reading it shows that it is what it was
+    assert study("run", *WORDS)[0] == 0
+    assert recall(asked()) is not None
+
+
+def test_a_study_on_raw_files_that_changed_is_made_anew(study):
+    raw = study.folder / "raw" / "three.csv"
+    lines = raw.read_text().splitlines()
+    raw.write_text("\n".join([lines[0], *lines[1:-5]]) + "\n")
+    code, _, err = study("run", *WORDS)
+    assert code == 0, err
+    assert "done    ingest" in err
+    assert "done    report" in err
+
+
+def test_force_runs_what_is_there(study):
+    code, _, err = study("run", *WORDS, "--force", "--jobs", "1")
+    assert code == 0, err
+    assert "skipped" not in err
+    assert recall(asked()) is not None
+
+
+def test_other_overrides_are_another_study(study):
+    assert recall(Asked(("run", *WORDS, "seed=1"), (*WORDS[1:], "seed=1"), "small")) is None
+    assert Asked(("run", "small", "output='a b'"), ("output='a b'",), "small").output is None
+
+
+def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
+    (tmp_path / "lap.csv").write_text("1")
+    before, about = stamp_of(str(tmp_path)), (tmp_path / "lap.csv").stat()
+    (tmp_path / "new.csv").write_text("2")
+    os.utime(tmp_path / "new.csv", ns=(about.st_atime_ns, about.st_mtime_ns))
+    os.replace(tmp_path / "new.csv", tmp_path / "lap.csv")
+    assert stamp_of(str(tmp_path)) != before
+    assert stamp_of(str(tmp_path / "nowhere")) == ABSENT
+
+
+def test_a_folder_that_links_to_itself_is_walked_once(tmp_path):
+    (tmp_path / "again").symlink_to(tmp_path)
+    assert stamp_of(str(tmp_path)) not in (None, ABSENT)

@@ -1,0 +1,218 @@
+"""Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone, nobody waits for ever."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from place import Place
+from vehest.run.artefacts import StagePlan, read_artefact
+from vehest.run.group import _held
+from vehest.run.locks import Lock, Waiting, held
+from vehest.run.train import TrainJob
+
+pytestmark = pytest.mark.apart
+
+HOLDER = """
+import sys
+from pathlib import Path
+from vehest.run.locks import Lock
+lock = Lock(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
+print(lock.take(), flush=True)
+sys.stdin.read()
+"""
+
+
+@contextmanager
+def held_elsewhere(output: Path, stage: str, name: str) -> Iterator[subprocess.Popen[str]]:
+    """A process of its own that holds a lock until it is ended."""
+    own = [sys.executable, "-c", HOLDER, str(output), stage, name]
+    process = subprocess.Popen(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        assert process.stdout.readline() == "True\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_lock_ends_with_the_process_that_holds_it(tmp_path: Path):
+    lock = Lock(tmp_path, "train", "a model")
+    with held_elsewhere(tmp_path, "train", "a model") as holder:
+        assert not lock.take()
+        assert lock.holder.startswith(f"process {holder.pid} on ")
+        os.kill(holder.pid, signal.SIGKILL)
+        holder.wait()
+        assert lock.take()
+    lock.release()
+
+
+def test_waiting_says_once_for_whom_and_ends_when_asked(tmp_path: Path):
+    said: list[Waiting] = []
+    asked = iter([False, False, True])
+    with held_elsewhere(tmp_path, "train", "a model") as holder:
+        with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
+            assert not mine
+        assert [(waiting.stage, waiting.label) for waiting in said] == [("train", "a model")]
+        assert str(holder.pid) in said[0].holder
+
+
+def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path: Path):
+    first, second = Lock(tmp_path, "train", "../a/b"), Lock(tmp_path, "train", ".._a_b")
+    assert first.take()
+    assert second.take()
+    assert not Lock(tmp_path, "train", "../a/b").take()
+    assert {file.parent for file in tmp_path.rglob("*.lock")} == {tmp_path / "locks"}
+    first.release()
+    second.release()
+
+
+def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path: Path):
+    jobs = [_job(tmp_path, seed) for seed in range(3)]
+    first, second = jobs[0].plan.lock, jobs[1].plan.lock
+    assert first.take()
+    with _held(jobs, lambda: False, pytest.fail) as free:
+        assert [job.seed for job in free] == [1, 2]
+        assert not second.take()
+    assert second.take(), "a group that is done with its members holds none"
+
+    said: list[Waiting] = []
+
+    def others_end(waiting: Waiting) -> None:
+        said.append(waiting)
+        first.release()
+
+    with _held(jobs[:2], lambda: False, others_end) as free:
+        assert [job.seed for job in free] == [0]
+    assert [waiting.label for waiting in said] == [jobs[0].plan.folder.name]
+    with _held(jobs[1:2], lambda: True, said.append) as free:
+        assert free == [], "who is asked to stop waits no longer"
+    second.release()
+
+
+def _job(output: Path, seed: int) -> TrainJob:
+    plan = StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", output)
+    return TrainJob(plan, {}, {}, None, seed, {})  # type: ignore[arg-type]
+
+
+COMMAND = [sys.executable, "-m", "vehest"]
+
+
+def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place: Place):
+    assert place("ingest", "mine")[0] == 0
+    [folder] = (place.folder / "outputs" / "ingest").iterdir()
+    with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
+        waiting = subprocess.Popen([*COMMAND, "ingest", "mine", "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert waiting.stderr is not None
+        line = waiting.stderr.readline()
+        assert line.split()[:3] == ["waiting", "ingest", folder.name]
+        assert f"process {holder.pid} on " in line
+        os.kill(holder.pid, signal.SIGKILL)
+        assert waiting.communicate()[1].startswith("done")
+    assert waiting.returncode == 0
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("stage", ["ingest", "train"])
+def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place: Place, stage: str, number: signal.Signals, code: int):
+    command = ["ingest", "mine"] if stage == "ingest" else ["train", "split=mine", "training.max_epochs=1", "tracking=none"]
+    assert place(*command)[0] == 0
+    before = place.files()
+    [folder] = (place.folder / "outputs" / stage).iterdir()
+    with held_elsewhere(place.folder / "outputs", stage, folder.name):
+        waiting = subprocess.Popen([*COMMAND, *command, "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert waiting.stderr is not None
+        while "waiting" not in (line := waiting.stderr.readline()):
+            assert line, "it ended without waiting"
+        waiting.send_signal(number)
+        waiting.communicate()
+        assert waiting.returncode == code
+    assert place.files() - before == set()
+
+
+SIDE_BY_SIDE = """
+import os, sys
+from vehest.cli import main
+import vehest.run.pipeline, vehest.studies.drive, vehest.report.document, mlflow
+
+def run(output, said, gate):
+    os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT), 2)
+    os.dup2(2, 1)
+    os.read(gate, 1)
+    sys.argv = ["vehest", "run", "small", "--jobs", "1", f"output={output}"]
+    try:
+        main()
+    except SystemExit as leave:
+        os._exit(int(leave.code or 0))
+    except BaseException:
+        os._exit(99)
+    os._exit(0)
+
+def at_once(count, output):
+    gate, opens = os.pipe()
+    runs = []
+    for number in range(count):
+        process = os.fork()
+        if not process:
+            os.close(opens)
+            run(output, f"said-{output}-{number}", gate)
+        runs.append(process)
+    os.write(opens, b"x" * count)
+    return [os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) for process in runs]
+
+print(at_once(1, "alone"), at_once(3, "together"))
+"""
+
+
+def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(place: Place):
+    from mlflow import MlflowClient
+
+    done = subprocess.run([sys.executable, "-c", SIDE_BY_SIDE], capture_output=True, text=True, check=False)
+    said = {file.name: file.read_text() for file in place.folder.glob("said-*")}
+    assert done.stdout == "[0] [0, 0, 0]\n", (done.stderr, said)
+    alone, together = place.folder / "alone", place.folder / "together"
+    assert _contents(together) == _contents(alone)
+    lines = [line.split() for text in said.values() for line in text.splitlines() if line.startswith("done")]
+    made = [tuple(words[1:3]) for words in lines]
+    assert len(made) == 2 * len(set(made)), "each is made once alone and once by one of the three"
+    client = MlflowClient(f"sqlite:///{together / 'mlflow.db'}")
+    found = client.search_runs([client.get_experiment_by_name("vehest").experiment_id])
+    runs = [run for run in found if run.data.tags["vehest.stage"] != "study"]
+    assert len(found) == len(runs) + 1, "and one above them"
+    assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(
+        artefact.key for folder in _folders(together) if (artefact := read_artefact(folder)).stage in {"train", "calibrate", "evaluate"}
+    )
+    assert {run.info.status for run in runs} == {"FINISHED"}
+    assert not list((together / "checkpoints").rglob("*"))
+
+
+def test_a_training_made_again_leaves_its_evaluation_up_to_date(place: Place):
+    arguments = ("split=mine", "training.max_epochs=1", "tracking=none", "--json")
+    assert place("train", *arguments)[0] == 0
+    assert json.loads(place("eval", *arguments)[1])["skipped"] is False
+    assert json.loads(place("train", *arguments, "--force")[1])["skipped"] is False
+    evaluated = json.loads(place("eval", *arguments)[1])
+    assert evaluated["skipped"] is True
+    assert evaluated["train_seconds.test"] > 0
+    assert evaluated["step_seconds.test"] > 0
+
+
+def _folders(output: Path) -> list[Path]:
+    return [
+        folder
+        for stage in ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
+        for folder in sorted((output / stage).iterdir())
+    ]
+
+
+def _contents(output: Path) -> dict[str, str]:
+    return {folder.name: read_artefact(folder).digest for folder in _folders(output) if folder.parent.name != "report"}

@@ -1,0 +1,433 @@
+"""What a user is told: usage errors, hostile names, full disks, broken streams; one line each, and nothing that steers a terminal."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+from safetensors import SafetensorError
+
+from conftest import planar_drive
+from place import DATASET, Place
+from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
+from vehest.data.files import no_room, written_aside
+from vehest.data.limits import Limits, use_limits
+from vehest.run.config import as_yaml, compose_config, count, expand, limits_of, parse
+from vehest.run.console import Messages
+from vehest.run.failures import failure_of
+
+HOSTILE = "a\x1b]0;owned\x07\x9b31m\u202e[bold]b[/] :car:"
+
+
+def _shows_only_text(text: str) -> bool:
+    return all(character == "\n" or is_printable(character) for character in text)
+
+
+# --- usage -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("trian",), "no such command 'trian'; did you mean 'train'? 'vehest --help' says what there is"),
+        (("train", "--nope"), "'vehest train --help' says what there is"),
+        (("data", "shwo"), "'vehest data --help' says what there is"),
+        (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
+        (("run", "small", "--jobs", "0"), "invalid value for '--jobs'"),
+        (("run", "small", "--jobs", "many"), "invalid value for '--jobs'"),
+        (("train", "--quiet=3"), "option '--quiet' does not take a value"),
+        (("train", "--seed", "3"), "written without dashes: seed=…"),
+        (("train", "--estimator=ksnn"), "written without dashes: estimator=…"),
+        (("train", "--training.patience=3"), "written without dashes: training.patience=…"),
+        (("train", "jobs=3"), "an option is written --jobs"),
+        (("run", "small", "dry_run=true"), "an option is written --dry-run"),
+        (("train", "ksnn"), "write key=value"),
+        (("config", "trian"), "is not one of: ingest, downsample, train, eval, estimate"),
+        (("train", "--\x1b[31mred"), r"--\x1b[31mred"),
+        (("data", "show", "no\x1b[31m\u202efile"), r"no\x1b[31m\u202efile"),
+    ],
+)
+def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
+    code, line = place.refused(*arguments)
+    assert code == 2
+    assert words in line
+    assert _shows_only_text(line)
+
+
+def test_help_version_and_completion_answer_as_before(place, monkeypatch):
+    assert "Usage" in place("train", "--help")[1]
+    assert place("--version")[:2] == (0, "vehest 0.1.0\n")
+    code, out, err = place("data")
+    assert (code, err) == (2, "")
+    assert "channels" in out
+    monkeypatch.setenv("_VEHEST_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "vehest tra")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    assert place()[1].split() == ["train"]
+
+
+# --- names from files ------------------------------------------------------------------------------------------------
+
+
+def test_hostile_names_reach_the_terminal_as_text(place):
+    dataset = {**DATASET, "title": HOSTILE, "licence": HOSTILE, "citation": HOSTILE, "vehicle": HOSTILE}
+    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
+    (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{HOSTILE.replace('/', '')}.csv")
+    table = pd.read_csv(place.folder / "raw" / "two.csv").rename(columns={"Yaw": HOSTILE})
+    table.to_csv(place.folder / "raw" / "two.csv", index=False)
+    good = "dataset.files='[!t]*.csv'"
+    for arguments in (("data", "show", "mine", good), ("data", "check", "mine"), ("config", "ingest", "dataset=mine"), ("ingest", "mine")):
+        code, out, err = place(*arguments)
+        assert "defect" not in err
+        assert _shows_only_text(out + err), arguments
+        assert arguments[0] == "config" or r"a\x1b]0;owned\x07\x9b31m\u202e[bold]b[" in out + err
+    assert code == 3, "no column 'Yaw'"
+
+
+def test_json_and_yaml_show_only_text_and_keep_every_value(place):
+    hostile = HOSTILE + "\x7f\u2028\U000e0041β"
+    override = f"output='{hostile}'"
+    for arguments, read in ((("--json",), json.loads), ((), yaml.safe_load)):
+        code, out, _ = place("config", "train", override, *arguments)
+        assert code == 0
+        assert _shows_only_text(out)
+        assert read(out)["output"] == hostile
+    assert "β" in as_yaml({"name": "β"})
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
+    messages = Messages()
+    seen = io.StringIO()
+    messages.console = type(messages.console)(
+        file=seen, force_terminal=terminal, color_system=None, soft_wrap=True, width=200, highlight=False
+    )
+    messages.line("done", "train", HOSTILE + "\\", HOSTILE)
+    messages.warn(f"first\n{HOSTILE}")
+    with messages.bars() as bars:
+        bars.step(HOSTILE, 1, 2, HOSTILE)
+    text = seen.getvalue()
+    shown = printable(HOSTILE)
+    assert text.startswith(f"done    train      {shown}\\ {shown}")
+    assert f"warning first\n{shown}" in text
+    assert not {"\x07", "\x9b", "\u202e"} & set(text)
+    assert "\x1b]" not in text
+    assert terminal == (f"{shown} " in text.split("warning", 1)[1].split(shown, 1)[1])
+
+
+def test_tables_read_no_markup_and_hold_no_escapes(place, capsys):
+    from vehest.cli import _table
+
+    _table(["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])
+    out = capsys.readouterr().out
+    assert _shows_only_text(out)
+    assert "[bold]name[/]" in out
+    assert printable(HOSTILE) in out
+    assert ":car:" in out
+
+
+# --- names that are not UTF-8 ----------------------------------------------------------------------------------------
+
+
+def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
+    drive = planar_drive(20.0, 100.0).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    lap = os.fsdecode(b"lap\xff.csv")
+    Path("lap.csv").rename(lap)
+    assert place("data", "check", lap)[:2] == (0, "nothing found\n")
+    code, out, err = place("data", "show", lap, "--json")
+    assert code == 0, err
+    out.encode("utf-8")
+    assert json.loads(out)["recordings"][0]["id"] == os.fsdecode(b"lap\xff")
+    assert r"lap\udcff: real" in place("data", "show", lap)[1]
+    assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")[0] == 0
+    for name in (b"out\xfe.parquet", b"out\xfe.csv"):
+        code, out, err = place("estimate", "luenberger", lap, "-o", os.fsdecode(name), "--json")
+        assert code == 0, err
+        assert json.loads(out)["out"] == os.fsdecode(name)
+        assert name in os.listdir(b".")
+    code, line = place.refused("data", "show", os.fsdecode(b"other\xff.csv"))
+    assert (code, r"'other\udcff.csv' is neither" in line) == (2, True)
+
+
+def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(place):
+    name = os.fsdecode(b"one\xff")
+    (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{name}.csv")
+    split = yaml.safe_load((place.folder / "conf" / "split" / "mine.yaml").read_text())
+    split |= {"train": [{"recording": "three"}], "tests": {"test": [{"recording": name}]}}
+    (place.folder / "conf" / "split" / "mine.yaml").write_text(yaml.safe_dump(split))
+    sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
+    pipeline = yaml.safe_load((place.folder / "pipelines" / "small.yaml").read_text()) | {"sweeps": sweeps}
+    pipeline |= {"title": "T <script>alert(1)</script>", "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))"}
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(pipeline))
+    code, out, err = place("run", "small", "--jobs", "1", "tracking=none", "--json")
+    assert code == 0, err
+    report = Path(json.loads(out)["report"])
+    assert r"recording one\\udcff" in report.with_suffix(".md").read_text(encoding="utf-8")
+    for text in (report.read_text(encoding="utf-8"), report.with_suffix(".md").read_text(encoding="utf-8")):
+        assert "T &lt;script" in text
+        assert "<script>alert" not in text
+        assert "<img src=x" not in text
+        assert 'href="javascript' not in text
+    assert "[x](javascript" not in report.with_suffix(".md").read_text(encoding="utf-8")
+    assert r"one\udcff" in (report.parent / "tables" / "ranges.csv").read_text(encoding="utf-8")
+
+
+# --- number of jobs, overrides ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("range(100000000)", "for 100000000 jobs, more than the limit of 10000"),
+        ("shuffle(range(100000000))", "more than the limit"),
+        ("sort(range(100000000))", "more than the limit"),
+        ("range(0,1e300,1e-300)", "1.0e+600 jobs"),
+        ("range(1e300,0,-1e-300)", "more than the limit"),
+        ("range(0,5,0)", "a step that is not zero"),
+        ("range(0,5.5,0.0)", "a step that is not zero"),
+        ("range(1,inf)", "needs numbers"),
+        ("range(nan,5)", "needs numbers"),
+        ("range(0)", "stands for no value"),
+        ("choice()", "cannot be read"),
+        ("interval(0,1)", "an interval cannot be counted"),
+        ("glob(*)", "list the values of an option"),
+        ("9" * 5000, "cannot be read"),
+        ("1" + ",1" * 5000, "use range"),
+    ],
+)
+def test_a_sweep_is_counted_before_it_is_expanded(place, value, words):
+    code, line = place.refused("sweep", "split=mine", f"seed={value}", "--dry-run")
+    assert code == 2
+    assert words in line
+
+
+def test_ranges_count_what_they_expand_to():
+    for text in ("range(7)", "range(2,9,3)", "range(9,2,-3)", "range(0,1,0.1)", "range(5,1,-0.25)", "1,2,3", "choice(a,b)", "glob(k*)"):
+        key = "estimator" if "glob" in text else "seed"
+        assert count([f"{key}={text}", "training.patience=1,2"]) == len(expand([f"{key}={text}", "training.patience=1,2"])) > 0
+
+
+def test_the_limit_of_jobs_holds_for_products_and_is_raised_by_an_override(place):
+    code, line = place.refused("sweep", "split=mine", "seed=range(200)", "training.patience=range(1,100)", "--dry-run")
+    assert code == 2
+    assert "19800 jobs" in line
+    assert "limits.jobs=NUMBER" in line
+    assert place.refused("sweep", "split=mine", "seed=range(6)", "limits.jobs=5", "--dry-run")[0] == 2
+    assert place("sweep", "split=mine", "seed=range(6)", "limits.jobs=6", "--dry-run")[0] == 0
+    assert limits_of(["limits.jobs=12345", "seed=3"]).jobs == 12345
+    code, line = place.refused("run", "small", "limits.jobs=3", "--dry-run")
+    assert (code, "'small.yaml' stand for 4 jobs" in line.replace(str(place.folder), "")) == (2, True)
+    assert place("run", "small", "limits.jobs=4", "--dry-run")[0] == 0
+    assert place.refused("sweep", "split=mine", "limits=5", "--dry-run")[0] == 2
+    assert place.refused("sweep", "split=mine", "limits.jobs=1,2", "--dry-run")[0] == 2
+    with use_limits(Limits(jobs=3)), pytest.raises(ConfigurationError, match="stand for 4 jobs"):
+        expand(["seed=range(4)"])
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("training.x=" + "[" * 100_000, "more than 20000"),
+        ("training.x=" + "[" * 9_000 + "]" * 9_000, "nests 9000 levels deep"),
+        ("training.x=" + "{a:" * 4_000 + "1" + "}" * 4_000, "nests 4000 levels deep"),
+        ("+" + "a." * 5_000 + "b=1", "nests 5000 levels deep"),
+        ("output='" + "${" * 3_000 + "'", "nests 3000 levels deep"),
+        ("output=" + "x" * 10_000_000, "has 10000007 characters"),
+        ("output='a\0b'", "a line break or a null character"),
+        ("output='a\nb'", "a line break or a null character"),
+        ("+training.x=[" + "1," * 9_000 + "1]", "lists more than 2000 values"),
+        ("~limits", "only keys inside a group"),
+    ],
+)
+def test_overrides_that_would_keep_the_parser_busy_are_refused(override, words):
+    with pytest.raises(ConfigurationError, match=words):
+        compose_config("train", [override])
+
+
+def test_very_many_overrides_are_refused_and_long_honest_ones_are_read():
+    with pytest.raises(ConfigurationError, match="100000 overrides are more than"):
+        parse(["seed=1"] * 100_000)
+    ranges = ", ".join(f"{{recording: one, start: {k}.5, stop: {k + 1}}}" for k in range(300))
+    assert len(compose_config("train", [f"split.train=[{ranges}]"])["split"]["train"]) == 300
+    assert compose_config("train", ["output='[((a, {b'"])["output"] == "[((a, {b"
+
+
+# --- full disks, broken streams, odd surroundings --------------------------------------------------------------------
+
+
+def _program(*lines: str, limit: int | None = None) -> str:
+    before = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))\n" if limit else ""
+    return before + "\n".join(lines)
+
+
+def _in_process(place: Place, *commands: tuple[str, ...], limit: int) -> list[tuple[int, str]]:
+    """Exit code and last line of commands that one process runs, its files bounded to ``limit`` bytes: as on a full disk."""
+    program = _program(
+        "import sys, json",
+        "from vehest.cli import main",
+        f"for arguments in {list(commands)!r}:",
+        "    sys.argv = ['vehest', *arguments]",
+        "    try:",
+        "        main()",
+        "    except SystemExit as leave:",
+        "        print('left with', leave.code, file=sys.stderr)",
+        limit=limit,
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(place.folder / "numba"), "VEHEST_DATA": str(place.folder / "raw")}
+    result = subprocess.run([sys.executable, "-c", program], cwd=place.folder, capture_output=True, text=True, timeout=300, env=environment)
+    lines = result.stderr.splitlines()
+    ends = [at for at, line in enumerate(lines) if line.startswith("left with")]
+    assert len(ends) == len(commands), result.stderr
+    return [(int(lines[at].split()[-1]), lines[at - 1]) for at in ends]
+
+
+def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
+    trained = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    pipeline = yaml.safe_load((place.folder / "pipelines" / "small.yaml").read_text())
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(pipeline | {"sweeps": [[trained[0], *trained[2:4]]]}))
+    assert place("train", *trained)[0] == 0
+    assert place("eval", *trained)[0] == 0, "for what it is scored against"
+    shutil.rmtree(place.folder / "outputs" / "evaluate")
+    drive = planar_drive(30.0, 100.0)
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    commands = (
+        ("eval", *trained),
+        ("estimate", "luenberger", "lap.csv", "-o", "out.parquet"),
+        ("estimate", "luenberger", "lap.csv", "-o", "out.csv"),
+        ("data", "align", "lap.csv", "-e", "offsets", "-o", "aligned"),
+    )
+    assert _in_process(place, commands[2], limit=10**9)[0][0] == 0, "it fills the compile cache"
+    Path("out.csv").unlink()
+    before = {str(path) for path in place.folder.rglob("*") if path.suffix != ".nbi" and "numba" not in path.parts}
+    ends = _in_process(place, *commands, limit=3_000)
+    assert place("run", "small", "tracking=none")[0] == 0
+    for folder in (place.folder / "outputs" / "report").iterdir():
+        shutil.rmtree(folder)
+    ends += _in_process(place, ("report", "small", "tracking=none"), limit=30_000)
+    for (code, line), target in zip(ends, ("evaluate", "out.parquet", "out.csv", "aligned", "outputs/report/small"), strict=True):
+        assert code == 4, line
+        assert line.startswith("error: no room left to write '"), line
+        assert target in line
+    after = {str(path) for path in place.folder.rglob("*") if path.suffix != ".nbi" and "numba" not in path.parts}
+    made = ("/evaluate", "/locks", "/finished")  # by the run that had room
+    assert {path for path in after - before if not path.endswith("/report") and not any(part in path for part in made)} == set()
+
+
+def _break_off(target: Path, error: Exception) -> None:
+    with written_aside(target) as aside:
+        aside.write_text("half")
+        raise error
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+        OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)),
+        OSError(errno.EFBIG, os.strerror(errno.EFBIG)),
+        SafetensorError('Error while serializing: IoError(Os { code: 28, kind: StorageFull, message: "No space left on device" })'),
+        sqlite3.OperationalError("database or disk is full"),
+        RuntimeError("wrapped: No space left on device (os error 28)"),
+    ],
+)
+def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
+    with pytest.raises(MissingError, match=f"no room left to write '{tmp_path / 'target'}'"):
+        _break_off(tmp_path / "target", error)
+    assert list(tmp_path.iterdir()) == []
+    assert failure_of(error).exit_code == 4
+
+
+def test_what_is_no_full_disk_is_none(tmp_path):
+    assert no_room(ValueError("no space")) is None
+    with pytest.raises(ValueError, match="other"):
+        _break_off(tmp_path / "target", ValueError("other"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "words"),
+    [
+        (MemoryError(), 4, "out of memory; close other programs, or ask for less at a time"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried"), 4, "out of memory"),
+        (RecursionError("maximum recursion depth exceeded"), 1, "nests too deeply: make it flatter"),
+        (OSError(errno.ENOSPC, "No space left on device"), 4, "no room left"),
+        (PermissionError(errno.EACCES, "Permission denied", "/some/file"), 4, "'/some/file' cannot be used: Permission denied"),
+        (KeyError("x\x1b[31m"), 1, "this is a defect of vehest (KeyError: 'x"),
+        (ValueError("x" * 100_000), 1, "…"),
+    ],
+)
+def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, words):
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr("vehest.run.doctor.examine", fail)
+    found, line = place.refused("doctor")
+    assert found == code
+    assert words in line
+    assert _shows_only_text(line)
+    assert len(line) < 5_000
+
+
+def _shell(place: Place, script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = f"vehest() {{ '{sys.executable}' -m vehest \"$@\"; }}\n{script}"
+    kept = {name: value for name, value in os.environ.items() if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")}
+    return subprocess.run(
+        ["bash", "-c", command],
+        cwd=place.folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**kept, **environment},
+        stdin=subprocess.DEVNULL,
+    )
+
+
+@pytest.mark.parametrize(
+    ("script", "code", "out", "err"),
+    [
+        ("vehest data channels >&-", 0, "", ""),
+        ("vehest data foo 2>&-", 2, "", ""),
+        ("vehest data channels <&- >&- 2>&-", 0, "", ""),
+        ("vehest data channels --json >/dev/full", 4, "", "error: cannot write to standard output (No space left on device)\n"),
+        ("vehest data foo 2>/dev/full", 2, "", ""),
+        ("{ vehest data channels; echo $? >&2; } | true", 0, "", "141\n"),
+        ("mkdir gone; cd gone; rmdir ../gone; vehest data channels >/dev/null", 0, "", ""),
+        (
+            "mkdir gone; cd gone; rmdir ../gone; vehest config train",
+            4,
+            "",
+            "error: the working folder has been removed; change to another\n",
+        ),
+        ("cd /proc; vehest data channels >/dev/null", 0, "", ""),
+    ],
+)
+def test_broken_streams_and_odd_folders_end_in_words(place, script, code, out, err):
+    result = _shell(place, script)
+    assert (result.returncode, result.stdout, result.stderr) == (code, out, err)
+
+
+def test_no_home_no_terminal_and_no_utf_8_still_show_everything(place):
+    plain = _shell(place, "vehest data channels --json", LC_ALL="C", PYTHONCOERCECLOCALE="0", PYTHONUTF8="0")
+    assert (plain.returncode, plain.stderr) == (0, "")
+    assert plain.stdout.isascii()
+    assert json.loads(plain.stdout) == json.loads(place("data", "channels", "--json")[1])
+    table = _shell(place, "vehest data channels", LC_ALL="C", PYTHONCOERCECLOCALE="0", PYTHONUTF8="0")
+    assert (table.returncode, table.stderr) == (0, "")
+    assert "m/s²" in table.stdout
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(place):
+    code, line = place.refused("ingest", "mine", "output=/proc/nothing")
+    assert code == 4
+    assert "cannot write '/proc/nothing" in line

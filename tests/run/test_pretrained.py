@@ -1,0 +1,124 @@
+"""The model for cars that nobody has trained on, which comes with vehest."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import yaml
+
+import vehest
+from conftest import planar_drive
+from place import Place, write_csv
+from vehest.cli import _complete_model_or_file
+from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.registry import estimator_class
+from vehest.run.config import compose_config
+from vehest.run.estimate import pretrained_folder
+from vehest.sources.base import kind_of, open_source
+from vehest.trust.record import read_trust
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place: Place):
+    table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
+    table.to_csv(place.folder / "lap.csv", index=False)
+    code, out, err = place("estimate", "lap.csv", "dataset=mine", "-o", "default.csv", "--json")
+    assert code == 0, err
+    said = json.loads(out)
+    assert said["model"] == "pretrained"
+    for what in ("simulated cars and not on this one", "real Ferrari", "PCT/IT2023/050058"):
+        assert what in said["note"]
+    assert place("estimate", "pretrained", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
+    assert Path("default.csv").read_bytes() == Path("named.csv").read_bytes()
+    bands = pd.read_csv("default.csv")["band_sideslip"].dropna()
+    assert len(bands) > 50
+    assert (bands > 0.0).all()
+
+
+def test_completion_of_the_first_word_offers_models_and_recordings(place: Place):
+    (place.folder / "outputs" / "train" / "ksnn-a").mkdir(parents=True)
+    for name in ("lap.csv", "lap.parquet", "notes.txt"):
+        (place.folder / name).touch()
+    assert _complete_model_or_file("") == ["ksnn-a", "lap.csv", "lap.parquet"]
+    assert _complete_model_or_file("la") == ["lap.csv", "lap.parquet"]
+    assert _complete_model_or_file("raw/o") == ["raw/one.csv"]
+    assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
+
+
+def test_a_named_model_is_used_and_a_folder_is_no_recording(place: Place):
+    write_csv(place.folder / "lap.csv", 9)
+    observer = estimator_class("luenberger").from_config({"rate_hz": 20})
+    observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
+    (place.folder / "own").mkdir()
+    save_model(observer, place.folder / "own")
+    code, out, err = place("estimate", "own", "lap.csv", "dataset=mine", "--json")
+    assert code == 0, err
+    assert json.loads(out)["estimator"] == "luenberger"
+    assert "note" not in json.loads(out)
+    assert "comes after the model" in place.refused("estimate", "own")[1]
+
+
+def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place: Place):
+    write_csv(place.folder / "speed=30.csv", 9)
+    code, out, err = place("estimate", "pretrained", "speed=30.csv", "dataset=mine", "--json")
+    assert code == 0, err
+    assert json.loads(out)["recording"] == "speed=30"
+
+
+def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
+    folder = pretrained_folder()
+    assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
+    spec = importlib.util.spec_from_file_location("make_pretrained", ROOT / "docs" / "make_pretrained.py")
+    assert spec is not None
+    assert spec.loader is not None
+    maker = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(maker)
+    row, about = maker.chosen_step(), yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
+    assert about["note"] == maker.note_of(row, load_model(folder)), "make pretrained"
+    assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
+    assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in about["datasets"])
+
+
+def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the_yardstick():
+    trust = read_trust(pretrained_folder())
+    assert trust.about.note == ""
+    assert trust.bands is not None
+    assert trust.guard is None, "simulated sensors say nothing of the range and resolution of real ones"
+    assert trust.health is not None
+    assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in trust.bands.datasets)
+    assert trust.bands.n_blocks >= 34
+    assert "ferrari_250_lm" not in trust.bands.vehicles
+
+
+def bands_on(name: str, data_root: Path) -> tuple[float, float, float]:
+    """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
+    source = open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
+    recording = next(iter(source.recordings()))
+    estimate = vehest.estimate(vehest.load_model(), recording)
+    reference = np.interp(estimate.time, recording.time, recording["sideslip_ref"])
+    error, band = np.abs(estimate["sideslip"] - reference), estimate["band_sideslip"]
+    judged = np.isfinite(error) & np.isfinite(band)
+    inside, valid = np.mean(error[judged] <= band[judged]), np.mean(estimate["health"][judged] == 0)
+    return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
+
+
+def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root: Path):
+    text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
+    told = re.search(r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid", text)
+    assert told is not None
+    inside, median, valid = bands_on("ferrari_250lm", data_root)
+    assert [told[1], told[2], told[3]] == [f"{100 * inside:.0f}", f"{median:.1f}", f"{100 * valid:.0f}"]
+    assert "hardly a sample is valid" in text
+    assert bands_on("roboracer", data_root)[2] < 0.01
+
+
+def test_python_interface_loads_the_pretrained_model_by_default():
+    recording = planar_drive(20.0, 100.0, seed=4)
+    estimate = vehest.estimate(vehest.load_model(), recording)
+    assert np.isfinite(estimate["vy"]).sum() == 400 - 30

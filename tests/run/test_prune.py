@@ -1,0 +1,173 @@
+"""Pruning finds what no present key can name, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from place import run_vehest
+from vehest.data.files import ASIDE_PREFIX
+from vehest.run import calibrate, downsample, evaluate, ingest, train
+from vehest.run.artefacts import Artefact, StagePlan, make
+from vehest.run.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unnamed
+
+
+class Root:
+    """An output root with artefacts that hold next to nothing."""
+
+    def __init__(self, output: Path) -> None:
+        self.output = output
+        self.ingested = self.add(
+            "ingest", "drives", {"source": "tabular"}, {"lap.csv": "raw"}, ingest.code_of_ingest("vehest.sources.tabular")
+        )
+        self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), downsample.code_of_downsampling())
+        module = "vehest.estimators.luenberger"
+        self.model = self.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, train.code_of_training(module))
+        of_model = {"model": self.model.digest}
+        self.trusted = self.add("calibrate", "one-trust", {}, of_model, calibrate.code_of_calibration(module))
+        of_both = of_model | {"calibration": self.trusted.digest}
+        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(module))
+
+    def add(self, stage: str, label: str, config: dict, inputs: dict[str, str], code: str) -> Artefact:
+        """Make an artefact with one file, whose content is its label."""
+        plan = StagePlan(stage, label, config, inputs, code, self.output)
+        return make(plan, lambda folder: (folder / "content").write_text(label) and None)
+
+    def found(self) -> dict[str, str]:
+        """Path in the root -> why no key names it."""
+        return {found.path.relative_to(self.output).as_posix(): found.reason for found in unnamed(self.output)}
+
+
+@pytest.fixture
+def root(tmp_path):
+    return Root(tmp_path / "outputs")
+
+
+def name_of(artefact: Artefact) -> str:
+    return f"{artefact.stage}/{artefact.folder.name}"
+
+
+def a_dead_process() -> int:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    return ended.pid
+
+
+def test_what_todays_code_has_made_stays(root):
+    assert root.found() == {}
+
+
+def test_what_other_code_has_made_is_found(root):
+    old = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16)
+    older = root.add("ingest", "drives", {"source": "tabular"}, {}, "0" * 16)
+    assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
+
+
+def test_a_model_of_an_estimator_that_is_not_installed_stays(root):
+    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "0" * 16)
+    assert root.found() == {}
+
+
+def test_what_was_made_of_a_model_that_is_gone_is_found_but_not_a_model_without_its_recordings(root):
+    for file in [*root.model.folder.iterdir()]:
+        file.unlink()
+    root.model.folder.rmdir()
+    assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
+
+
+def test_an_evaluation_without_its_calibration_is_found(root):
+    for file in [*root.trusted.folder.iterdir()]:
+        file.unlink()
+    root.trusted.folder.rmdir()
+    assert root.found() == {name_of(root.scored): ORPHANED}
+
+
+def test_recordings_of_outdated_code_keep_what_was_made_from_them(root):
+    manifest = root.ingested.folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace(root.ingested.code, "0" * 16))
+    assert root.found() == {name_of(root.ingested): OUTDATED}
+
+
+def test_a_damaged_artefact_is_found(root):
+    (root.rated.folder / "content").unlink()
+    assert root.found() == {name_of(root.rated): DAMAGED}
+
+
+def test_checkpoints_of_finished_models_are_found_and_others_are_not(root):
+    for name in (root.model.folder.name, "another-seed0-0123456789ab"):
+        (root.output / "checkpoints" / name).mkdir(parents=True)
+        (root.output / "checkpoints" / name / "checkpoint.safetensors").write_text("state")
+    assert root.found() == {f"checkpoints/{root.model.folder.name}": SUPERFLUOUS}
+
+
+def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not(root):
+    dead = root.output / "train" / f"{ASIDE_PREFIX}{a_dead_process()}-1-one"
+    living = root.output / "train" / f"{ASIDE_PREFIX}{os.getpid()}-1-one"
+    for folder in (dead, living):
+        folder.mkdir()
+    parts = root.ingested.folder.with_name(f"{ingest.PARTS_PREFIX}{root.ingested.folder.name}")
+    unfinished = parts.with_name(f"{ingest.PARTS_PREFIX}other-0123456789ab")
+    for folder in (parts, unfinished):
+        folder.mkdir()
+    assert root.found() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}
+
+
+def test_a_record_of_a_study_that_lost_an_artefact_is_found(root):
+    (root.output / "finished").mkdir()
+    for name, folder in (("whole", root.model.folder), ("lost", root.model.folder.with_name("two-0123456789ab"))):
+        made = [{"folder": folder.relative_to(root.output).as_posix(), "key": "", "digest": ""}]
+        (root.output / "finished" / f"{name}.json").write_text(json.dumps({"made": made}))
+    assert root.found() == {"finished/lost.json": BROKEN}
+
+
+def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
+    elsewhere = Root(tmp_path / "elsewhere")
+    old = elsewhere.add("train", "old", {"estimator": {"name": "luenberger"}}, {}, "0" * 16)
+    (root.output / "train" / old.folder.name).symlink_to(old.folder)
+    (root.output / "report").symlink_to(elsewhere.output / "train")
+    mine = root.output / "train" / "notes-0123456789ab"
+    mine.mkdir()
+    (mine / "manifest.json").write_text("mine")
+    renamed = root.output / "train" / "my_favourite-0123456789ab"
+    os.rename(root.add("train", "renamed", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder, renamed)
+    assert root.found() == {}
+
+
+@pytest.fixture
+def outdated(root, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+    return root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
+
+
+def test_a_dry_run_lists_and_removes_nothing(outdated, capsys):
+    code, out, err = run_vehest(capsys, "prune", "--dry-run")
+    assert code == 0, err
+    assert OUTDATED in out
+    assert "1 to remove" in out
+    assert outdated.is_dir()
+
+
+def test_where_nobody_can_be_asked_nothing_is_removed(outdated, capsys):
+    for options in ((), ("--json",)):
+        code, _, err = run_vehest(capsys, "prune", *options)
+        assert code == 2
+        assert "--yes" in err
+    assert outdated.is_dir()
+
+
+def test_yes_removes_what_was_listed_and_nothing_else(outdated, root, capsys):
+    code, out, err = run_vehest(capsys, "prune", "--yes", "--json")
+    assert code == 0, err
+    outcome = json.loads(out)
+    assert outcome["removed"] == [row["path"] for row in outcome["found"]]
+    assert outcome["bytes"] > 0
+    assert not outdated.exists()
+    assert root.model.folder.is_dir()
+    assert {path.name for path in outdated.parent.iterdir()} == {root.model.folder.name}
+    assert run_vehest(capsys, "prune")[1] == "nothing to remove\n"

@@ -1,0 +1,226 @@
+"""Published results: a rerun leaves them as they are, and a check says whether they are those of today."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from place import PIPELINE, Place, run_vehest
+from vehest.run import study_keys
+from vehest.run.artefacts import TIMINGS
+from vehest.run.publishing import PROVENANCE
+
+QUICK = PIPELINE | {
+    "publish": True,
+    "sweeps": [
+        ["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"],
+        ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"],
+    ],
+}
+RUN = ("run", "small", "--jobs", "1", "tracking=none")
+CHECK = ("report", "--check")
+TIME_NAMES = ("seconds", "minutes", "[ms]", "## Times")
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small study that was run and published."""
+    folder = tmp_path_factory.mktemp("published")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("VEHEST_DATA", str(folder / "raw"))
+        patch.delenv("VEHEST_OUTPUT", raising=False)
+        place = Place(folder, _Silent())
+        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(QUICK))
+        assert place(*RUN)[0] == 0
+    return folder
+
+
+class _Silent:
+    """Stands for pytest's capsys, which serves single tests only."""
+
+    def readouterr(self) -> tuple[str, str]:
+        return "", ""
+
+
+@pytest.fixture
+def checked(published: Path, place: Place) -> Place:
+    """The same study in a folder of its own, without the output root: what is checked needs no models."""
+    for name in ("conf", "pipelines", "raw", "results"):
+        shutil.rmtree(place.folder / name, ignore_errors=True)
+        shutil.copytree(published / name, place.folder / name)
+    return place
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+def verdict(place: Place, *words: str) -> tuple[int, str]:
+    """Exit code and outcome of a check of one study; it needs no output root and makes none."""
+    code, out, err = place(*CHECK, *words)
+    assert not (place.folder / "outputs").exists()
+    assert err == ""
+    return code, out.strip()
+
+
+def changed(file: Path, **values: object) -> None:
+    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **values}, allow_unicode=True))
+
+
+# What is published
+
+
+def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published: Path) -> None:
+    (report,) = (published / "outputs" / "report").iterdir()
+    timings = pd.read_csv(report / TIMINGS)
+    metrics = pd.read_csv(published / "results" / "small" / "metrics.csv")
+    assert set(timings["metric"]) >= {"train_seconds", "step_seconds"}
+    assert (timings["value"] > 0).all()
+    assert list(timings.columns) == list(metrics.columns)
+    assert len(timings[(timings["estimator"] == "gru") & (timings["metric"] == "train_seconds")]) == 2
+    page = (report / "report.html").read_text(encoding="utf-8")
+    assert "<h2>Times</h2>" in page
+    assert "online step [ms]" in page
+    texts = {name: content.decode() for name, content in contents(published / "results" / "small").items() if not name.endswith(".png")}
+    assert TIMINGS not in texts
+    for name, text in texts.items():
+        words = [word for word in TIME_NAMES if word in text]
+        assert not words or (name, words) == ("tables/ranges.csv", ["seconds"]), name  # how long the ranges of the drive are
+
+
+def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(published)
+    monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
+    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+    before = contents(published / "results")
+    assert {"small/report.md", "small/metrics.csv", f"small/{PROVENANCE}", "small/figures/learning.svg"} <= set(before)
+    for command in (["init", "--quiet"], ["add", "results"], ["-c", "user.name=a", "-c", "user.email=a", "commit", "--quiet", "-m", "a"]):
+        subprocess.run(["git", *command], check=True)
+    (report,) = (published / "outputs" / "report").iterdir()
+    timings = (report / TIMINGS).read_bytes()
+    code, _, err = run_vehest(capsys, *RUN, "--force")
+    assert code == 0, err
+    assert (report / TIMINGS).read_bytes() != timings, "it was trained again"
+    assert contents(published / "results") == before
+    status = subprocess.run(["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True)
+    assert status.stdout == ""
+    assert run_vehest(capsys, *CHECK)[:2] == (0, "small: up to date\n")
+
+
+def test_results_that_other_code_gives_alike_are_recorded_as_its_own(
+    published: Path, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.rmtree(place.folder)
+    shutil.copytree(published, place.folder)
+    shutil.rmtree(place.folder / "outputs" / "finished")
+    monkeypatch.chdir(place.folder)
+    monkeypatch.setattr(study_keys, "code_of_ingest", lambda module: "other")
+    before = contents(place.folder / "results" / "small")
+    assert place(*CHECK)[:2] == (3, "small: stale: code (ingest mine)\n")
+    assert place(*RUN)[0] == 0
+    after = contents(place.folder / "results" / "small")
+    assert [name for name in before if after[name] != before[name]] == [PROVENANCE]
+    assert place(*CHECK)[:2] == (0, "small: up to date\n")
+
+
+# What is checked
+
+
+def test_published_results_are_up_to_date_by_study_and_by_file(checked: Place) -> None:
+    for words in ([], ["small"], ["pipelines/small.yaml"], ["small", f"root={checked.folder / 'raw'}"]):
+        assert verdict(checked, *words) == (0, "small: up to date")
+
+
+def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked: Place) -> None:
+    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]])
+    assert verdict(checked) == (3, "small: stale: configuration (train gru, report)")
+    code, out = verdict(checked, "--json")
+    changes = [{"what": what, "cause": "configuration"} for what in ("train gru", "report")]
+    assert (code, json.loads(out)) == (3, [{"study": "small", "state": "stale", "changes": changes, "note": ""}])
+
+
+def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked: Place) -> None:
+    sweeps = [[*sweep, "training.checkpoint_seconds=1"] if "estimator=gru" in sweep else sweep for sweep in QUICK["sweeps"]]
+    changed(checked.folder / "pipelines" / "small.yaml", sweeps=sweeps)
+    changed(checked.folder / "conf" / "dataset" / "mine.yaml", citation="somebody else")
+    assert verdict(checked) == (0, "small: up to date")
+
+
+def test_estimators_that_come_and_go_are_named(checked: Place) -> None:
+    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
+    code, line = verdict(checked)
+    assert code == 3
+    assert "train zero added" in line
+    [study] = json.loads(verdict(checked, "--json")[1])
+    named = {change["what"] for change in study["changes"]}
+    stages = ("train", "calibrate", "evaluate")
+    assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
+
+
+def test_changed_split_and_title_are_named(checked: Place) -> None:
+    changed(checked.folder / "conf" / "split" / "mine.yaml", tests={"test": [{"recording": "three", "stop": 20}]})
+    assert verdict(checked) == (3, "small: stale: configuration (split)")
+    changed(checked.folder / "conf" / "dataset" / "mine.yaml", title="Another title")
+    assert verdict(checked) == (3, "small: stale: configuration (split, report)")
+
+
+def test_changed_code_and_data_are_told_apart(checked: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open(checked.folder / "raw" / "two.csv", "a") as stream:
+        stream.write("\n")
+    assert verdict(checked) == (3, "small: stale: data (ingest mine)")
+    monkeypatch.setattr(study_keys, "code_of_report", lambda study: "other")
+    assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
+
+
+def test_raw_files_that_are_elsewhere_are_not_compared_and_this_is_said(checked: Place) -> None:
+    shutil.rmtree(checked.folder / "raw")
+    assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
+    changed(checked.folder / "conf" / "dataset" / "mine.yaml", vehicle="another car")
+    assert verdict(checked) == (3, "small: stale: configuration (ingest mine); raw files not here, not compared: mine")
+
+
+def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked: Place) -> None:
+    file = checked.folder / "results" / "small" / PROVENANCE
+    about = json.loads(file.read_text())
+    file.write_text(json.dumps({name: value for name, value in about.items() if name != "keys"}))
+    assert verdict(checked) == (3, "small: not known: published before keys were recorded; run it again")
+    file.write_text(json.dumps(about))
+    (checked.folder / "pipelines" / "small.yaml").rename(checked.folder / "pipelines" / "renamed.yaml")
+    code, line = verdict(checked)
+    assert (code, line) == (3, "small: stale: configuration (report)"), "the command is another"
+    (checked.folder / "pipelines" / "renamed.yaml").unlink()
+    assert verdict(checked) == (3, "small: not known: there is no pipeline that publishes 'small'")
+    assert verdict(checked, "quickstart")[1] == "quickstart: not known: there is nothing in 'results/quickstart' that vehest published"
+
+
+def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked: Place) -> None:
+    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
+    code, line = verdict(checked)
+    assert code == 3
+    assert line.startswith("small: stale: configuration (pipeline); today it cannot be run (unknown option 'training.nothing'")
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("report",), 2, "say which pipeline, of:"),
+        ((*CHECK, "smal"), 4, "there is no pipeline 'smal'; did you mean pipelines/small.yaml?"),
+        ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes what comes out"),
+    ],
+)
+def test_what_cannot_be_checked_is_one_line(checked: Place, words: tuple[str, ...], code: int, message: str) -> None:
+    ended, line = checked.refused(*words)
+    assert (ended, message in line) == (code, True), line
+
+
+def test_where_nothing_is_published_there_is_nothing_to_check(place: Place) -> None:
+    code, line = place.refused(*CHECK)
+    assert code == 4
+    assert "no study is published in 'results'" in line

@@ -1,0 +1,703 @@
+"""What describes something, and is damaged, hostile or of another version, is one line; and no name in it leads out of the output root."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.numpy import load_file, save_file
+from safetensors.torch import save_file as save_tensors
+
+from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.estimate import Estimate
+from vehest.data.limits import Limits, use_limits
+from vehest.data.recording import Recording
+from vehest.data.schema import check_format, settings_from_config, validated
+from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
+from vehest.data.text_files import number_in, read_rows
+from vehest.data.transforms import Preparation, transform_from_config
+from vehest.estimators.model_files import Description, load_model, read_description, save_model
+from vehest.estimators.registry import estimator_class
+from vehest.run import config_checks
+from vehest.run.artefacts import Artefact, StagePlan, find, make, read_artefact
+from vehest.run.config import compose_config
+from vehest.run.downsample import write_downsample
+from vehest.run.estimate import preparation_of
+from vehest.run.evaluate import protocol_from_config
+from vehest.run.ingest import recording_file
+from vehest.run.pipeline import read_pipeline
+from vehest.run.publishing import PROVENANCE, publish, shown_in
+from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
+from vehest.sources.base import open_source
+from vehest.studies.artefacts import read_frame
+from vehest.training.checkpoints import Checkpoint, load_checkpoint, resume_epoch, save_checkpoint
+
+HOSTILE = ["../../../evil", "/tmp/evil", "..", "a/b", "a\\b", "a\0b", "", ".hidden", "x" * 300, "ä" * 200, "a\nb"]
+
+
+def changed(content: Any, /, **changes: Any) -> Any:
+    return {key: value for key, value in {**content, **changes}.items() if value is not ...}
+
+
+# ---------------------------------------------------------------------------------------------------------------- models
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    folder = tmp_path / "model"
+    folder.mkdir()
+    estimator = estimator_class("ksnn").from_config({})
+    estimator.load_weights({name: np.full_like(values, 0.5) for name, values in estimator.weights().items()})
+    save_model(estimator, folder, {"seed": 3, "datasets": ["d"], "downsample": {"method": "decimate", "transforms": []}, "step": "any"})
+    return folder
+
+
+def rewrite(model: Path, **changes: Any) -> None:
+    path = model / "model.yaml"
+    path.write_text(yaml.safe_dump(changed(yaml.safe_load(path.read_text()), **changes)))
+
+
+def test_the_description_of_a_model_is_read_with_its_types(model: Path) -> None:
+    described = read_description(model)
+    assert isinstance(described, Description)
+    assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
+    assert preparation_of(model) == {"method": "decimate", "transforms": []}
+    assert load_model(model).name == "ksnn"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": 2}, "written by a newer vehest (format 2, this one knows 1)"),
+        ({"format": 0}, "written by an older vehest (format 0"),
+        ({"format": "1"}, "format must be a whole number, not '1'"),
+        ({"format": 10**400}, "written by a newer vehest"),
+        ({"estimator": 3}, "estimator must be text, not 3"),
+        ({"estimator": "os"}, "estimator 'os' is not one of"),
+        ({"estimator": "vehest.estimators.ksnn"}, "is not one of"),
+        ({"estimator": "__init__"}, "is not one of"),
+        ({"settings": [1]}, "settings must be a mapping"),
+        ({"settings": {"window": "30"}}, "settings.window must be a whole number, not '30'"),
+        ({"settings": {"windows": 30}}, "settings.windows is not an option of settings"),
+        ({"settings": {"rate_hz": float("nan")}}, "settings.rate_hz must be a number, not nan"),
+        ({"settings": {"n_local": 10**9}}, "settings.n_local is 1e+09, and model.safetensors holds"),
+        ({"settings": {"n_local": 4000}}, "which do not fit its settings"),
+        ({"about": {"seed": "three"}}, "about.seed must be a whole number"),
+        ({"about": {"downsample": {"method": "magic"}}}, "about.downsample.method 'magic' is not one of: polyphase, decimate"),
+        ({"about": {"downsample": {"transforms": [{"name": "low_pass"}]}}}, "transform 'low_pass': cutoff_hz is missing"),
+        ({"evil": 1}, "unknown key 'evil'"),
+    ],
+)
+def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model: Path, changes: dict[str, Any], message: str) -> None:
+    rewrite(model, **changes)
+    with pytest.raises(VehestError) as caught:
+        load_model(model)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "model.yaml" in str(caught.value) or "transform" in message or "fit its settings" in message
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null", "2026-01-01", "a: &a [*a]", "{" * 100, b"\xff", "a: !!python/object:os {}"])
+def test_a_description_that_is_none_is_one_line(model: Path, text: str | bytes) -> None:
+    (model / "model.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(DataError, match=r"model\.yaml"):
+        load_model(model)
+
+
+def test_a_description_that_is_a_pipe_does_not_block(model: Path) -> None:
+    (model / "model.yaml").unlink()
+    os.mkfifo(model / "model.yaml")
+    with pytest.raises(DataError, match="a pipe"):
+        load_model(model)
+
+
+def test_a_date_where_text_belongs_is_named_with_its_key(model: Path) -> None:
+    path = model / "model.yaml"
+    path.write_text(path.read_text().replace("step: any", "step: 2026-01-01"))
+    with pytest.raises(DataError, match=r"about\.step is no plain value but a date"):
+        read_description(model)
+
+
+def test_weights_that_are_not_finite_are_counted_by_tensor(model: Path) -> None:
+    weights = load_file(model / "model.safetensors")
+    name = max(weights, key=lambda own: weights[own].size)
+    weights[name] = weights[name].copy()
+    weights[name].flat[:2] = [np.nan, np.inf]
+    save_file(weights, model / "model.safetensors")
+    with pytest.raises(DataError, match=rf"model\.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"):
+        load_model(model)
+
+
+def test_levels_that_each_recording_tells_may_be_open_and_not_infinite(tmp_path: Path) -> None:
+    estimator = estimator_class("kalman").from_config({})
+    save_model(estimator, tmp_path)
+    load_model(tmp_path)
+    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
+    with pytest.raises(DataError, match="1 of the 1 numbers of tensor"):
+        load_model(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.int64, np.uint8, np.bool_])
+def test_weights_of_another_type_are_refused(model: Path, dtype: Any) -> None:
+    weights = load_file(model / "model.safetensors")
+    save_file({name: values.astype(dtype) for name, values in weights.items()}, model / "model.safetensors")
+    with pytest.raises(DataError, match=r"tensor '\w+.*' is of type \w+, not one of: F32, F64"):
+        load_model(model)
+
+
+def test_weights_of_a_type_that_numpy_does_not_know_are_refused(model: Path) -> None:
+    save_tensors({"a": torch.zeros(4, dtype=torch.bfloat16)}, model / "model.safetensors")
+    with pytest.raises(DataError, match="is of type BF16"):
+        load_model(model)
+
+
+@pytest.mark.parametrize(
+    ("length", "header"),
+    [
+        (2**62, {}),
+        (10**6, {}),
+        (None, {"a": {"dtype": "F64", "shape": [10**12], "data_offsets": [0, 8 * 10**12]}}),
+        (None, {"a": {"dtype": "F64", "shape": [2**40, 2**40], "data_offsets": [0, 16]}}),
+        (None, {"a": {"dtype": "F64", "shape": [-1], "data_offsets": [0, 16]}}),
+        (None, {"a": {"dtype": "F64", "shape": [2], "data_offsets": [-16, 0]}}),
+        (None, {"a": {"dtype": "F64", "shape": "2", "data_offsets": [0, 16]}}),
+        (None, [1]),
+    ],
+)
+def test_a_header_that_lies_is_one_line(model: Path, length: int | None, header: Any) -> None:
+    text = json.dumps(header).encode()
+    (model / "model.safetensors").write_bytes((length or len(text)).to_bytes(8, "little") + text + bytes(16))
+    with pytest.raises(DataError, match=r"model\.safetensors"):
+        load_model(model)
+
+
+# ------------------------------------------------------------------------------------------------------------- manifests
+
+
+def plan(output: Path, label: str = "mine") -> StagePlan:
+    return StagePlan("stage", label, {"a": 1.0}, {"raw": "0"}, "code", output)
+
+
+def made(output: Path, label: str = "mine") -> Artefact:
+    return make(plan(output, label), lambda folder: (folder / "a.txt").write_text("a") and None)
+
+
+def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path) -> None:
+    artefact = made(tmp_path)
+    path = artefact.folder / "manifest.json"
+    content = json.loads(path.read_text())
+    assert content["format"] == 1
+    assert artefact.config == {"a": 1.0}
+    path.write_text(json.dumps(changed(content, format=...)))
+    assert read_artefact(artefact.folder).outputs == artefact.outputs
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": 2}, "written by a newer vehest"),
+        ({"format": "x"}, "format must be a whole number"),
+        ({"label": 3}, "label must be text"),
+        ({"key": ...}, "key is missing"),
+        ({"status": "done"}, "status 'done' is not one of: complete, interrupted"),
+        ({"outputs": []}, "outputs must be a mapping"),
+        ({"outputs": {"a.txt": {"sha256": "0"}}}, "outputs.a.txt.bytes is missing"),
+        ({"outputs": {"a.txt": {"sha256": "0", "bytes": "1"}}}, "outputs.a.txt.bytes must be a whole number"),
+        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "is gone or truncated"),
+        ({"config": "a"}, "config must be a mapping"),
+        ({"inputs": {"a": 3}}, "inputs.a must be text"),
+        *[({"outputs": {name: {"sha256": "0", "bytes": 1}}}, "") for name in HOSTILE],
+    ],
+)
+def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    artefact = made(tmp_path)
+    path = artefact.folder / "manifest.json"
+    path.write_text(json.dumps(changed(json.loads(path.read_text()), **changes)))
+    with pytest.raises(DataError) as caught:
+        read_artefact(artefact.folder)
+    assert message in str(caught.value)
+    assert find(plan(tmp_path)) is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"format": 1', "NaN"])
+def test_a_manifest_that_is_none_is_one_line(tmp_path: Path, text: str) -> None:
+    artefact = made(tmp_path)
+    (artefact.folder / "manifest.json").write_text(text)
+    with pytest.raises(DataError):
+        read_artefact(artefact.folder)
+
+
+def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
+    artefact = made(tmp_path / "out")
+    (tmp_path / "elsewhere").write_text("a")
+    (artefact.folder / "a.txt").unlink()
+    (artefact.folder / "a.txt").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(DataError, match="is a link"):
+        read_artefact(artefact.folder)
+
+
+def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path: Path) -> None:
+    artefact = made(tmp_path)
+    with pytest.raises(DataError, match=r"manifest\.json': config\.estimator is missing"):
+        learnt_spans(artefact)
+    entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
+    config = {"estimator": {"rate_hz": 20}, "train": [entry], "validation": []}
+    told = Artefact(**{**artefact.__dict__, "config": config})
+    assert trained_rate(told) == 20.0
+    with pytest.raises(DataError, match="name no ranges"):
+        learnt_spans(told)
+
+
+def test_labels_that_are_fine_name_the_folder_as_before(tmp_path: Path) -> None:
+    own = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
+    assert own.folder == tmp_path / "stage" / f"{own.label}-{own.key[:12]}"
+    assert own.checkpoint_folder == tmp_path / "checkpoints" / f"{own.label}-{own.key[:12]}"
+
+
+# --------------------------------------------------------------------------------------------------------------- Parquet
+
+
+def recording(name: str = "lap", n: int = 20) -> Recording:
+    provenance = {"mass": 1000.0}
+    return Recording(name, "car", 10.0, 0.0, {"vx": np.ones(n), "vy_ref": np.zeros(n)}, provenance=provenance)
+
+
+def redescribed(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    table = pq.read_table(path)
+    content = change(json.loads(table.schema.metadata[b"vehest"]))
+    described = content if isinstance(content, bytes) else json.dumps(content).encode()
+    pq.write_table(table.replace_schema_metadata({b"vehest": described}), path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": 2}, "written by a newer vehest"),
+        ({"format": 0}, "written by an older vehest"),
+        ({"format": None}, "format must be a whole number"),
+        ({"id": 3}, "id must be text"),
+        ({"id": ...}, "id is missing"),
+        ({"rate_hz": "fast"}, "rate_hz must be a number"),
+        ({"rate_hz": -1.0}, "the sampling rate must be positive"),
+        ({"rate_hz": float("nan")}, "rate_hz must be a number"),
+        ({"start_time": [0]}, "start_time must be a number"),
+        ({"kind": "dreamt"}, "kind 'dreamt' is not one of"),
+        ({"gappy": "vx"}, "gappy"),
+        ({"provenance": []}, "provenance must be a mapping"),
+        ({"content": "estimate"}, "not a recording that vehest wrote"),
+        ({"content": ["recording"]}, "not a recording that vehest wrote"),
+    ],
+)
+def test_what_a_recording_says_about_itself_is_checked(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = tmp_path / "lap.parquet"
+    write_recording(recording(), path)
+    redescribed(path, lambda content: changed(content, **changes))
+    with pytest.raises(DataError) as caught:
+        read_recording(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [b"\xff", b"{", b"[" * 100_000])
+def test_a_recording_whose_description_is_damaged_is_not_taken_for_a_table(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "lap.parquet"
+    write_recording(recording(), path)
+    redescribed(path, lambda _: text)
+    for read in (read_recording, is_stored_recording):
+        with pytest.raises(DataError, match=r"cannot be read as JSON|nests deeper"):
+            read(path)
+
+
+def test_provenance_comes_back_as_it_was(tmp_path: Path) -> None:
+    write_recording(recording(), tmp_path / "lap.parquet")
+    assert isinstance(read_recording(tmp_path / "lap.parquet").provenance["mass"], float)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_states": 10**9}, "n_states is 1000000000, and there are 4 columns"),
+        ({"n_states": -2}, "n_states is -2"),
+        ({"n_states": 3}, "n_states is 3"),
+        ({"n_states": "2"}, "n_states must be a whole number"),
+        ({"covariance_of": ["vy"]}, "covariance_of must name 2 different quantities"),
+        ({"covariance_of": ["vy", "luck"]}, "covariance_of must name 2 different quantities"),
+        ({"covariance_of": 3}, "covariance_of must be a list"),
+        ({"mode": "psychic"}, "mode 'psychic' is not one of"),
+    ],
+)
+def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = tmp_path / "estimate.parquet"
+    covariance = np.tile(np.eye(2), (5, 1, 1))
+    channels = {"vy": np.zeros(5), "sideslip": np.zeros(5)}
+    write_estimate(Estimate("lap", "kalman", 10.0, 0.0, channels, "causal", covariance, ("vy", "yaw_rate")), path)
+    assert read_estimate(path).covariance is not None
+    redescribed(path, lambda content: changed(content, **changes))
+    with pytest.raises(DataError) as caught:
+        read_estimate(path)
+    assert message in str(caught.value)
+
+
+def test_columns_of_another_type_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "lap.parquet"
+    write_recording(recording(), path)
+    table = pq.read_table(path)
+    text = table.set_column(0, "vx", [["1"] * 20])
+    pq.write_table(text.replace_schema_metadata(table.schema.metadata), path)
+    with pytest.raises(DataError, match="column 'vx' is of type string, not double"):
+        read_recording(path)
+
+
+# ------------------------------------------------------------------------------------------- what stages read back
+
+
+def test_tables_that_are_damaged_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "fit.csv"
+    for text in (
+        "metric\n1\n",
+        "metric,value\nepochs\n",
+        "metric,value\nepochs,many\n",
+        'metric,value\n"open,1\n',
+        "metric,value\na,1,2\n",
+    ):
+        path.write_text(text)
+        with pytest.raises(DataError, match=r"fit\.csv"):
+            read_fit_metrics(tmp_path)
+    path.write_bytes(b"metric,value\n\xff,1\n")
+    with pytest.raises(DataError, match="UTF-8"):
+        read_fit_metrics(tmp_path)
+    with pytest.raises(MissingError):
+        read_fit_metrics(tmp_path / "none")
+    path.write_text("metric,value\nepochs,7\n")
+    (tmp_path / "timings.csv").write_text("metric,value\ntrain_seconds,1.5\n")
+    assert read_fit_metrics(tmp_path) == {"epochs": 7.0, "train_seconds": 1.5}
+    with pytest.raises(DataError, match="not finite"):
+        number_in({"a": "inf"}, "a", path, finite=True)
+    assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
+
+
+def test_frames_have_the_columns_and_numbers_that_are_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.csv"
+    for text, message in (("", "cannot be read as CSV"), ("a\n1\n", "no column 'value'"), ("value\nmany\n", "holds text")):
+        path.write_text(text)
+        with pytest.raises(DataError, match=message):
+            read_frame(path, ("value",), numbers=("value",))
+
+
+def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path: Path) -> None:
+    for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
+        save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
+        assert load_checkpoint(tmp_path) is None
+        assert resume_epoch(tmp_path) == 0
+    save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}))
+    assert resume_epoch(tmp_path) == 3
+
+
+def test_a_published_study_that_is_damaged_shows_nothing(tmp_path: Path) -> None:
+    for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
+        (tmp_path / PROVENANCE).write_text(text)
+        assert shown_in(tmp_path) == set()
+    (tmp_path / PROVENANCE).write_text('{"kinds": {"a": "real"}, "parts": ["b"], "command": "x"}')
+    assert shown_in(tmp_path) == {"a", "b"}
+
+
+def test_nothing_is_published_through_a_link(tmp_path: Path) -> None:
+    report = made(tmp_path / "out")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "results").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "study").symlink_to(tmp_path / "elsewhere")
+    for folder in (tmp_path / "results" / "study", tmp_path / "study"):
+        with pytest.raises(ConfigurationError, match="through a link"):
+            publish(report, folder, {})
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+# --------------------------------------------------------------------------------------------------------- configuration
+
+
+PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"study": 3}, "study must be text, not 3"),
+        ({"study": "../evil"}, "must be made of letters"),
+        ({"report": "../../evil"}, "there is no study module"),
+        ({"report": "os"}, "there is no study module"),
+        ({"report": "drive.os"}, "there is no study module"),
+        ({"publish": "yes"}, "publish must be true or false"),
+        ({"sweeps": "estimator=gru"}, "sweeps must be a list"),
+        ({"sweeps": []}, "sweeps must be a list of lists"),
+        ({"sweeps": [[]]}, "sweeps must be a list of lists"),
+        ({"sweeps": [[3]]}, "sweeps.0.0 must be text"),
+        ({"evaluation": [1]}, "evaluation must be a mapping"),
+        ({"evaluation": {"rate_hz": [1]}}, "evaluation.rate_hz"),
+        ({"parts": {"a": 3}}, "parts.a must be a group of options"),
+        ({"datasets": "a"}, "datasets must be a list"),
+        ({"title": __import__("datetime").date(2026, 1, 1)}, "title is no plain value but a date"),
+        ({"unknown": 1}, "unknown key 'unknown'"),
+        ({"split": ...}, "it needs study, report and one of"),
+        ({"based_on": 3}, "based_on must be text"),
+    ],
+)
+def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(changed(PIPELINE, **changes)))
+    with pytest.raises(ConfigurationError) as caught:
+        read_pipeline(str(path))
+    assert message in str(caught.value)
+    assert "mine.yaml" in str(caught.value)
+
+
+BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
+
+
+@pytest.mark.parametrize("text", [BOMB, "[" * 200, b"\xff", "3", "- a", "a: &a {b: *a}"])
+def test_a_pipeline_that_is_none_is_one_line(tmp_path: Path, text: str | bytes) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigurationError, match=r"mine\.yaml"):
+        read_pipeline(str(path))
+
+
+@pytest.fixture
+def conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "dataset").mkdir(parents=True)
+    return tmp_path / "conf"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (BOMB, "holds more than 500000 values"),
+        ("'7'", "holds the text '7' where a mapping belongs"),
+        ("a: !!timestamp soon", "a value is not what its tag"),
+        ("a: " + "[" * 200 + "]" * 200, "nests deeper than 60 levels"),
+        (b"a: \xff", "is not UTF-8 text"),
+        ("a: &a {b: *a}", "inside itself"),
+        ("hydra:\n  searchpath: [pkg://antigravity]", "options of Hydra itself"),
+        ("hydra.searchpath: [pkg://antigravity]", "options of Hydra itself"),
+        ("defaults:\n  - override hydra/launcher: antigravity", "options of Hydra itself"),
+        ("defaults:\n  - /hydra/launcher@_global_: antigravity", "options of Hydra itself"),
+        ("defaults:\n  - ../../elsewhere", "outside of its folder"),
+        ("# @package hydra\nsearchpath: [pkg://antigravity]", "Hydra's own options"),
+    ],
+)
+def test_a_hostile_file_in_conf_is_one_line_before_hydra_reads_it(conf: Path, text: str | bytes, message: str) -> None:
+    (conf / "dataset" / "mine.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ConfigurationError) as caught:
+        config_checks.check_local_files()
+    assert message in str(caught.value)
+    assert "mine.yaml" in str(caught.value)
+
+
+def test_pipes_and_loops_of_links_in_conf_hold_nothing_up(conf: Path) -> None:
+    (conf / "dataset" / "again").symlink_to(conf)
+    config_checks.check_local_files()
+    os.mkfifo(conf / "dataset" / "mine.yaml")
+    with pytest.raises(ConfigurationError, match="a pipe"):
+        config_checks.check_local_files()
+
+
+def test_a_changed_file_in_conf_is_looked_at_again_and_a_broken_one_left_to_hydra(conf: Path) -> None:
+    file = conf / "dataset" / "mine.yaml"
+    file.write_text("a: [")
+    config_checks.check_local_files()
+    file.write_text("hydra: {}")
+    with pytest.raises(ConfigurationError, match="Hydra"):
+        config_checks.check_local_files()
+    file.write_text("name: mine")
+    with use_limits(Limits(text_bytes=5)), pytest.raises(ConfigurationError, match=r"limits\.text_bytes"):
+        config_checks.check_local_files()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"a": "${oc.decode:x}"}, "only ${KEY} and ${oc.env:VARIABLE,DEFAULT} are followed"),
+        ({"a": "${hydra:runtime.cwd}"}, "only ${KEY}"),
+        ({"a": "${oc.create:{b: 1}}"}, "reference inside a reference, or one that does not end"),
+        ({"a": "${b${c}}", "c": "d"}, "reference inside a reference"),
+        ({"a": "${b}", "b": "${a}"}, "refers to itself"),
+        ({"a": ["${a}"]}, "refers to itself"),
+        ({"b0": "x" * 100, **{f"b{n}": f"${{b{n - 1}}}" * 10 for n in range(1, 12)}}, "characters, more than the limit"),
+        ({"b0": ["x"] * 10, **{f"b{n}": [f"${{b{n - 1}}}"] * 10 for n in range(1, 12)}}, "characters, more than the limit"),
+    ],
+)
+def test_references_that_compute_or_explode_are_one_line(content: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        config_checks.check_references(content)
+    assert message in str(caught.value)
+
+
+def test_references_to_keys_and_environment_variables_are_followed() -> None:
+    content = {
+        "root": "${oc.env:VEHEST_DATA,null}",
+        "dataset": {"path": "${root}/revs", "name": "${.path}", "b": "${oc.env:A}", "c": "${x.y}"},
+    }
+    config_checks.check_references(content)
+
+
+def test_shapes_of_shared_groups_are_checked() -> None:
+    good = {"output": "o", "limits": {}, "downsample": {"method": "decimate"}, "tracking": {"name": "none"}, "seed": 0}
+    config_checks.check_shape(good, "train")
+    for changes, message in (
+        ({"output": 3}, "output must be text, not 3"),
+        ({"output": ""}, "output must name a folder"),
+        ({"root": ["a"]}, "root must be text"),
+        ({"downsample": "polyphase"}, "downsample must be a group of options"),
+        ({"downsample": {"method": "magic"}}, "downsample.method 'magic' is not one of: polyphase, decimate"),
+        ({"downsample": {"transforms": {}}}, "downsample.transforms must be a list"),
+        ({"tracking": {"name": "mlflow", "uri": 3}}, "tracking.uri must be text"),
+        ({"tracking": "mlflow"}, "tracking must be a group of options"),
+        ({"estimator": {}}, "estimator.name is missing"),
+        ({"limits": 3}, "limits must be a mapping"),
+    ):
+        with pytest.raises(ConfigurationError) as caught:
+            config_checks.check_shape({**good, **changes}, "train")
+        assert message in str(caught.value)
+
+
+def test_wrong_values_on_the_command_line_name_their_keys() -> None:
+    for override, message in (("tracking.uri=3", "tracking.uri must be text"), ("downsample.method=magic", "downsample.method 'magic'")):
+        with pytest.raises(ConfigurationError, match=message):
+            compose_config("train", [override])
+
+
+@pytest.mark.parametrize("override", ["hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil", "+tracking@hydra.job=none"])
+def test_no_override_reaches_hydra_itself(override: str) -> None:
+    with pytest.raises(ConfigurationError, match="sets an option of Hydra itself, or leaves conf/"):
+        compose_config("train", [override])
+
+
+def test_the_protocol_is_read_with_its_types() -> None:
+    assert protocol_from_config({"rate_hz": 20, "initial_state": False, "sequence_seconds": None}).rate_hz == 20.0
+    for wrong in (
+        {"rate_hz": "20"},
+        {"rate_hz": True},
+        {"initial_state": 1},
+        {"sequence_seconds": [1]},
+        {"rate": 20},
+        {"rate_hz": float("inf")},
+    ):
+        with pytest.raises(ConfigurationError, match=r"^evaluation\."):
+            protocol_from_config(wrong)
+
+
+def test_transforms_are_read_with_their_types() -> None:
+    assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": "ay"}) is not None
+    for wrong in ({"cutoff_hz": "5"}, {"cutoff_hz": True}, {"cutoff_hz": 5, "direction": "sideways"}, {"cutoff_hz": 5, "zero": 1}, {}):
+        with pytest.raises(ConfigurationError, match=r"transform 'low_pass': "):
+            transform_from_config({"name": "low_pass", **wrong})
+    assert Preparation(transforms=({"name": "low_pass", "cutoff_hz": 5.0},)).as_plain()["transforms"] == [
+        {"name": "low_pass", "cutoff_hz": 5.0}
+    ]
+
+
+TABULAR = {"name": "mine", "source": "tabular", "rate_hz": 100}
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rate_hz": "100"}, "dataset.rate_hz must be a number, not '100'"),
+        ({"rate_hz": float("nan")}, "dataset.rate_hz must be a number, not nan"),
+        ({"clock": 3}, "dataset.clock '3' is not one of: strict, interpolate"),
+        ({"gappy": "vx"}, "dataset.gappy must be a list"),
+        ({"files": 3}, "dataset.files must be text"),
+        ({"skip_rows": 1.5}, "dataset.skip_rows must be a whole number"),
+        ({"channels": [1]}, "dataset.channels must be a mapping"),
+        ({"channels": {"vx": 3}}, "channel 'vx' must say column, unit"),
+        ({"channels": {"vx": {"column": 3.5, "unit": "m/s"}}}, "channel 'vx': column must be text"),
+        ({"channels": {"vx": {"column": "v"}}}, "channel 'vx': unit is missing"),
+        ({"channels": {"vx": {"column": "v", "unit": "m/s", "factor": True}}}, "factor must be a number"),
+        ({"title": 3}, "dataset.title must be text"),
+        ({"accept": "gap"}, "dataset.accept must be a list"),
+        ({"kind": "dreamt"}, "dataset.kind 'dreamt' is not one of: real, simulated"),
+        ({"name": "../evil"}, "must be made of letters"),
+    ],
+)
+def test_a_data_set_that_does_not_fit_names_data_set_and_key(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        open_source(changed(TABULAR, **changes))
+    assert message in str(caught.value)
+    assert str(caught.value).startswith("data set")
+
+
+# ----------------------------------------------------------------------------------------------------------------- names
+
+
+def tree(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+names = st.one_of(st.sampled_from(HOSTILE), st.text(max_size=40), st.text(alphabet="./\\~ \0ab", max_size=12))
+
+
+@settings(max_examples=25, deadline=None)
+@given(label=names, stage=names, output=names, recording_id=names)
+def test_no_name_inside_a_file_leads_out_of_the_output_root(label: str, stage: str, output: str, recording_id: str) -> None:
+    with tempfile.TemporaryDirectory() as made_here:
+        root = Path(made_here)
+        inside = root / "a" / "b" / "out"
+        inside.mkdir(parents=True)
+        before = tree(root)
+        attempts: list[Callable[[], object]] = [
+            lambda: make(StagePlan(stage, label, {}, {}, "", inside), lambda folder: None),
+            lambda: save_checkpoint(plan(inside, label).checkpoint_folder, Checkpoint({}, {"epoch": 1})),
+            lambda: write_recording(recording(recording_id), inside / recording_file(recording_id)),
+            lambda: _downsampled_from(inside, output),
+        ]
+        for attempt in attempts:
+            try:
+                attempt()
+            except VehestError:
+                continue
+        assert all(name.startswith("a/b/out/") for name in tree(root) - before)
+
+
+def _downsampled_from(inside: Path, output: str) -> None:
+    """Downsample what a manifest names that somebody else has written."""
+    ingested = make(plan(inside, "ingested"), lambda folder: write_recording(recording(), folder / "lap.parquet"))
+    path = ingested.folder / "manifest.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps(changed(content, outputs={output: content["outputs"]["lap.parquet"]})))
+    target = plan(inside, "target").folder
+    target.mkdir(parents=True, exist_ok=True)
+    write_downsample(read_artefact(ingested.folder), {"rate_hz": 10.0, "method": "decimate", "transforms": []}, target)
+
+
+def test_formats_are_whole_numbers_between_the_oldest_and_the_newest() -> None:
+    assert check_format(1, 2, "'f'") == 1
+    for wrong in (0, 3, True, 1.5, None, "1"):
+        with pytest.raises(DataError, match="'f'"):
+            check_format(wrong, 2, "'f'")
+
+
+def test_whole_numbers_with_a_point_stay_as_they_are_where_anything_may_stand() -> None:
+    described = validated(Description, {"format": 1.0, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'")
+    assert described.format == 1
+    assert isinstance(described.format, int)
+    assert isinstance(described.settings["x"], float)
+
+
+def test_training_settings_within_training_settings_may_carry_the_name_of_their_file():
+    for name in ("cnn_ukf", "ensemble_ukf"):
+        config = compose_config("train", [f"estimator={name}"])
+        assert config["training"]["identification"]["name"] == "identification"
+        settings_from_config(estimator_class(name).training_type, config["training"], "training")

@@ -1,0 +1,278 @@
+"""A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps; and what is skipped or fails."""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from scipy import stats
+
+from vehest.data.errors import ConfigurationError
+from vehest.data.splits import Span, Split
+from vehest.evaluation.metrics import Protocol
+from vehest.report.heat_map import Panel, heat_map
+from vehest.run.artefacts import StagePlan
+from vehest.run.completion import complete_override
+from vehest.run.sweep import plan_sweep
+from vehest.run.train import TrainJob
+from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of
+
+QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
+GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")
+
+
+def jobs_of(scores: dict[tuple[object, ...], dict[str, list[float]]], keys: tuple[str, ...]) -> pd.DataFrame:
+    """A table of jobs from settings -> set -> RMSE(β) of each seed."""
+    rows = []
+    for number, (values, sets) in enumerate(scores.items()):
+        for seed in range(len(next(iter(sets.values())))):
+            figures = {f"rmse_sideslip.{name}": own[seed] for name, own in sets.items()}
+            settings = dict(zip(keys, values, strict=True))
+            rows.append({"combination": number, "title": f"combination {number}", **settings, "seed": seed, "status": "done", **figures})
+    return pd.DataFrame(rows).assign(error="", n_parameters=12, epochs=5.0)
+
+
+def artefacts_of(jobs: pd.DataFrame, keys: tuple[str, ...], kind: str = "simulated") -> SweepArtefacts:
+    spans = {name: Span("mine", name, -math.inf, math.inf) for name in ("one", "two", "three")}
+    split = Split("mine", (spans["one"],), (spans["two"],), {"test": (spans["three"],)})
+    return SweepArtefacts("s", "vehest sweep", keys, jobs, split, Protocol(20.0, 10.0, 1.5), {"mine": kind}, {"mine": "My car"}, ["facts"])
+
+
+# The statistics
+
+
+@pytest.mark.parametrize("n", [2, 3, 10])
+def test_interval_is_that_of_students_t(n):
+    values = np.random.default_rng(n).normal(0.4, 0.1, n)
+    mean, half = interval(values)
+    low, high = stats.t.interval(0.95, n - 1, loc=values.mean(), scale=stats.sem(values))
+    assert (mean - half, mean + half) == pytest.approx((low, high), rel=1e-12)
+
+
+def test_interval_covers_the_true_mean_nineteen_times_in_twenty():
+    draws = np.random.default_rng(0).normal(1.0, 0.2, (4000, 3))
+    inside = [abs(mean - 1.0) <= half for mean, half in map(interval, draws)]
+    assert np.mean(inside) == pytest.approx(0.95, abs=4 * math.sqrt(0.95 * 0.05 / 4000)), "within four standard errors of the count"
+
+
+def test_one_seed_has_a_mean_and_no_interval_and_a_lost_seed_is_not_dropped():
+    mean, half = interval(np.array([0.3]))
+    assert mean == 0.3
+    assert math.isnan(half)
+    assert all(map(math.isnan, interval(np.array([0.3, math.inf, 0.2]))))
+    assert all(map(math.isnan, interval(np.array([]))))
+
+
+def test_best_is_chosen_on_validation_though_another_is_better_on_the_test():
+    keys = ("estimator.n_local",)
+    jobs = jobs_of(
+        {
+            (2,): {"validation": [0.4, 0.5], "test": [0.1, 0.1]},
+            (3,): {"validation": [0.3, 0.4], "test": [0.8, 0.9]},
+            (4,): {"validation": [math.nan, 0.1], "test": [0.1, 0.1]},
+        },
+        keys,
+    )
+    table = summary(jobs, keys, ["validation", "test"])
+    assert table["chosen"].tolist() == [False, True, False]
+    assert table["rmse_sideslip.test"].tolist() == pytest.approx([0.1, 0.85, 0.1])
+    header, rows = table_of(artefacts_of(jobs, keys), table)
+    assert header == ["", "n_local", "parameters", "seeds", "validation", "test"]
+    assert [row[0] for row in rows] == ["", "*", ""]
+    assert rows[1][4] == "0.350 ± 0.635"
+    swapped = jobs.rename(columns={"rmse_sideslip.validation": "rmse_sideslip.test", "rmse_sideslip.test": "rmse_sideslip.validation"})
+    assert not summary(swapped, keys, ["test"])["chosen"].any(), "nothing is chosen without a validation range"
+
+
+def test_a_combination_with_a_failed_seed_is_shown_and_never_chosen():
+    keys = ("estimator.n_local",)
+    jobs = jobs_of({(2,): {"validation": [0.1, 0.1], "test": [0.1, 0.1]}, (3,): {"validation": [0.3, 0.4], "test": [0.8, 0.9]}}, keys)
+    jobs.loc[1, ["status", "rmse_sideslip.validation", "rmse_sideslip.test"]] = ["failed", math.nan, math.nan]
+    table = summary(jobs, keys, ["validation", "test"])
+    assert table["chosen"].tolist() == [False, True]
+    assert table["n_seeds"].tolist() == [1, 2]
+    assert table_of(artefacts_of(jobs, keys), table)[1][0][3] == "1 (1 failed)"
+
+
+# The pictures
+
+
+def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
+    def score(value: float) -> dict[str, list[float]]:
+        return {"validation": [value, value + 0.1], "test": [2 * value, 2 * value]}
+
+    keys = ("estimator.n_local", "estimator.n_hidden", "estimator.bias")
+    grid = {(p, q, bias): score(0.1 * p + 0.01 * q + bias) for p in (3, 2) for q in (0, 1, 2) for bias in (True, False)}
+    jobs = jobs_of(grid, keys)
+    made = heat_maps(artefacts_of(jobs, keys), summary(jobs, keys, ["validation", "test"]))
+    assert [figure.name for figure in made] == ["heat_map_validation", "heat_map_test"]
+    axes = [axes for axes in made[0].static.axes if axes.get_xlabel() == "n_local"]
+    assert [axes.get_title(loc="left") for axes in axes] == ["bias = true", "bias = false"]
+    assert [tick.get_text() for tick in axes[0].get_xticklabels()] == ["2", "3"], "sorted, though typed otherwise"
+    texts = {text.get_position(): text.get_text() for text in axes[1].texts}
+    half = stats.t.ppf(0.975, 1) * 0.05
+    assert texts[1, 2] == f"0.370\n±{half:.3f}"
+    without = jobs_of({(p, q): score(p + q) for p in (2, 3) for q in (0, 1)}, keys[:2])
+    assert len(heat_maps(artefacts_of(without, keys[:2]), summary(without, keys[:2], ["validation", "test"]))) == 2
+    for values, names in (
+        ({(2,): score(0.1), (3,): score(0.2)}, ("estimator.n_local",)),
+        ({(2, "gru"): score(0.1), (3, "lstm"): score(0.2)}, ("estimator.n_local", "estimator")),
+        ({(2, "gru", 1): score(0.1), (3, "lstm", 2): score(0.2)}, ("a.n", "estimator", "b.n")),
+        ({(2, 1, 1): score(0.1), (3, 2, 2): score(0.2)}, ("a.n", "b.n", "c.n")),
+    ):
+        others = jobs_of(values, names)
+        assert heat_maps(artefacts_of(others, names), summary(others, names, ["validation", "test"])) == []
+
+
+def test_darker_is_larger_and_a_missing_cell_is_grey():
+    figure = heat_map(
+        [Panel("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), (0, 0))], ["2", "3", "4"], ["0"], "P", "Q", "RMSE"
+    )
+    faces = [sum(patch.get_facecolor()[:3]) for patch in figure.axes[0].patches[:3]]
+    assert faces[0] > faces[1]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["0.100", "0.400", "–"]
+    red, green, blue, _ = figure.axes[0].patches[2].get_facecolor()
+    assert red == green == blue
+
+
+def test_report_names_command_budget_split_and_kind():
+    jobs = jobs_of({(2,): {"validation": [0.4, 0.5], "test": [0.1, 0.1]}}, ("estimator.n_local",))
+    for kind, shown in (("simulated", "**SIMULATED data:**"), ("real", "**real data:**")):
+        text = "\n".join(block for block in build(artefacts_of(jobs, ("estimator.n_local",), kind)).blocks if isinstance(block, str))
+        assert text.startswith(shown)
+        assert "Command: `vehest sweep`" in text
+        assert "Budget: 1 combinations, seeds 0, 1: 2 of 2 jobs done; training took 5 epochs" in text
+        assert "Split `mine`: training one (all)" in text
+        assert "Student's t" in text
+
+
+def test_report_says_how_many_others_the_interval_of_the_chosen_one_covers():
+    keys = ("estimator.n_local",)
+    scores = {(2,): [0.4, 0.5], (3,): [0.9, 0.9], (4,): [2.0, 2.1], (5,): [1.0, 1.1]}  # half interval of the first: 12.7 times 0.05
+    jobs = jobs_of({values: {"validation": own, "test": own} for values, own in scores.items()}, keys)
+    text = "\n".join(block for block in build(artefacts_of(jobs, keys)).blocks if isinstance(block, str))
+    assert "2 of the other 3 combinations have a mean on the validation range within its interval" in text
+
+
+# The command
+
+
+def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place):
+    code, out, err = place("sweep", *GRID, "--jobs", "1", "--json")
+    assert code == 0, err
+    outcome = json.loads(out)
+    folder = Path(outcome["folder"])
+    assert folder.parent == Path("outputs/sweep")
+    assert folder.name.startswith("ksnn-mine-")
+    jobs, table = pd.read_csv(folder / "sweep.csv"), pd.read_csv(folder / "summary.csv")
+    assert len(jobs) == 8
+    assert len(table) == 4
+    assert set(jobs["status"]) == {"done"}
+    own = jobs[(jobs["estimator.n_local"] == 3) & (jobs["estimator.n_hidden"] == 1)]["rmse_sideslip.test"]
+    row = table[(table["estimator.n_local"] == 3) & (table["estimator.n_hidden"] == 1)].iloc[0]
+    assert row["rmse_sideslip.test"] == pytest.approx(own.mean(), rel=1e-12)
+    assert row["rmse_sideslip_half.test"] == pytest.approx(stats.t.ppf(0.975, 1) * own.std() / math.sqrt(2), rel=1e-12)
+    assert outcome["chosen"]["combination"] == int(table["rmse_sideslip.validation"].idxmin())
+    for name in ("validation", "test"):
+        with Image.open(folder / "figures" / f"heat_map_{name}.png") as image:
+            assert image.width > 400
+        ElementTree.parse(folder / "figures" / f"heat_map_{name}.svg")
+    assert "SIMULATED" in (folder / "report.md").read_text()
+
+    by_hand = json.loads(place("eval", *QUICK, "estimator.n_local=3", "estimator.n_hidden=1", "seed=1", "--json")[1])
+    assert by_hand["rmse_sideslip.test"] == own.tolist()[1], "a job is what train and eval make"
+
+    made = place.files()
+    code, again, err = place("sweep", *GRID, "--jobs", "1", "--json")
+    assert code == 0, err
+    assert json.loads(again) == {**outcome, "skipped": True}
+    assert place.files() == made
+    assert {line.split()[0] for line in err.splitlines()} == {"skipped"}
+
+    code, out, err = place("sweep", *GRID[:-1], "seed=range(3)", "--jobs", "1", "--name", "more")
+    assert code == 0, err
+    assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 4, "only the third seeds were missing"
+    assert "± " in out
+    assert "outputs/sweep/more-" in out
+
+
+def test_failing_combinations_are_named_and_the_others_go_on(place):
+    arguments = (*QUICK, "estimator.n_hidden=-1,0,0.5", "training.learning_rate=0.001,1e6", "training.max_epochs=2", "seed=range(2)")
+    arguments = tuple(word for word in arguments if word != "training.max_epochs=1")
+    code, out, err = place("sweep", *arguments, "--jobs", "1", "--json")
+    assert code == 5
+    last = err.splitlines()[-1]
+    assert last.startswith("error: 10 of 12 jobs failed, the others are kept; ")
+    assert "n_hidden=-1, learning_rate=0.001" in last
+    assert "estimator.n_hidden must not be negative, not -1" in last
+    assert "Traceback" not in err
+    outcome = json.loads(out)
+    named = {entry["jobs"]: entry["message"] for entry in outcome["failed"]}
+    for seed in (0, 1):
+        assert "validation loss" in named[f"n_hidden=0, learning_rate=1000000.0 seed {seed}"]
+    assert outcome["chosen"]["training.learning_rate"] == 0.001
+    jobs = pd.read_csv(Path(outcome["folder"]) / "sweep.csv")
+    assert (jobs["status"] == "done").sum() == 2
+    assert jobs.loc[jobs["status"] == "failed", "error"].notna().all()
+    assert "## What failed" in (Path(outcome["folder"]) / "report.md").read_text()
+
+
+def test_a_single_combination_over_one_seed_has_no_interval_and_no_heat_map(place):
+    code, out, err = place("sweep", *QUICK, "estimator.n_hidden=0", "seed=4", "--quiet")
+    assert code == 0, err
+    assert "KS-NN linear no bias, P = 2" in out
+    assert "±" not in out.split("data\n", 1)[1]
+    folder = next((place.folder / "outputs" / "sweep").iterdir())
+    assert not (folder / "figures").exists()
+    assert pd.read_csv(folder / "summary.csv")["n_seeds"].tolist() == [1]
+
+
+def test_dry_run_tells_and_makes_nothing(place):
+    code, out, err = place("sweep", *GRID, "--dry-run")
+    assert code == 0
+    assert "n_local=3, n_hidden=1 seeds 0, 1" in err
+    assert "would   sweep      ksnn-mine" in err
+    assert out == ""
+    assert place.files() == set()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("split=mine,quickstart",), "'split' takes one value in a sweep"),
+        (("evaluation.rate_hz=10,20",), "'evaluation.rate_hz' takes one value"),
+        (("seed=1", "seed=2"), "'seed' is named twice"),
+        (("estimator.depth=1,2",), "unknown option 'estimator.depth'"),
+        (("estimator=gru", "estimator.n_states=0,-1"), "no combination can be trained; n_states=0: "),
+    ],
+)
+def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
+    with pytest.raises(ConfigurationError) as caught:
+        plan_sweep(["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides])
+    assert message in str(caught.value)
+
+
+def test_the_same_training_twice_is_refused_and_named(place):
+    code, _, err = place("sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0", "--jobs", "1")
+    assert code == 5
+    assert "checkpoint_seconds=20: it is the same training as checkpoint_seconds=10" in err.splitlines()[-1]
+
+
+def test_overrides_of_a_sweep_are_completed():
+    assert ("estimator.n_local=2", "default") in complete_override("eval", ["estimator=ksnn"], "estimator.n_l")
+
+
+def test_jobs_group_by_training_settings_that_come_in_groups():
+    def job(rate):
+        split = Split("any", (), (), {"test": (Span("any", "one", -math.inf, math.inf),)})
+        plan = StagePlan("train", "any", {}, {}, "", Path())
+        return TrainJob(plan, {"name": "ksnn"}, {"name": "sequences", "phase": {"learning_rate": rate}}, split, 0, {})
+
+    assert hash(job(1e-3).group) == hash(job(1e-3).group)
+    assert job(1e-3).group == job(1e-3).group != job(2e-3).group

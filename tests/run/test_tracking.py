@@ -1,0 +1,308 @@
+"""Runs in MLflow: in the local store, on a server of its own, and what happens when that server is away."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from place import Place
+from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
+from vehest.run.tracking import Tracker
+
+pytestmark = pytest.mark.apart
+
+STARTUP_SECONDS = 120.0  # of a server on a busy machine
+
+
+def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
+    code, _, err = place("run", "small", "--jobs", "1")
+    assert code == 0, err
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("vehest")
+    runs = {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])}
+    assert len(runs) == 13, "12 of stages, and one above them"
+    parent = runs.pop("small")
+    assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
+    trained = runs["ksnn-linear_no_bias_p2-seed0"]
+    (learnt,) = trained.inputs.dataset_inputs
+    assert (learnt.dataset.name, learnt.tags[0].value) == ("mine", "training")
+    assert trained.data.tags["mlflow.source.name"].startswith("vehest run small")
+    assert trained.data.params["estimator.n_local"] == "2"
+    assert trained.data.params["training.learning_rate"] == "0.001"
+    assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
+    kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
+    assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
+    evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
+    (output,) = client.get_run(trained.info.run_id).outputs.model_outputs
+    (used,) = client.get_run(evaluated.info.run_id).inputs.model_inputs
+    assert output.model_id == used.model_id
+    model = client.get_logged_model(output.model_id)
+    assert (model.model_type, str(model.status)) == ("ksnn", "READY")
+    assert evaluated.data.metrics["rmse_sideslip.test"] > 0
+    assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
+
+
+def test_training_goes_on_when_the_tracking_server_is_away(place):
+    code, _, err = place("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
+    assert code == 0
+    assert err.count("does not answer") == 1
+    assert "going on without tracking" in err
+
+
+TRAIN = ("train", "split=mine", "training.max_epochs=2")
+
+
+def _local(place: Place, stage: str = "") -> list:
+    """Runs in the local store, of one stage or of all."""
+    from mlflow import MlflowClient
+
+    client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
+    experiment = client.get_experiment_by_name("vehest")
+    runs = client.search_runs([experiment.experiment_id]) if experiment else []
+    return [run for run in runs if run.data.tags["vehest.stage"] == stage or (not stage and run.data.tags["vehest.stage"] != "study")]
+
+
+def _markers(place: Place) -> list[str]:
+    return sorted(file.name for file in (place.folder / "outputs" / "tracked").rglob("*") if file.is_file())
+
+
+def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Place, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as away:
+        away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
+        code, _, err = place("run", "small", "--jobs", "1")
+        assert code == 0, err
+        assert err.count("does not answer") == 1
+    assert _markers(place) == []
+    code, _, err = place("run", "small", "--jobs", "1")
+    assert code == 0, err
+    assert "done" not in err, "nothing is made again for it"
+    assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
+    assert len(_markers(place)) == 12
+
+
+def test_a_run_that_was_logged_and_not_marked_is_not_logged_twice(place: Place):
+    assert place(*TRAIN)[0] == 0
+    marked = _markers(place)
+    shutil.rmtree(place.folder / "outputs" / "tracked")
+    assert place(*TRAIN)[0] == 0
+    assert _markers(place) == marked
+    assert len(_local(place, "train")) == 1
+
+
+@pytest.mark.parametrize("step", ["log_batch", "log_artifact", "log_figure", "set_terminated"])
+def test_a_run_that_was_half_logged_is_completed(place: Place, monkeypatch: pytest.MonkeyPatch, step: str):
+    from mlflow import MlflowClient
+
+    with monkeypatch.context() as killed:
+        killed.setattr(MlflowClient, step, _raising(KeyboardInterrupt()))
+        assert place(*TRAIN)[0] == 130
+    assert [run.info.status for run in _local(place, "train")] == ["RUNNING"]
+    assert place(*TRAIN)[0] == 0
+    [run] = _local(place, "train")
+    assert run.info.status == "FINISHED"
+    client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
+    assert [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")] == [1, 2]
+    assert {"model.safetensors", "manifest.json", "figures"} <= {entry.path for entry in client.list_artifacts(run.info.run_id)}
+
+
+def test_an_unfinished_run_of_another_output_root_is_left_alone(place: Place, monkeypatch: pytest.MonkeyPatch):
+    from mlflow import MlflowClient
+
+    shared = f"tracking.uri=sqlite:///{place.folder / 'outputs' / 'mlflow.db'}"
+    (place.folder / "outputs").mkdir()
+    with monkeypatch.context() as killed:
+        killed.setattr(MlflowClient, "log_figure", _raising(KeyboardInterrupt()))
+        assert place(*TRAIN, shared, "output=there")[0] == 130
+    assert place(*TRAIN, shared, "output=here")[0] == 0
+    assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
+
+
+def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place: Place):
+    assert place(*TRAIN)[0] == 0
+    assert place(*TRAIN, "--force")[0] == 0
+    [run] = _local(place, "train")
+    tracker = Tracker({"name": "mlflow"}, place.folder / "outputs", pytest.fail)
+    [folder] = (place.folder / "outputs" / "train").iterdir()
+    artefact = read_artefact(folder)
+    assert run.data.tags["vehest.key"] == artefact.key
+    assert tracker.is_tracked(artefact)
+    other = replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64})
+    assert not tracker.is_tracked(other)
+    tracker.log(other, {}, {})
+    assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
+
+
+def test_a_store_that_is_gone_is_filled_again(place: Place):
+    assert place(*TRAIN)[0] == 0
+    (place.folder / "outputs" / "mlflow.db").unlink()
+    assert place(*TRAIN)[0] == 0
+    assert len(_local(place, "train")) == 1
+
+
+def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place):
+    assert place("run", "small", "--jobs", "1")[0] == 0
+    done = _in_process(
+        "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "False"
+
+
+FULL = "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); vehest.cli.main()"
+
+
+def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place: Place):
+    assert place(*TRAIN, "tracking=none")[0] == 0
+    full = _in_process(FULL, *TRAIN)
+    assert full.returncode == 0, full.stderr
+    assert full.stderr.count("going on without tracking") == 1
+    assert _markers(place) == []
+    assert not list((place.folder / "outputs").glob("*mlflow.db*")), "no half of a store stays"
+    code, _, err = place(*TRAIN)
+    assert code == 0, err
+    assert [run.info.status for run in _local(place, "train")] == ["FINISHED"]
+
+
+def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
+    assert place(*TRAIN)[0] == 0
+    store = place.folder / "outputs" / "mlflow.db"
+    with sqlite3.connect(store) as padded:  # larger than any other file, so that it alone reaches the limit
+        padded.execute("create table padding as select zeroblob(20000000) as zeros")
+    padded.close()
+    size = store.stat().st_size
+    full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
+    assert full.returncode == 0, full.stderr
+    assert full.stderr.count("going on without tracking") == 1
+    assert len(_markers(place)) < 14
+    code, _, err = place("run", "small", "--jobs", "1")
+    assert code == 0, err
+    assert len(_markers(place)) == 14
+    assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
+
+
+def _raising(error: BaseException):
+    def raises(*arguments, **options):
+        raise error
+
+    return raises
+
+
+def _in_process(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own, run by ``code``."""
+    own = [sys.executable, "-c", f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}", *arguments]
+    return subprocess.run(own, capture_output=True, text=True, check=False)
+
+
+@contextmanager
+def mlflow_server(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A real MLflow server on loopback, ready to answer: its address and its process."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    folder.mkdir()
+    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
+    command += ["--backend-store-uri", f"sqlite:///{folder / 'server.db'}", "--artifacts-destination", str(folder / "artifacts")]
+    with open(folder / "log", "wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
+    try:
+        _await_answer(f"http://127.0.0.1:{port}", process, folder / "log")
+        yield f"http://127.0.0.1:{port}", process
+    finally:
+        _kill(process)
+
+
+def _await_answer(address: str, process: subprocess.Popen[bytes], log: Path) -> None:
+    ends = time.monotonic() + STARTUP_SECONDS
+    while time.monotonic() < ends:
+        assert process.poll() is None, log.read_text()
+        try:
+            with urllib.request.urlopen(f"{address}/health", timeout=5):
+                return
+        except OSError:
+            time.sleep(0.1)
+    raise AssertionError(f"the server did not start:\n{log.read_text()}")
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _runs(client, name: str = "vehest") -> dict:
+    experiment = client.get_experiment_by_name(name)
+    return {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])} if experiment else {}
+
+
+def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_nothing(place: Place):
+    from mlflow import MlflowClient
+
+    with mlflow_server(place.folder / "server") as (address, process):
+        client = MlflowClient(address)
+        code, _, err = place("run", "small", "--jobs", "1", f"tracking.uri={address}")
+        assert code == 0, err
+        assert "does not answer" not in err
+        runs = _runs(client)
+        assert len(runs) == 13
+        trained = runs["ksnn-linear_no_bias_p2-seed1"]
+        assert trained.info.status == "FINISHED"
+        assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
+        kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
+        assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
+        assert not (place.folder / "outputs" / "mlflow.db").exists()
+
+        def fell_over() -> None:
+            while len(_runs(client, "second")) < 1:
+                time.sleep(0.05)
+            _kill(process)
+
+        watcher = threading.Thread(target=fell_over)
+        watcher.start()
+        again = ("run", "small", "--jobs", "1", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
+        code, out, err = place(*again)
+        watcher.join()
+    assert code == 0, err
+    assert err.count("does not answer") == 1
+    assert "going on without tracking" in err
+    assert "KS-NN linear no bias, P = 2" in out
+    assert len(list((place.folder / "again" / "train").iterdir())) == 4
+
+
+def test_a_server_that_hears_and_never_answers_is_given_up(place: Place, monkeypatch):
+    monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
+    with socket.socket() as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        deaf.listen()
+        uri = f"http://127.0.0.1:{deaf.getsockname()[1]}"
+        code, _, err = place("train", "split=mine", "training.max_epochs=1", f"tracking.uri={uri}")
+    assert code == 0
+    assert err.count("does not answer") == 1
+
+
+def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
+    from mlflow import MlflowClient
+
+    config = {"group": {f"value_{position}": position for position in range(250)}}
+    (tmp_path / MANIFEST).write_text("{}")
+    artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
+    said: list[str] = []
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, {}, {})
+    assert not said
+    [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}")).values()
+    assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}

@@ -1,0 +1,465 @@
+"""What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from conftest import planar_drive
+from place import DATASET, Place
+from vehest.data.contents import Contents, common_channels, contents_of, stored_contents
+from vehest.data.derived import WHEELS
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.data.schema import settings_from_config
+from vehest.data.store import write_recording
+from vehest.data.supplies import MAKES, supply_of
+from vehest.data.transforms import TRANSFORMS, transform_from_config
+from vehest.estimators.base import FitData
+from vehest.estimators.needs import lacking_to_train
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.config import compose_config
+from vehest.run.rates import at_estimator_rate, at_evaluation_rate
+from vehest.run.train import new_estimator
+from vehest.run.usable import all_usabilities, usability
+from vehest.training.context import FitContext
+
+RADIUS, RATIO = 0.32, 16.0
+VALUES = {"wheel_radius": RADIUS, "ratio": RATIO}
+"""What only the user knows of the car below."""
+
+FULL = {"vx", "yaw_rate", "ay", "ax", "steer", "vy_ref"}
+UNITS = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "ax": "m/s²", "steer": "rad", "handwheel": "rad"}
+UNITS |= {"vx_ref": "m/s", "vy_ref": "m/s", "sideslip_ref": "rad"} | {f"wheel_speed_{wheel}": "rad/s" for wheel in WHEELS}
+
+
+def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float = 30.0, name: str = "lap") -> Recording:
+    """A drive of which only these channels were logged."""
+    drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02, name=name)
+    steer = 2.5 * drive["yaw_rate"] / drive["vx"]
+    known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
+    known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
+    return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
+
+
+def rows(recording: Recording) -> dict[str, dict]:
+    return {row.estimator: row.as_plain() for row in all_usabilities([contents_of(recording)])}
+
+
+def with_values(entries: list[dict]) -> list[dict]:
+    return [{key: VALUES[key] if value is None else value for key, value in entry.items()} for entry in entries]
+
+
+def add_logged(place: Place, channels: set[str], rate_hz: float = 50.0, **options: object) -> None:
+    """A data set ``logged`` of three laps with these channels, and a split ``logged`` on it."""
+    folder = place.folder / "raw" / "logged"
+    folder.mkdir()
+    for seed, name in enumerate(("lap1", "lap2", "lap3"), 1):
+        lap = log(channels, rate_hz, seed)
+        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(folder / f"{name}.csv", index=False)
+    declared = {name: {"column": name, "unit": UNITS[name]} for name in sorted(channels)}
+    dataset = DATASET | {"name": "logged", "path": "${root}/logged", "time": {"column": "t", "unit": "s"}, "channels": declared, **options}
+    split = yaml.safe_load((place.folder / "conf" / "split" / "mine.yaml").read_text()) | {"name": "logged", "dataset": "logged"}
+    for role, lap in (("train", "lap1"), ("validation", "lap2")):
+        split[role] = [{"recording": lap}]
+    split["tests"] = {"test": [{"recording": "lap3"}]}
+    for group, content in (("dataset", dataset), ("split", split)):
+        (place.folder / "conf" / group / "logged.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+
+
+def add_study(place: Place, *sweeps: list[str], **options: object) -> None:
+    pipeline = {"study": "logged", "report": "drive", "split": "logged", "sweeps": list(sweeps), **options}
+    (place.folder / "pipelines" / "logged.yaml").write_text(yaml.safe_dump(pipeline))
+
+
+def models(place: Place) -> set[str]:
+    return {folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")}
+
+
+# What recordings have
+
+
+def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do(tmp_path):
+    vx = np.ones(40)
+    vx[3] = np.nan
+    recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
+    write_recording(recording, tmp_path / "gap.parquet")
+    assert (
+        stored_contents(tmp_path / "gap.parquet")
+        == contents_of(recording)
+        == Contents("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
+    )
+
+
+def test_table_of_someone_else_is_no_recording(tmp_path):
+    pd.DataFrame({"vx": [1.0]}).to_parquet(tmp_path / "other.parquet")
+    with pytest.raises(DataError, match="not a recording that vehest wrote"):
+        stored_contents(tmp_path / "other.parquet")
+
+
+# What estimators need
+
+
+IDENTIFIED = [f"training.identification.{setting}" for setting in ("method=data", "restarts=1", "generations=1")]
+QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
+
+
+@pytest.mark.parametrize("name", [name for name in estimator_names() if name != "data_sheet"])
+def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
+    """The table that stands beside the estimators against their own fits: without any one of the channels, no fit succeeds."""
+    config = compose_config("train", [f"estimator={name}", *QUICK.get(name, ())])
+    estimator = new_estimator(config["estimator"])
+    training = settings_from_config(estimator.training_type, config["training"], "training")
+    needed = lacking_to_train(estimator, training, ())
+    unread = {"learned_ukf": {"vx"}, "learned_ukf_variant": {"vx"}, "kalman": {"vx"}}.get(
+        name, set()
+    )  # their fits read other channels, their estimates this one
+    assert bool(needed) == estimator.learns
+    generator = np.random.default_rng(0)
+    channels = {channel: 10.0 + generator.normal(size=400) for channel in needed}
+    stops = name not in QUICK  # at once where a fit would go on; of these the filter is identified whole before the network is trained
+    for channel in set(needed) - unread:
+        held = {other: samples for other, samples in channels.items() if other != channel}
+        lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, held, "simulated")
+        fresh = new_estimator(config["estimator"])
+        with pytest.raises(DataError, match=f"'{channel}'|no {channel} "):
+            fresh.fit(FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops))
+
+
+def test_channels_of_a_settings_choice_and_references_of_outputs_count():
+    def needed(*overrides: str) -> set[str]:
+        config = compose_config("train", list(overrides))
+        estimator = new_estimator(config["estimator"])
+        return set(lacking_to_train(estimator, settings_from_config(estimator.training_type, config["training"], "training"), ()))
+
+    assert needed("estimator=sideslip_ffnn", "estimator.inputs=imu") == FULL
+    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]", "estimator.outputs=[vy]") == {"vx", "ay", "vy_ref"}
+    assert needed("estimator=velocity_gru", "estimator.inputs=[ay]") == {"vx", "ay", "vx_ref", "vy_ref", "yaw_rate_ref"}
+    assert needed("estimator=kalman") == {"vx", "yaw_rate", "ay", "steer"}, "noise levels are read off measured channels"
+    assert needed("estimator=zero") == set()
+
+
+def test_estimator_of_another_package_says_itself_what_it_learns_from():
+    kind = estimator_class("static_map")
+    other = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
+    assert set(lacking_to_train(other, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
+
+
+def test_estimator_without_a_file_in_conf_is_told_by_its_defaults():
+    found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [contents_of(log(FULL))])
+    assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
+
+
+# What could supply it
+
+
+LOGS = {
+    "speed and accelerations": {"vx", "yaw_rate", "ay", "sideslip_ref"},
+    "wheels": {"wheel_speed_rl", "wheel_speed_rr", "yaw_rate", "ay", "sideslip_ref"},
+    "handwheel": {"vx", "yaw_rate", "ay", "ax", "handwheel", "vy_ref"},
+    "all derived": {"wheel_speed_fl", "yaw_rate", "ay", "handwheel", "sideslip_ref"},
+    "reference speed": {"vx", "vx_ref", "yaw_rate", "ay", "ax", "steer", "sideslip_ref"},
+}
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 50.0])
+@pytest.mark.parametrize("channels", LOGS.values(), ids=list(LOGS))
+def test_every_transform_that_is_promised_makes_its_channel(channels, rate_hz):
+    recording = log(channels, rate_hz)
+    promised = {channel: entries for row in rows(recording).values() for channel, entries in row["supplies"].items()}
+    assert promised
+    for channel, entries in promised.items():
+        derived = recording
+        for entry in with_values(entries):
+            derived = transform_from_config(entry)(derived)
+        assert channel in derived
+        assert np.isfinite(derived[channel]).all()
+
+
+@pytest.mark.parametrize("channels", LOGS.values(), ids=list(LOGS))
+def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels):
+    recording = log(channels)
+    before = rows(recording)
+    entries = {json.dumps(entry): entry for row in before.values() for made in row["supplies"].values() for entry in with_values(made)}
+    for entry in sorted(entries.values(), key=lambda entry: entry["name"] != "speed_from_wheels"):  # others may need vx
+        recording = transform_from_config(entry)(recording)
+    after = rows(recording)
+    for name in ("ksnn", "gru", "lstm", "luenberger", "static_map", "kinematic", "zero"):
+        assert after[name]["usable"] == "yes", name
+    for name in before:
+        unsupplied = {*before[name]["missing_to_estimate"], *before[name]["missing_to_train"]} - set(before[name]["supplies"])
+        assert {*after[name]["missing_to_estimate"], *after[name]["missing_to_train"]} == unsupplied
+
+
+@pytest.mark.parametrize("name", ["dugoff_ukf", "sideslip_ffnn", "cnn_ukf", "ensemble_ukf", "velocity_gru", "velocity_lstm"])
+def test_settings_that_are_offered_make_the_estimator_usable(name):
+    contents = [contents_of(log(FULL))]
+    config = compose_config("train", [f"estimator={name}"])
+    plain = usability(name, config, contents)
+    assert plain.usable == "no"
+    changed = compose_config("train", [f"estimator={name}", *plain.as_plain()["settings"]])
+    assert usability(name, changed, contents).usable == "yes"
+
+
+def test_wheelbase_is_a_missing_setting_and_giving_it_helps():
+    contents = [contents_of(log(FULL))]
+    row = usability("data_sheet", compose_config("train", ["estimator=data_sheet"]), contents)
+    assert row.usable == "no"
+    assert "estimator.wheelbase=" in row.to_give
+    given = compose_config("train", ["estimator=data_sheet", "estimator.wheelbase=2.4"])
+    assert usability("data_sheet", given, contents).usable == "yes"
+
+
+def test_log_without_a_reference_will_do_for_models_from_elsewhere():
+    found = rows(log(FULL - {"vy_ref"}))
+    assert found["ksnn"]["usable"] == "not to train"
+    assert found["ksnn"]["missing_to_train"] == ["vy_ref"]
+    assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), "they learn nothing of a reference"
+
+
+def test_nothing_is_made_of_a_speed_with_gaps_or_of_channels_that_are_not_there():
+    assert supply_of("ax", {"vx"}, {"vx"}, 50.0) is None
+    assert supply_of("steer", {"vx", "yaw_rate"}, (), 50.0) is None
+    assert supply_of("vy_ref", {"sideslip_ref"}, (), 50.0) is None
+    assert supply_of("motor_current", set(UNITS), (), 50.0) is None
+
+
+def test_gaps_are_told_to_estimators_that_cannot_skip_them():
+    drive = log(FULL)
+    ay = drive["ay"].copy()
+    ay[10] = np.nan
+    found = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
+    assert found["ksnn"]["gaps"] == ["ay"]
+    assert found["kalman"]["gaps"] == [], "it skips a sample of ay"
+
+
+def test_channels_count_that_every_recording_has():
+    one, other = contents_of(log(FULL)), contents_of(log(FULL - {"ax"}, name="other"))
+    assert common_channels([one, other]) == FULL - {"ax"}
+    assert usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
+
+
+def test_every_transform_that_makes_a_channel_is_known():
+    assert set(MAKES) <= set(TRANSFORMS)
+    recording = log(set(UNITS))
+    for name, channel in MAKES.items():
+        options = {"speed_from_wheels": {"wheel_radius": RADIUS}, "steering_ratio": {"ratio": RATIO}}.get(name, {})
+        lacking = recording.select([own for own in recording.channels if own != channel])
+        assert channel in transform_from_config({"name": name, **options})(lacking)
+
+
+# The table
+
+
+def test_table_names_all_estimators_and_json_says_the_same(place):
+    add_logged(place, LOGS["wheels"])
+    place("ingest", "logged")
+    code, out, _ = place("data", "usable", "logged", "--json")
+    assert code == 0
+    told = json.loads(out)
+    assert {row["estimator"] for row in told["estimators"]} == set(estimator_names())
+    assert told["rate_hz"] == 50.0
+    assert told["missing_to_score"] == ["vx", "vy_ref"]
+    ksnn = next(row for row in told["estimators"] if row["estimator"] == "ksnn")
+    assert ksnn["missing_to_estimate"] == ["vx", "ax"]
+    assert ksnn["missing_to_train"] == ["vx", "ax", "vy_ref"]
+    assert ksnn["supplies"]["ax"] == [{"name": "speed_from_wheels", "wheel_radius": None}, {"name": "acceleration_from_speed"}]
+    code, out, _ = place("data", "usable", "logged")
+    assert code == 0
+    words = " ".join(out.split())
+    assert "luenberger no 50 Hz, not 100" in words
+    assert "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]" in words
+
+
+def test_bare_file_is_told_by_its_columns(place):
+    lap = log({"vx", "yaw_rate", "ay"})
+    table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
+    table.to_csv("lap.csv", index=False)
+    code, out, _ = place("data", "usable", "lap.csv", "--json")
+    assert code == 0
+    assert json.loads(out)["unused_columns"] == ["AccX", "Steering"]
+    assert "columns that no channel uses: AccX, Steering" in place("data", "usable", "lap.csv")[1]
+    assert place("data", "usable", "nowhere.csv")[0] == 2
+
+
+# Before anything is trained
+
+
+def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which_works(place):
+    add_logged(place, LOGS["speed and accelerations"])
+    code, line = place.refused("train", "estimator=luenberger", "split=logged", "tracking=none")
+    assert code == 3
+    assert (
+        "recording 'lap1' and 1 more lack what estimator 'luenberger' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)"
+        in line
+    )
+    assert "vy_ref (transforms: [{name: velocity_from_sideslip}] of sideslip_ref and vx)" in line
+    assert "'vehest data usable logged'" in line
+    assert not list((place.folder / "outputs").glob("downsample/*")), "it is said before recordings are resampled"
+    file = place.folder / "conf" / "dataset" / "logged.yaml"
+    transforms = [{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}]
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"transforms": transforms}, allow_unicode=True))
+    few = ("training.grid=1", "training.max_evaluations=10")
+    code, _, err = place("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
+    assert code == 0, err
+
+
+def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
+    add_logged(place, FULL - {"ax", "steer"})
+    add_study(place, ["estimator=zero"], ["estimator=static_map"], ["estimator=ksnn", "seed=0,1"], ["estimator=kalman"])
+    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    assert code == 5
+    told = json.loads(out)
+    assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "static_map"}
+    reasons = {name.split("-")[0]: reason for name, reason in told["failed"].items()}
+    assert set(reasons) == {"ksnn", "kalman"}
+    assert "lack what estimator 'ksnn' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)" in reasons["ksnn"]
+    assert "steer (not in the log)" in reasons["kalman"]
+    assert models(place) == {"zero", "static_map"}
+    lines = [line.split() for line in err.splitlines()]
+    said = [position for position, line in enumerate(lines) if line[0] == "failed"]
+    made = [position for position, line in enumerate(lines) if line[:2] in (["done", "train"], ["done", "downsample"])]
+    assert len(said) == 2
+    assert max(said) < min(made)
+    assert "seeds 0, 1" in " ".join(lines[said[0]])
+    code, again, _ = place("report", "logged", "--json", "tracking=none")
+    assert (code, json.loads(again)["failed"].keys()) == (5, told["failed"].keys())
+
+
+def test_study_none_of_whose_candidates_will_do_trains_nothing(place):
+    add_logged(place, {"vx", "yaw_rate", "vy_ref"})
+    add_study(place, ["estimator=ksnn"], ["estimator=kalman"])
+    code, _, err = place("run", "logged", "--jobs", "1", "tracking=none")
+    assert code == 3
+    assert "none of these estimators can be used with the recordings of split 'logged'" in err.splitlines()[-1]
+    assert not models(place)
+
+
+def test_recordings_without_the_reference_that_scores_are_refused_for_all(place):
+    add_logged(place, FULL - {"vy_ref"})
+    add_study(place, ["estimator=zero"], ["estimator=kalman"])
+    code, _, err = place("run", "logged", "--jobs", "1", "tracking=none")
+    assert code == 3
+    assert "vy_ref (not in the log)" in err.splitlines()[-1]
+    assert not models(place)
+
+
+def test_channels_that_the_downsampling_makes_are_not_missing(place):
+    add_logged(place, (FULL - {"steer"}) | {"handwheel"})
+    made = f"downsample.transforms=[{{name: steering_ratio, ratio: {RATIO}}}]"
+    add_study(place, ["estimator=kalman", made])
+    assert place("run", "logged", "--jobs", "1", "--json", "tracking=none")[0] == 0
+
+
+def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(place):
+    add_logged(place, FULL - {"steer"})
+    code, out, err = place("sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none", "--jobs", "1")
+    assert code == 5
+    told = json.loads(out)
+    assert [row["estimator"] for row in told["summary"] if row["rmse_sideslip.test"] is not None] == ["static_map"]
+    assert "steer (not in the log)" in told["failed"][0]["message"]
+    assert models(place) == {"static_map"}
+    assert err.index("steer (not in the log)") < err.index("static_map")
+
+
+# Rates
+
+
+def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
+    add_logged(place, FULL)
+    few = ("estimator=luenberger", "split=logged", "tracking=none", "training.grid=1", "training.max_evaluations=10")
+    code, out, err = place("train", *few, "--json")
+    assert code == 0, err
+    said = "luenberger runs at 50 Hz instead of its 100 Hz, since recording 'lap1' is sampled at 50 Hz"
+    assert " ".join(err.split()).count(said) == 1
+    folder = Path(json.loads(out)["model"])
+    assert yaml.safe_load((folder / "model.yaml").read_text())["settings"]["rate_hz"] == 50.0
+    assert json.loads((folder / "manifest.json").read_text())["config"]["estimator"]["rate_hz"] == 50.0
+    assert place("eval", *few, "--json")[0] == 0, "it finds the model by the same overrides"
+    assert place("eval", "--model", str(folder), "split=logged", "tracking=none")[0] == 0
+    same = json.loads(place("train", *few, "estimator.rate_hz=50.0", "--json")[1])
+    assert (same["model"], same["skipped"]) == (str(folder), True), "the same training as if the rate had been given"
+
+
+def test_rate_that_an_override_asks_for_is_not_lowered(place):
+    add_logged(place, FULL)
+    code, line = place.refused("train", "estimator=luenberger", "estimator.rate_hz=100", "split=logged", "tracking=none")
+    assert code == 3
+    assert "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less" in line
+
+
+def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
+    add_logged(place, FULL)
+    add_study(place, ["estimator=zero"], ["estimator=kalman"], ["estimator=static_map", "estimator.rate_hz=100"])
+    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    assert code == 5
+    told = json.loads(out)
+    assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "kalman"}
+    assert [name.split("-")[0] for name in told["failed"]] == ["static_map"]
+    assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
+    report = (Path(told["report"]).parent / "report.md").read_text(encoding="utf-8")
+    assert "kalman runs at 50 Hz instead of its 100 Hz" in report
+    assert "Recordings at 20 and 50 Hz" in report
+
+
+def test_study_whose_rates_were_lowered_is_recognised_when_it_is_finished(place):
+    add_logged(place, FULL)
+    add_study(place, ["estimator=kalman"])
+    first = place("run", "logged", "--jobs", "1", "tracking=none")
+    second = place("run", "logged", "--jobs", "1", "tracking=none")
+    assert (first[0], second[0], second[1]) == (0, 0, first[1])
+    assert list((place.folder / "outputs" / "finished").iterdir())
+    assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(second[2].split())
+
+
+def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
+    add_logged(place, FULL, rate_hz=10.0)
+    add_study(place, ["estimator=static_map"], ["estimator=ksnn", "estimator.window=10", "training.max_epochs=2"])
+    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    assert code == 0, err
+    words = " ".join(err.split())
+    assert words.count("evaluation reads estimates at 10 Hz instead of 20 Hz") == 1
+    assert "ksnn runs at 10 Hz instead of its 20 Hz" in words
+    assert "estimator.window of 10 samples lasts 1 s instead of 0.5 s (estimator.window=5 keeps that)" in words
+    metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
+    assert set(metrics["rate_hz"]) == {10.0}
+    code, _, err = place("run", "logged", "evaluation.rate_hz=20", "--jobs", "1", "tracking=none")
+    assert code == 3
+    assert "evaluation.rate_hz asks for 20 Hz, and recording 'lap1' is sampled at 10 Hz" in err.splitlines()[-1]
+
+
+def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
+    add_logged(place, FULL)
+    file = place.folder / "conf" / "split" / "logged.yaml"
+    split = yaml.safe_load(file.read_text())
+    split["tests"]["other"] = [{"dataset": "mine", "recording": "three"}]  # sampled at 100 Hz
+    file.write_text(yaml.safe_dump(split))
+    add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
+    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    assert code == 0, err
+    assert "luenberger runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
+    assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
+
+
+def test_rates_that_recordings_have_are_left_alone():
+    config, limit = compose_config("eval", ["estimator=luenberger"]), Contents("lap", 100.0, frozenset())
+    assert at_estimator_rate(config, limit) == (config, ())
+    assert at_evaluation_rate(config, limit) == (config, ())
+
+
+def test_setting_that_makes_no_sense_at_the_lower_rate_is_told_with_it():
+    config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
+    with pytest.raises(DataError, match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window"):
+        at_estimator_rate(config, Contents("lap", 20.0, frozenset()))
+
+
+def test_lengths_that_a_training_counts_in_samples_are_told():
+    config = compose_config("eval", ["estimator=velocity_gru"])
+    _, (note,) = at_estimator_rate(config, Contents("lap", 50.0, frozenset()))
+    assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in note.told
