@@ -1,21 +1,72 @@
-"""A comparison of estimators on one split: sweeps of trainings and the evaluations they feed."""
+"""A comparison of estimators on one split, from its jobs to what the report stage draws.
+
+jobs -> `check` (rates, required channels) -> CheckedJobs -> `plan` (trainings in groups) -> Planned -> `Runner.run` -> `collect` -> Compared
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError, VehestError
+from vehest.data.split_files import dataset_names
+from vehest.data.splits import Split
+from vehest.run.artefacts import Artefact
 from vehest.run.config import Config
+from vehest.run.estimate import find_model, model_artefact
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import all_of, check_channels, faults_of
-from vehest.run.fitting import Fitted, fitted
 from vehest.run.group import Evaluation, Group, Member, existing, is_finished
-from vehest.run.starting import plan_training
-from vehest.run.train import TrainJob, new_estimator
-from vehest.run.workshop import NotThereYet, Workshop
+from vehest.run.rates import Note, at_estimator_rate, at_evaluation_rate, slowest
+from vehest.run.runner import Runner
+from vehest.run.signals import DryRunStop
+from vehest.run.study import Job
+from vehest.run.train import TrainJob, new_estimator, plan_train
+from vehest.run.usable import lack
+
+NO_TIME = "not done yet: no time was left, the same command goes on"
+
+
+@dataclass(frozen=True)
+class CheckedJobs:
+    """Jobs of one split at rates that its recordings have.
+
+    Args:
+        jobs: all of them.
+        failures: position of a job that cannot be done -> why.
+        notes: rates that were lowered, each once.
+    """
+
+    jobs: Sequence[Job]
+    failures: Mapping[int, Failure]
+    notes: Sequence[Note] = ()
+
+    @property
+    def usable(self) -> dict[int, Config]:
+        """Position -> configuration of the jobs that can be done."""
+        return {position: job.config for position, job in enumerate(self.jobs) if position not in self.failures}
+
+
+@dataclass(frozen=True)
+class Planned:
+    """Trainings of a comparison.
+
+    Args:
+        checked: its jobs.
+        trainings: position of a job -> its training.
+        failures: position of a job that cannot be done -> why.
+        groups: trainings that fit one batch, with their evaluation.
+        evaluation: split, references and protocol of all of them.
+    """
+
+    checked: CheckedJobs
+    trainings: Mapping[int, TrainJob]
+    failures: Mapping[int, Failure]
+    groups: Sequence[Group]
+    evaluation: Evaluation
 
 
 @dataclass(frozen=True)
@@ -23,189 +74,303 @@ class Compared:
     """A comparison that has been run.
 
     Args:
-        members: trained and evaluated, in the order of the pipeline.
-        evaluation: split, references and protocol.
+        title: for people; none in a study that is not in parts.
+        planned: its jobs and trainings.
+        found: key of a training -> its member.
+        failures: position of a job -> why it failed.
         data_titles: data set -> title, for people.
-        facts: how recordings were prepared and what each training scheme was allowed, a line each.
-        n_groups: groups of jobs there were.
-        failures: name of a group that failed, and why; its members are missing.
-        unfinished: jobs for which no time was left, by name.
+        training: how recordings were prepared and the budget of each training scheme, a line each.
     """
 
-    members: Sequence[Member]
-    evaluation: Evaluation
-    data_titles: dict[str, str]
-    facts: Sequence[str]
-    n_groups: int
-    failures: Sequence[tuple[str, Failure]]
-    unfinished: Sequence[str] = ()
+    title: str
+    planned: Planned
+    found: Mapping[str, Member]
+    failures: Mapping[int, Failure]
+    data_titles: Mapping[str, str]
+    training: Sequence[str]
 
+    @property
+    def evaluation(self) -> Evaluation:
+        """Split, references and protocol."""
+        return self.planned.evaluation
 
-def prepare(configs: Sequence[Config], workshop: Workshop) -> Fitted:
-    """Fit the jobs of a comparison to its recordings, and say which of them lack something, before anything is trained.
+    @property
+    def members(self) -> list[Member]:
+        """Trained and evaluated members in the order of the jobs."""
+        keys = dict.fromkeys(training.plan.key for training in self.planned.trainings.values())
+        return [self.found[key] for key in keys if key in self.found]
 
-    Raises:
-        ConfigurationError: the jobs do not fit one comparison, or a setting makes no sense.
-        DataError: no job can be done, or the evaluation asks for more than the rate of the recordings.
-        NotThereYet: in a dry run, after saying what would be trained.
-    """
-    for config in configs:
-        for key in ("split", "evaluation", "downsample"):
-            if config[key] != configs[0][key]:
-                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
-    try:
-        found = fitted(configs, workshop)
-    except NotThereYet:
-        _say_plan(configs, workshop)
-        raise
-    lacking = _lacking(found)
-    for name, failure in lacking:
-        workshop.messages.line("fail", "train", name, failure.message)
-    if len(found.failures) == len(configs):
-        reasons = dict.fromkeys(failure.message for _, failure in lacking)
-        raise DataError(
-            f"none of these estimators can be used with the recordings of split '{configs[0]['split']['name']}'; {'; '.join(reasons)}"
+    @property
+    def unfinished(self) -> list[str]:
+        """Trainings for which no time was left, by name."""
+        left = [training.plan for at, training in self.planned.trainings.items() if at not in self.failures]
+        return list(dict.fromkeys(plan.label for plan in left if plan.key not in self.found))
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Name of what is left out -> why."""
+        return {name: failure.message for name, failure in named(self.failures, self.planned.checked.jobs)} | dict.fromkeys(
+            self.unfinished, NO_TIME
         )
-    return found
 
 
-def _lacking(found: Fitted) -> list[tuple[str, Failure]]:
-    """Jobs that cannot be done, those that differ in their seed alone under one name, as a group of them is called."""
-    named: dict[tuple[str, Failure], list[str]] = {}
-    for position, failure in found.failures.items():
-        config = found.configs[position]
-        estimator = new_estimator(config["estimator"])
-        named.setdefault((f"{estimator.name}-{estimator.variant}", failure), []).append(str(config["seed"]))
-    return [(f"{name} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}", failure) for (name, failure), seeds in named.items()]
-
-
-def _say_plan(configs: Sequence[Config], workshop: Workshop) -> None:
-    """What a dry run would train, where there are no recordings yet to plan with."""
-    for config in configs:
-        estimator = new_estimator(config["estimator"])
-        workshop.messages.line("plan", "train", f"{estimator.name}-{estimator.variant}-seed{config['seed']}", "then evaluate")
-
-
-def compare(prepared: Fitted, workshop: Workshop, command: str, *, only_report: bool = False) -> Compared:
-    """Train and evaluate every job; what is there is skipped, and what fails keeps no other from running.
+def check(jobs: Sequence[Job], runner: Runner) -> CheckedJobs:
+    """Fit jobs to the recordings of their split, which are ingested for it, and find jobs that lack something; no samples are read.
 
     Args:
-        prepared: its jobs, which agree in split, evaluation and downsampling; from `prepare`.
-        workshop: where stages run.
-        command: the command that would train what is missing, for messages.
-        only_report: take what is there, train and evaluate nothing.
+        jobs: of one split; those that are refused already count as failed.
+        runner: prints rates that are lowered, and failures.
 
     Raises:
-        ConfigurationError: the jobs do not fit one comparison.
-        DataError: recordings cannot be brought to the evaluation's rate, or to that of any estimator.
-        MissingError: ``only_report`` and something is missing, or raw files are not here.
-        NotThereYet: in a dry run.
-        Stopped: a signal came.
+        ConfigurationError: a setting makes no sense.
+        DataError: no job can be done, or the evaluation is to read estimates more often than recordings are sampled.
+        DryRunStop: in a dry run, if recordings would have to be made, after printing what would be trained.
     """
-    configs = [config for position, config in enumerate(prepared.configs) if position not in prepared.failures]
-    first = configs[0]
+    failures = {at: Failure(job.refusal, exit_code=ConfigurationError.exit_code) for at, job in enumerate(jobs) if job.refusal}
+    _print_failures(failures, jobs, runner)
+    first = next(job.config for job in jobs if not job.refusal)
     try:
-        groups, unplanned = groups_of(configs, workshop)
-    except NotThereYet:
-        _say_plan(configs, workshop)
+        split, contents = runner.split(first), runner.contents(first)
+    except DryRunStop:
+        runner.print_trainings([_labelled(job) for job in jobs if not job.refusal], ["evaluate"])
         raise
-    missing = [*_lacking(prepared), *unplanned]
-    n_groups = len(groups) + len(missing)
-    wanted = groups
-    if only_report:
-        wanted, absent = _finished(groups, command)
-        missing += absent
-    found, failures = workshop.run_groups(wanted)
-    members = [member for member in found if member.evaluation is not None]
-    order = {job.plan.key: position for position, job in enumerate(job for group in groups for job in group.jobs)}
-    members.sort(key=lambda member: order[member.job.plan.key])
-    evaluation = groups[0].evaluation
-    assert evaluation is not None
-    titles = {name: str(workshop.dataset_config(name, first)["dataset"].get("title", name)) for name in evaluation.split.datasets}
-    facts = [*training_facts(configs), resampling_fact(configs), *prepared.facts]
-    unfinished = _unfinished(wanted, members, failures)
-    return Compared(members, evaluation, titles, facts, n_groups, [*failures, *missing], unfinished)
+    limit, notes, reasons = slowest(contents), dict[Note, None](), dict[str, str]()
+    lacking: dict[int, Failure] = {}
+    checked = list(jobs)
+    for position, job in enumerate(jobs):
+        if job.refusal:
+            continue
+        config, lowered = at_evaluation_rate(job.config, limit)
+        try:
+            config, more = at_estimator_rate(config, limit)
+            same = json.dumps([config["estimator"], config["training"]], sort_keys=True, default=str)
+            if same not in reasons:
+                reasons[same] = lack(config, split, contents)
+            if reasons[same]:
+                raise DataError(reasons[same])
+            notes |= dict.fromkeys((*lowered, *more))
+        except DataError as error:
+            lacking[position] = failure_of(error)
+        checked[position] = replace(job, config=config)
+    for note in notes:
+        runner.print_note(note)
+    _print_failures(lacking, checked, runner)
+    if lacking and len(failures) + len(lacking) == len(jobs):
+        reasons_of_all = dict.fromkeys(failure.message for failure in lacking.values())
+        raise DataError(f"none of these estimators can be used with the recordings of split '{split.name}'; {'; '.join(reasons_of_all)}")
+    return CheckedJobs(checked, failures | lacking, tuple(notes))
 
 
-def _unfinished(groups: Sequence[Group], members: Sequence[Member], failures: Sequence[tuple[str, Failure]]) -> list[str]:
-    """Jobs that were neither done nor failed, since the time was up, by name."""
-    done = {member.job.plan.key for member in members}
-    failed = {name for name, _ in failures}
-    return [job.plan.label for group in groups if group.name not in failed for job in group.jobs if job.plan.key not in done]
+def check_job(config: Config, runner: Runner) -> Config:
+    """Fit one job to the recordings of its split.
+
+    Raises:
+        DataError: recordings lack what its estimator needs, or an override asks for more than their rate.
+        DryRunStop: in a dry run, if recordings would have to be made.
+    """
+    try:
+        return check([Job(config)], runner).jobs[0].config
+    except DataError as error:
+        names = ", ".join(f"'vehest data usable {name}'" for name in dataset_names(config["split"]))
+        raise DataError(f"{error}; {names} says what each estimator needs") from None
 
 
-def _finished(groups: Sequence[Group], command: str) -> tuple[list[Group], list[tuple[str, Failure]]]:
-    """What of the groups is there, and what is missing, by name.
+def check_evaluation(config: Config, runner: Runner) -> Config:
+    """Fit the evaluation alone, of a model that has its rate.
+
+    Raises:
+        DataError: an override asks for more than the rate of the recordings.
+        DryRunStop: in a dry run, if recordings would have to be made.
+    """
+    config, notes = at_evaluation_rate(config, slowest(runner.contents(config)))
+    for note in notes:
+        runner.print_note(note)
+    return config
+
+
+def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
+    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
+
+    Raises:
+        ConfigurationError: a setting that makes no sense.
+        DataError: the split names a recording that the data set does not have.
+        MissingError: the model to start from is not there.
+    """
+    job = plan_train(config, split, data)
+    start = config["training"].get("start_from")
+    if start is None:
+        return job
+    folder = find_model(str(start), job.plan.output, lambda _: None)
+    plan = replace(job.plan, inputs={**job.plan.inputs, f"start from {start}": model_artefact(folder).digest})
+    return replace(job, plan=plan, training={**job.training, "start_from": str(folder.resolve())})
+
+
+def plan(checked: CheckedJobs, runner: Runner, *, sweep: bool = False) -> Planned:
+    """The trainings of a comparison in groups that fit one batch, with the data they need, which are made on the way.
+
+    Args:
+        checked: its jobs, from `check`.
+        runner: makes data.
+        sweep: whether jobs are those of a sweep, each of which is evaluated under its own faults and may fail alone; those of a study
+            are all evaluated under the faults of all.
+
+    Raises:
+        ConfigurationError: the split has no test ranges, or two trainings have one name.
+        DataError: there are no data for any job.
+        DryRunStop: in a dry run, if data would have to be made, after printing what would be trained.
+    """
+    first = next(iter(checked.usable.values()))
+    split, protocol = runner.split(first), protocol_from_config(first["evaluation"])
+    if not any(split.tests.values()):
+        raise ConfigurationError(f"split '{split.name}' has no test ranges; a {'sweep' if sweep else 'study'} needs some")
+    trainings: dict[int, TrainJob] = {}
+    failures: dict[int, Failure] = {}
+    names: dict[Any, Any] = {}
+    try:
+        references = runner.references_for(split, protocol.rate_hz, first)
+        for position, config in checked.usable.items():
+            try:
+                data = runner.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
+                training = plan_training(config, split, data)
+                check_channels(faults_of(config), split, data)
+                _check_name(checked.jobs[position], training, names, sweep=sweep)
+                trainings[position] = training
+            except VehestError as error:
+                if not sweep and not isinstance(error, DataError):
+                    raise
+                failures[position] = failure_of(error)
+    except DryRunStop:
+        runner.print_trainings([_labelled(checked.jobs[position]) for position in checked.usable], ["evaluate"])
+        raise
+    if not trainings:
+        raise DataError("; ".join(dict.fromkeys(failure.message for failure in failures.values())))
+    _print_failures(failures, checked.jobs, runner)
+    evaluation = Evaluation(split, {}, references, runner.kinds_of(split, first), protocol, runner.output)
+    groups = _groups(checked.jobs, trainings, evaluation, runner.force, sweep=sweep)
+    return Planned(checked, trainings, {**checked.failures, **failures}, groups, evaluation)
+
+
+def _check_name(job: Job, training: TrainJob, names: dict[Any, Any], *, sweep: bool) -> None:
+    """Refuse a training that cannot be told from another.
+
+    Raises:
+        ConfigurationError: two combinations of a sweep are one training, or two trainings of a study have one name.
+    """
+    key = training.plan.key
+    if sweep:
+        twin = names.setdefault((key, faults_of(job.config)), job.label)
+        if twin != job.label:
+            raise ConfigurationError(f"it is the same training as {twin}")
+    elif names.setdefault(training.plan.label, key) != key:
+        raise ConfigurationError(
+            f"two jobs are both called {training.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
+        )
+
+
+def _groups(
+    jobs: Sequence[Job], trainings: Mapping[int, TrainJob], evaluation: Evaluation, force: frozenset[str], *, sweep: bool
+) -> list[Group]:
+    """Trainings that fit one batch; combinations of a sweep that differ in their fault alone share a training."""
+    faults = {position: faults_of(jobs[position].config) for position in trainings}
+    of_training: dict[str, list[int]] = {}
+    for position, training in trainings.items():
+        of_training.setdefault(training.plan.key, []).append(position)
+    groups: dict[tuple[Any, ...], Group] = {}
+    for positions in of_training.values():
+        first, training = jobs[positions[0]], trainings[positions[0]]
+        how = replace(evaluation, data=training.data, faults=all_of(faults[at] for at in (positions if sweep else trainings)))
+        key = (training.group, how.faults, first.batch)
+        group = groups.get(key, Group([], how, force, first.batch))
+        groups[key] = replace(group, jobs=[*group.jobs, training])
+    return list(groups.values())
+
+
+def only_there(planned: Planned, command: str) -> tuple[Planned, dict[str, Failure]]:
+    """A comparison without the trainings that are missing, and key of a training -> that it is missing.
 
     Raises:
         MissingError: nothing is there.
     """
-    found, missing = [], []
-    for group in groups:
-        there = [member for member in existing(group) if is_finished(group, member)]
+    groups: list[Group] = []
+    missing: dict[str, Failure] = {}
+    labels = []
+    for group in planned.groups:
+        found = existing(group)
+        there = [member.job for member in found if is_finished(group, member)]
         if there:
-            found.append(replace(group, jobs=[member.job for member in there]))
-        for job in group.jobs:
-            if all(member.job is not job for member in there):
-                missing.append((job.plan.label, Failure(f"has not been trained and evaluated; run '{command}' first", exit_code=4)))
-    if not found:
-        raise MissingError(f"{missing[0][0]} {missing[0][1].message}")
-    return found, missing
+            groups.append(replace(group, jobs=there))
+        for member in found:
+            if not is_finished(group, member):
+                labels.append(member.job.plan.label)
+                missing[member.job.plan.key] = Failure(f"has not been trained and evaluated; run '{command}' first", exit_code=4)
+    if not groups:
+        raise MissingError(f"{labels[0]} has not been trained and evaluated; run '{command}' first")
+    return replace(planned, groups=groups), missing
 
 
-def failed_in(compared: Iterable[Compared], workshop: Workshop) -> JobsFailedError | None:
-    """Say in full what failed; returns what the command ends with, if anything did."""
-    counted = list(compared)
-    failures = [failure for own in counted for failure in own.failures]
+def collect(title: str, planned: Planned, found: Mapping[str, Member], failed: Mapping[str, Failure], runner: Runner) -> Compared:
+    """The outcome of a comparison.
+
+    Args:
+        title: for people.
+        planned: what was run.
+        found: key of a training -> its member.
+        failed: key of a training -> why.
+        runner: knows the titles of data sets.
+    """
+    checked, configs = planned.checked, list(planned.checked.usable.values())
+    failures = dict(planned.failures)
+    for position, training in planned.trainings.items():
+        if training.plan.key in failed:
+            failures[position] = failed[training.plan.key]
+    evaluated = {key: member for key, member in found.items() if member.evaluation is not None}
+    datasets = {name: runner.dataset_config(name, configs[0])["dataset"] for name in planned.evaluation.split.datasets}
+    titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
+    facts = [*training_facts(configs), resampling_fact(configs), *(f"{note.what} {note.text}" for note in checked.notes)]
+    return Compared(title, planned, evaluated, failures, titles, facts)
+
+
+def named(failures: Mapping[int, Failure], jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
+    """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
+    seeds: dict[tuple[str, Failure], list[str]] = {}
+    for position, failure in failures.items():
+        seeds.setdefault((_stem(jobs[position]), failure), []).append(str(jobs[position].config.get("seed", "")))
+    return [
+        (f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}".removesuffix(" seed "), failure) for (stem, failure), own in seeds.items()
+    ]
+
+
+def failed_in(compared: Sequence[Compared], runner: Runner) -> JobsFailedError | None:
+    """Print tracebacks of defects; returns the error of all failures, if there are any."""
+    failures = [pair for own in compared for pair in named(own.failures, own.planned.checked.jobs)]
     if not failures:
         return None
     for name, failure in failures:
         if failure.detail:
-            workshop.messages.warn(f"{name}:\n{failure.detail}")
-    listed = "; ".join(f"{name}: {failure.message}" for name, failure in failures)
-    return JobsFailedError(
-        f"{len(failures)} of {sum(own.n_groups for own in counted)} groups of jobs failed, the others are kept; {listed}"
-    )
-
-
-def groups_of(configs: Sequence[Config], workshop: Workshop) -> tuple[list[Group], list[tuple[str, Failure]]]:
-    """Jobs that fit one batch, with the data they need, which is made on the way; and those whose data cannot be made, by name.
-
-    Raises:
-        DataError: there are no data for any.
-    """
-    groups: dict[tuple[Any, ...], list[TrainJob]] = {}
-    evaluations: dict[tuple[Any, ...], Evaluation] = {}
-    labels: dict[str, str] = {}
-    unplanned: dict[int, Failure] = {}
-    faults = all_of(map(faults_of, configs))  # all jobs of a comparison are scored under the same conditions
-    for position, config in enumerate(configs):
-        split = workshop.split(config)
-        if not any(split.tests.values()):
-            raise ConfigurationError(f"split '{split.name}' has no test ranges; a study needs some")
-        protocol = protocol_from_config(config["evaluation"])
-        references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-        try:
-            data = workshop.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
-        except DataError as error:
-            unplanned[position] = failure_of(error)
-            continue
-        job = plan_training(config, split, data)
-        if labels.setdefault(job.plan.label, job.plan.key) != job.plan.key:
-            raise ConfigurationError(
-                f"two jobs are both called {job.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
-            )
-        check_channels(faults, split, data)
-        own = groups.setdefault(job.group, [])
-        if all(job.plan.key != other.plan.key for other in own):  # which another job with another fault may be
-            own.append(job)
-        evaluations[job.group] = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output, faults)
-    if not groups:
-        raise DataError(next(iter(unplanned.values())).message)
-    failures = _lacking(Fitted(configs, unplanned))
+            runner.messages.warn(f"{name}:\n{failure.detail}")
+    reasons: dict[str, list[str]] = {}
     for name, failure in failures:
-        workshop.messages.line("fail", "train", name, failure.message)
-    return [Group(jobs, evaluations[key], workshop.force) for key, jobs in groups.items()], failures
+        reasons.setdefault(failure.message, []).append(name)
+    listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
+    n_failed, n_jobs = sum(len(own.failures) for own in compared), sum(len(own.planned.checked.jobs) for own in compared)
+    return JobsFailedError(f"{n_failed} of {n_jobs} jobs failed, the others are kept; {listed}")
+
+
+def _print_failures(failures: Mapping[int, Failure], jobs: Sequence[Job], runner: Runner) -> None:
+    for name, failure in named(failures, jobs) if len(jobs) > 1 else ():
+        runner.messages.line("fail", "train", name, failure.message)
+
+
+def _stem(job: Job) -> str:
+    """The name of a job without its seed."""
+    if job.label:
+        return job.label
+    estimator = new_estimator(job.config["estimator"])
+    return f"{estimator.name}-{estimator.variant}"
+
+
+def _labelled(job: Job) -> str:
+    return f"{_stem(job)} seed {job.config['seed']}" if job.label else f"{_stem(job)}-seed{job.config['seed']}"
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:
@@ -220,19 +385,14 @@ def resampling_fact(configs: Sequence[Config]) -> str:
     return f"Recordings at {' and '.join(f'{rate:g}' for rate in rates)} Hz are made from the native rate {how}{first}"
 
 
-def plain_resampling(config: Config) -> Config:
-    """The configuration for references: resampled like everything, but never filtered further."""
-    return {**config, "downsample": {**config["downsample"], "transforms": []}}
-
-
 def training_facts(configs: Sequence[Config]) -> list[str]:
-    """What each training scheme was allowed, a line each."""
-    facts = []
+    """The budget of each training scheme, a line each."""
+    schemes: dict[str, set[str]] = {}
     for config in configs:
-        training = config["training"]
+        schemes.setdefault(json.dumps(config["training"], default=str), set()).add(config["estimator"]["name"])
+    facts = dict[str, None]()
+    for text, names in schemes.items():
+        training = json.loads(text)
         options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
-        names = sorted({c["estimator"]["name"] for c in configs if c["training"] == training})
-        fact = f"{', '.join(names)}: {training['name']} ({options})" if options else f"{', '.join(names)}: nothing is trained"
-        if fact not in facts:
-            facts.append(fact)
-    return facts
+        facts[f"{', '.join(sorted(names))}: {training['name']} ({options})" if options else f"{', '.join(sorted(names))}: nothing is trained"] = None
+    return list(facts)

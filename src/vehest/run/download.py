@@ -5,23 +5,24 @@ from __future__ import annotations
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
-from vehest.run.workshop import NotThereYet, Workshop
+from vehest.run.runner import Runner
+from vehest.run.signals import DryRunStop
 from vehest.sources.base import open_source
 from vehest.sources.download import Outcome, download_of
 
 
-def download_files(config: Config, workshop: Workshop) -> None:
+def download_files(config: Config, runner: Runner) -> None:
     """Fetch what is missing of a data set's files, and record or compare the checksums of the others.
 
     Args:
         config: as composed for ``ingest``.
-        workshop: whose messages and dry run apply.
+        runner: whose messages and dry run apply.
 
     Raises:
         ConfigurationError: the data set does not say where its files come from.
         DataError: a file has other bytes than recorded.
         MissingError: no data root is set, the server is out of reach or lacks a file, or the disk is full.
-        NotThereYet: in a dry run, if a file would have to be fetched.
+        DryRunStop: in a dry run, if a file would have to be fetched.
     """
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
@@ -30,22 +31,22 @@ def download_files(config: Config, workshop: Workshop) -> None:
             f"data sets that do: {', '.join(_downloadable()) or 'none'}"
         )
     download = download_of(source)
-    if workshop.dry_run:
+    if runner.dry_run:
         missing = download.missing()
         for name in missing:
-            workshop.messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
+            runner.messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
         if missing:
-            workshop.messages.line("plan", "ingest", source.name, "then")
-            raise NotThereYet
+            runner.messages.line("plan", "ingest", source.name, "then")
+            raise DryRunStop
         return
-    with workshop.messages.bars() as bars:
+    with runner.messages.bars() as bars:
 
         def progress(name: str, done: int, total: int | None) -> None:
             bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
 
         for outcome in download.fetch(progress):
             bars.close(f"download {outcome.name}")
-            workshop.messages.line("skip" if outcome.what == "matched" else "done", "download", outcome.name, _detail(outcome))
+            runner.messages.line("skip" if outcome.what == "matched" else "done", "download", outcome.name, _detail(outcome))
 
 
 def _detail(outcome: Outcome) -> str:

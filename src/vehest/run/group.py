@@ -1,10 +1,14 @@
-"""What one worker does: train the members of a group together, then calibrate and evaluate each."""
+"""The work of one process: members of a group are trained together, then each is calibrated and evaluated.
+
+Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluation -> Member
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,13 +16,13 @@ import torch
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
-from vehest.run.artefacts import Artefact, Status, ensured, find, make
-from vehest.run.calibrate import STAGE, CalibrateJob, plan_calibrate, write_calibration
+from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
+from vehest.run.calibrate import CalibrateJob, plan_calibrate, write_calibration
 from vehest.run.evaluate import plan_evaluate
 from vehest.run.evaluate_faults import FaultedJob, write_faulted
 from vehest.run.faults import FaultSettings
 from vehest.run.locks import Waiting, held, held_at_once
-from vehest.run.train import TrainJob, fit_jobs, write_model
+from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
 
@@ -93,13 +97,21 @@ class Member:
 
 
 def existing(group: Group) -> list[Member]:
-    """What of a group is there already."""
+    """The artefacts of a group that are there already."""
     members = []
     for job in group.jobs:
-        model = None if "train" in group.force else find(job.plan)
-        calibration = _found_calibration(group, job, model)
-        members.append(Member(job, model, _found_evaluation(group, job, model, calibration), calibration))
+        model, calibration, evaluation = _found(group, job.plan), None, None
+        if model is not None:
+            calibrating = calibration_job(group, job, model)
+            calibration = None if calibrating is None else _found(group, calibrating.plan)
+            if group.evaluation is not None and (calibrating is None or calibration is not None):
+                evaluation = _found(group, group.evaluation.of(model, calibration).plan)
+        members.append(Member(job, model, evaluation, calibration))
     return members
+
+
+def _found(group: Group, plan: StagePlan) -> Artefact | None:
+    return None if plan.stage in group.force else find(plan)
 
 
 def is_finished(group: Group, member: Member) -> bool:
@@ -123,49 +135,29 @@ def drop_finished_checkpoint(job: TrainJob) -> None:
 
 
 def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
-    """Train what is missing, evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+    """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
 
-    What another process is making is taken from it once it is done; what nobody makes is made first.
+    An artefact that another process is making is taken from it once it is done; those that no process makes come first.
 
     On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
     """
     torch.set_num_threads(1)
-    with one_blas_thread():
-        return _run_group(group, should_stop, on_progress)
-
-
-def _run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
     models = {member.job.plan.key: member.model for member in existing(group)}
-    forced = "train" in group.force
     waiting = [job for job in group.jobs if models[job.plan.key] is None]
-    while waiting and not should_stop():
-        with _held(waiting, should_stop, on_progress) as jobs:
-            missing = []
-            for job in jobs:
-                if forced:
-                    drop_checkpoint(job.plan.checkpoint_folder)
-                else:
-                    models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
-                if models[job.plan.key] is None:
-                    missing.append(job)
-            for together in _together(missing):
-                if should_stop():
-                    break
-                for artefact in _train(together, should_stop, on_progress):
-                    models[artefact.key] = artefact
-        waiting = [job for job in waiting if job not in jobs]
-    members = []
-    for job in group.jobs:
-        model = models[job.plan.key]
-        calibration = evaluation = None
-        if model is not None and model.status == "complete" and not should_stop():
-            calibrating = calibration_job(group, job, model)
-            if calibrating is not None:
-                calibration = _calibrated(group, job, calibrating, should_stop, on_progress)
-            if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
-                evaluation = _evaluated(group, job, model, calibration, should_stop, on_progress)
-        members.append(Member(job, model, evaluation, calibration))
-    return members
+    with one_blas_thread():
+        while waiting and not should_stop():
+            with _held(waiting, should_stop, on_progress) as jobs:
+                for job in jobs:
+                    if STAGE in group.force:
+                        drop_checkpoint(job.plan.checkpoint_folder)
+                    else:
+                        models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
+                for together in _together([job for job in jobs if models[job.plan.key] is None]):
+                    if should_stop():
+                        break
+                    models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
+            waiting = [job for job in waiting if job not in jobs]
+        return [_followed_up(group, job, models[job.plan.key], should_stop, on_progress) for job in group.jobs]
 
 
 @contextmanager
@@ -208,44 +200,25 @@ def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progres
 
 
 def calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
-    """How a model is calibrated; none where it is not, or there is nothing to calibrate it by."""
+    """How a model is calibrated; none where it is not, or its split has no validation range."""
     split = group.split_of_bands
     return None if split is None else plan_calibrate(model, split, job.data, job.plan.output)
 
 
-def _found_calibration(group: Group, job: TrainJob, model: Artefact | None) -> Artefact | None:
-    calibrating = None if model is None or STAGE in group.force else calibration_job(group, job, model)
-    return None if calibrating is None else find(calibrating.plan)
+def _followed_up(
+    group: Group, job: TrainJob, model: Artefact | None, should_stop: Callable[[], bool], say: Callable[[Waiting], None]
+) -> Member:
+    """The member of a model, calibrated and evaluated unless the training or the waiting for another process was stopped."""
 
+    def made(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
+        return _found(group, plan) or ensured(plan, write, plan.stage in group.force, should_stop, say)
 
-def _calibrated(
-    group: Group, job: TrainJob, calibrating: CalibrateJob, should_stop: Callable[[], bool], say: Callable[[Waiting], None]
-) -> Artefact | None:
-    """The calibration of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
-    return _found_calibration(group, job, calibrating.model) or ensured(
-        calibrating.plan, lambda folder: write_calibration(calibrating, folder), STAGE in group.force, should_stop, say
-    )
-
-
-def _found_evaluation(group: Group, job: TrainJob, model: Artefact | None, calibration: Artefact | None) -> Artefact | None:
-    if model is None or group.evaluation is None or "evaluate" in group.force:
-        return None
-    if calibration is None and calibration_job(group, job, model) is not None:
-        return None
-    return find(group.evaluation.of(model, calibration).plan)
-
-
-def _evaluated(
-    group: Group,
-    job: TrainJob,
-    model: Artefact,
-    calibration: Artefact | None,
-    should_stop: Callable[[], bool],
-    say: Callable[[Waiting], None],
-) -> Artefact | None:
-    """The evaluation of a model, made unless it is there; none where the waiting for another process that makes it was stopped."""
-    assert group.evaluation is not None
-    scoring = group.evaluation.of(model, calibration)
-    return _found_evaluation(group, job, model, calibration) or ensured(
-        scoring.plan, lambda folder: write_faulted(scoring, folder), "evaluate" in group.force, should_stop, say
-    )
+    calibration = evaluation = None
+    if model is not None and model.status == "complete" and not should_stop():
+        calibrating = calibration_job(group, job, model)
+        if calibrating is not None:
+            calibration = made(calibrating.plan, partial(write_calibration, calibrating))
+        if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
+            scoring = group.evaluation.of(model, calibration)
+            evaluation = made(scoring.plan, partial(write_faulted, scoring))
+    return Member(job, model, evaluation, calibration)

@@ -25,7 +25,7 @@ from vehest.data.text_files import read_json
 from vehest.estimators.registry import estimator_module
 from vehest.run import calibrate, downsample, evaluate, ingest, report, sweep, train
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
-from vehest.run.finished import FINISHED
+from vehest.run.run_cache import FINISHED
 from vehest.sources.base import source_module
 
 CHECKPOINTS = "checkpoints"

@@ -20,12 +20,12 @@ class Note:
 
     Args:
         what: runs more slowly: an estimator, or the evaluation.
-        told: a sentence that goes on from there.
+        text: a sentence that goes on from there.
         advice: how to choose another.
     """
 
     what: str
-    told: str
+    text: str
     advice: str
 
 

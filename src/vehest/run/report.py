@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch
 
 from vehest.data.errors import ConfigurationError
+from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.run.code_version import code_version
+from vehest.run.comparison import Compared
 from vehest.run.config import Config
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
-from vehest.run.group import Evaluation, Member
 from vehest.run.publishing import PROVENANCE
+from vehest.run.study import Part, Study
 from vehest.run.train import read_fit_metrics, recording_file
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import (
@@ -39,40 +42,6 @@ from vehest.studies.registry import study_module, study_module_name
 
 STAGE = "report"
 OVERVIEW = "tables/overview.csv"
-
-
-@dataclass(frozen=True)
-class PartJob:
-    """A comparison to draw.
-
-    Args:
-        title: for people; none in a study that is not in parts.
-        members: trained and evaluated, in the order of the pipeline.
-        evaluation: split, references and protocol.
-        data_titles: data set -> title.
-        training: how recordings were prepared and what each training scheme was allowed, a line each.
-        failed: name of what is left out -> why.
-    """
-
-    title: str
-    members: Sequence[Member]
-    evaluation: Evaluation
-    data_titles: Mapping[str, str]
-    training: Sequence[str]
-    failed: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class AbsentPart:
-    """A part that a study goes on without, since its raw files are not here.
-
-    Args:
-        name: in the pipeline file.
-        title: for people.
-    """
-
-    name: str
-    title: str
 
 
 @dataclass(frozen=True)
@@ -95,49 +64,48 @@ class ReportJob:
     """A report to draw.
 
     Args:
-        study: name of the study.
-        title: its title.
-        about: a paragraph on it.
-        command: the command that makes it.
-        module: name of the module that draws it, as `vehest.studies.registry` knows it.
-        titles: part -> title, of all there are in the pipeline file.
-        parts: part -> what was compared.
+        study: that was run.
+        command: that makes it.
+        parts: part -> its comparison.
         absent: parts that the study goes on without.
         datasets: of a study of recordings alone.
     """
 
-    study: str
-    title: str
-    about: str
+    study: Study
     command: str
-    module: str
-    titles: Mapping[str, str]
-    parts: Mapping[str, PartJob]
-    absent: Sequence[AbsentPart] = ()
+    parts: Mapping[str, Compared]
+    absent: Sequence[Part] = ()
     datasets: ShownDatasets = ShownDatasets()
 
     @property
-    def compares(self) -> bool:
-        """Whether it compares estimators."""
-        return bool(self.parts)
+    def titles(self) -> dict[str, str]:
+        """Part -> title, of all parts of the pipeline."""
+        return {part.name: part.title for part in self.study.parts}
 
 
 def plan_report(job: ReportJob, output: Path) -> StagePlan:
     """What a report is made from."""
-    config: dict[str, Any] = {key: getattr(job, key) for key in ("study", "title", "about", "command", "module")}
-    config |= {"titles": dict(job.titles), "absent": [asdict(part) for part in job.absent]}
-    config["parts"] = {
-        name: {
-            "training": part.training,
-            "failed": dict(part.failed),
-            "data_titles": dict(part.data_titles),
-            "protocol": asdict(part.evaluation.protocol),
-        }
-        for name, part in job.parts.items()
+    study, shown = job.study, job.datasets
+    config: dict[str, Any] = {
+        "study": study.study,
+        "title": study.title,
+        "about": study.about,
+        "command": job.command,
+        "module": study.report,
+        "titles": job.titles,
+        "absent": [{"name": part.name, "title": part.title} for part in job.absent],
+        "parts": {
+            name: {
+                "training": list(part.training),
+                "failed": part.failed,
+                "data_titles": dict(part.data_titles),
+                "protocol": asdict(part.evaluation.protocol),
+            }
+            for name, part in job.parts.items()
+        },
+        "datasets": {own["dataset"]["name"]: [prose_of(own["dataset"], "title"), kind_of(own["dataset"])] for own in shown.configs},
+        "absent_datasets": [asdict(dataset) for dataset in shown.absent],
     }
-    shown = job.datasets
-    config["datasets"] = {own["dataset"]["name"]: [prose_of(own["dataset"], "title"), kind_of(own["dataset"])] for own in shown.configs}
-    config["absent_datasets"] = [asdict(dataset) for dataset in shown.absent]
     inputs = {artefact.label: artefact.digest for artefact in shown.ingested}
     for name, part in job.parts.items():
         prefix = f"{name}: " if name else ""
@@ -146,7 +114,7 @@ def plan_report(job: ReportJob, output: Path) -> StagePlan:
             assert member.evaluation is not None
             made = (member.model, member.evaluation, *([member.calibration] if member.calibration is not None else []))
             inputs |= {f"{prefix}{artefact.label}": artefact.digest for artefact in made}
-    return StagePlan(stage=STAGE, label=job.study, config=config, inputs=inputs, code=code_of_report(job.module), output=output)
+    return StagePlan(stage=STAGE, label=study.study, config=config, inputs=inputs, code=code_of_report(study.report), output=output)
 
 
 def code_of_report(study: str) -> str:
@@ -160,24 +128,29 @@ def code_of_report(study: str) -> str:
 
 
 def write_report(job: ReportJob, folder: Path) -> None:
-    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a comparison metrics.csv and timings.csv."""
+    """Draw the study into ``folder``: report.md, report.html, tables, figures, provenance; of a comparison metrics.csv and timings.csv.
+
+    On one thread, as groups are trained, so that it has the same last digits whether trainings came before or not.
+    """
     from vehest.report.document import write_documents
 
+    torch.set_num_threads(1)
     artefacts = study_artefacts(job)
-    timings = {name: _timings_of(part, job.study) for name, part in job.parts.items()}
+    timings = {name: _timings_of(part, job.study.study) for name, part in job.parts.items()}
     times = [(job.titles[name] if name else "", timings[name], titles_of(part)) for name, part in artefacts.parts.items()]
-    module = study_module(job.module)
-    write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times) if times else ())
+    module = study_module(job.study.report)
+    with one_blas_thread():
+        write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times) if times else ())
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
-        raise ConfigurationError(f"the study module '{job.module}' gives no table 'overview', which the terminal shows")
-    if job.compares:
+        raise ConfigurationError(f"the study module '{job.study.report}' gives no table 'overview', which the terminal shows")
+    if job.parts:
         table, kept = artefacts.metrics, getattr(module, "METRICS", None)
         if kept is not None:
             table = table[table["metric"].isin(kept) & (table["subset"] == "all")]
         write_metrics(table, folder / METRICS)
         write_metrics(of_parts(timings), folder / TIMINGS)
     about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
-    about |= {"study": job.study, "command": job.command} | _made_from(job)
+    about |= {"study": job.study.study, "command": job.command} | _made_from(job)
     (folder / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
@@ -198,18 +171,20 @@ def write_metrics(table: pd.DataFrame, path: Path) -> None:
     table.to_csv(path, index=False, lineterminator="\n", errors="backslashreplace")
 
 
-def shown_in_terminal(job: ReportJob, report: Artefact) -> tuple[pd.DataFrame | None, pd.DataFrame | None]:
-    """The study's leaderboard, one row an estimator and test set, or, where its module gives none, its overview as the report shows it."""
-    module = study_module(job.module)
-    if hasattr(module, "leaderboard"):
-        table: pd.DataFrame = module.leaderboard(study_artefacts(job).first)
-        return table, None
-    return None, read_frame(report.folder / OVERVIEW)
+def leaderboard(job: ReportJob) -> pd.DataFrame | None:
+    """The study's leaderboard, one row an estimator and test set; none where its module gives an overview instead."""
+    module = study_module(job.study.report)
+    return module.leaderboard(study_artefacts(job).first) if hasattr(module, "leaderboard") else None
 
 
-def verdict_in_terminal(job: ReportJob) -> list[str]:
-    """What a study says in words at its end, a line each; nothing where its module says none."""
-    module = study_module(job.module)
+def overview(report: Artefact) -> pd.DataFrame:
+    """The overview of a study as its report shows it."""
+    return read_frame(report.folder / OVERVIEW)
+
+
+def verdict(job: ReportJob) -> list[str]:
+    """The conclusion of a study, a line each; nothing where its module has none."""
+    module = study_module(job.study.report)
     lines: list[str] = module.verdict(study_artefacts(job)) if hasattr(module, "verdict") else []
     return lines
 
@@ -229,19 +204,19 @@ def study_artefacts(job: ReportJob) -> StudyArtefacts:
         for config, artefact in zip(job.datasets.configs, job.datasets.ingested, strict=True)
     ]
     return StudyArtefacts(
-        study=job.study,
-        title=job.title,
-        about=job.about,
+        study=job.study.study,
+        title=job.study.title,
+        about=job.study.about,
         command=job.command,
         titles=job.titles,
-        parts={name: _part_artefacts(job, part) for name, part in job.parts.items()},
+        parts={name: _part_artefacts(job.study, job.command, part) for name, part in job.parts.items()},
         datasets=datasets,
         absent=[part.name for part in job.absent],
         absent_datasets=job.datasets.absent,
     )
 
 
-def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
+def _part_artefacts(study: Study, command: str, part: Compared) -> PartArtefacts:
     models, tables = [], []
     for member in part.members:
         assert member.model is not None
@@ -262,15 +237,15 @@ def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
         )
     e = part.evaluation
     return PartArtefacts(
-        study=job.study,
-        title=part.title or job.title,
-        about=job.about,
-        command=job.command,
+        study=study.study,
+        title=part.title or study.title,
+        about=study.about,
+        command=command,
         split=e.split,
         protocol=e.protocol,
         kinds=e.kinds,
         data_titles=part.data_titles,
-        metrics=_together(tables, job.study),
+        metrics=_together(tables, study.study),
         models=models,
         references={(s.dataset, s.recording): recording_file(e.references[s.dataset], s) for s in (*e.split.train, *scored_spans(e.split))},
         facts=list(part.training),
@@ -278,7 +253,7 @@ def _part_artefacts(job: ReportJob, part: PartJob) -> PartArtefacts:
     )
 
 
-def _timings_of(part: PartJob, study: str) -> pd.DataFrame:
+def _timings_of(part: Compared, study: str) -> pd.DataFrame:
     """What trainings, their phases and online steps took, with `METRIC_COLUMNS` [s]; in no published file."""
     tables = []
     for member in part.members:
@@ -304,7 +279,7 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
 
 
-def _recording_digests(part: PartJob) -> dict[str, str]:
+def _recording_digests(part: Compared) -> dict[str, str]:
     """Data set and recording -> digest, of every recording that is scored, at the evaluation rate."""
     references = part.evaluation.references
     return {
@@ -316,3 +291,8 @@ def _recording_digests(part: PartJob) -> dict[str, str]:
 def prose_of(dataset: Mapping[str, Any], key: str) -> str:
     """A text of a data set's configuration on one line; its name, where there is none."""
     return " ".join(str(dataset.get(key, dataset["name"])).split())
+
+
+def absent_dataset(dataset: Mapping[str, Any]) -> AbsentDataset:
+    """A data set that a study goes on without, as its report names it."""
+    return AbsentDataset(dataset["name"], *(prose_of(dataset, key) for key in ("title", "licence", "citation")))

@@ -22,6 +22,10 @@ class Stopped(BaseException):
         self.exit_code = 128 + number
 
 
+class DryRunStop(Exception):
+    """A dry run met a stage that waits for one that has not run."""
+
+
 class StopSignals:
     """Remembers the first SIGINT or SIGTERM; raises `Stopped` at once, or later where a fit is to end cleanly."""
 

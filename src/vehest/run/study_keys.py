@@ -27,7 +27,7 @@ from vehest.run.train import code_of_training
 from vehest.sources.base import kind_of, source_module
 
 if TYPE_CHECKING:
-    from vehest.run.pipeline import Configs, Pipeline
+    from vehest.run.study import Study
 
 Keys = dict[str, dict[str, str]]
 """What is made, for example ``scheme_1: train ksnn`` -> ``code``, ``configuration`` and, of an ingest, ``data`` -> hash."""
@@ -36,8 +36,8 @@ CODE, CONFIGURATION, DATA = "code", "configuration", "data"
 
 
 def keys_of_study(
-    pipeline: Pipeline,
-    configs: Configs,
+    pipeline: Study,
+    configs: Mapping[str, Sequence[Config]],
     absent: Collection[str],
     dataset_config: Callable[[str, Config], Config],
     inputs_of: Callable[[Config], Mapping[str, str] | None],
@@ -98,7 +98,7 @@ def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, st
     return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
 
 
-def _of_report(pipeline: Pipeline, about: Mapping[str, Any]) -> dict[str, str]:
+def _of_report(pipeline: Study, about: Mapping[str, Any]) -> dict[str, str]:
     return {CODE: code_of_report(pipeline.report), CONFIGURATION: _hash(about)}
 
 

@@ -25,6 +25,7 @@ PARAMETERS = 100
 SQLITE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 TRACKED = "tracked"  # folder of the markers
+TRACKED_STAGES = ("train", "calibrate", "evaluate")
 KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output"
 STUDY_TAG, PARENT_TAG, PARENT = "vehest.study", "mlflow.parentRunId", "study"
 SOURCE_LENGTH = 5000
@@ -42,10 +43,16 @@ class Tracker:
         output: the output root, where the local store and the markers lie.
         warn: called with one line when tracking has to be given up.
         should_stop: asked while another process logs; what is left then is logged by the next run.
+        study: name of the study or sweep, a tag of all its runs.
     """
 
     def __init__(
-        self, config: Mapping[str, Any], output: Path, warn: Callable[[str], None], should_stop: Callable[[], bool] = lambda: False
+        self,
+        config: Mapping[str, Any],
+        output: Path,
+        warn: Callable[[str], None],
+        should_stop: Callable[[], bool] = lambda: False,
+        study: str = "",
     ) -> None:
         self._wanted = config.get("name") == "mlflow"
         self._uri = config.get("uri")
@@ -53,6 +60,7 @@ class Tracker:
         self._output = output
         self._warn = warn
         self._should_stop = should_stop
+        self._study = study
         self._client: Any = None
         self._experiment_id = ""
 
@@ -75,7 +83,6 @@ class Tracker:
     def log(
         self,
         artefact: Artefact,
-        tags: Mapping[str, str],
         metrics: Mapping[str, float],
         history: Path | None = None,
         figures: Mapping[str, Callable[[], Any]] | None = None,
@@ -83,8 +90,7 @@ class Tracker:
         """Log one artefact as a run, unless it is: its configuration, figures, figures over epochs, files, manifest and drawings.
 
         Args:
-            artefact: what a stage made; its label is the run's name.
-            tags: study, data set and the like.
+            artefact: of a stage; its label is the run's name.
             metrics: final figures.
             history: CSV with a column ``epoch`` and figures over it.
             figures: file name -> what draws it (a matplotlib figure, or none if there is nothing to draw).
@@ -95,7 +101,7 @@ class Tracker:
         try:
             with held(Lock(self._output, "tracking", self._address), self._should_stop) as mine:
                 if mine and not self.is_tracked(artefact):
-                    self._mark(artefact, self._logged(artefact) or self._log(artefact, tags, metrics, history, drawings))
+                    self._mark(artefact, self._logged(artefact) or self._log(artefact, metrics, history, drawings))
         except Exception as error:  # whatever a tracking server does, results matter more
             self._wanted = False
             self._warn(
@@ -125,15 +131,11 @@ class Tracker:
         wanted = f"tags.`{KEY_TAG}` = '{artefact.key}' and tags.`{STAGE_TAG}` = '{artefact.stage}'"
         return list(self._connected().search_runs([self._experiment_id], wanted))
 
-    def _log(
-        self, artefact: Artefact, tags: Mapping[str, str], metrics: Mapping[str, float], history: Path | None, drawings: Mapping[str, Any]
-    ) -> str:
+    def _log(self, artefact: Artefact, metrics: Mapping[str, float], history: Path | None, drawings: Mapping[str, Any]) -> str:
         client = self._connected()
         from mlflow.entities import Metric, Param, RunTag
 
-        run = self._begun(artefact) or client.create_run(
-            self._experiment_id, tags={**self._identity(artefact), **tags, **self._parent(tags)}
-        )
+        run = self._begun(artefact) or client.create_run(self._experiment_id, tags={**self._identity(artefact), **self._parent()})
         run_id, stamp = str(run.info.run_id), run.info.start_time
         client.log_inputs(run_id, datasets=_datasets(artefact))
         points = [Metric(key, value, stamp, 0) for key, value in metrics.items()]
@@ -159,21 +161,21 @@ class Tracker:
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else KILLED)
         return run_id
 
-    def _parent(self, tags: Mapping[str, str]) -> dict[str, str]:
-        """The tag that puts a run below that of its study or sweep, which is made with the first of them."""
-        study = tags.get(STUDY_TAG)
-        if study is None:
+    def _parent(self) -> dict[str, str]:
+        """The tags that put a run below that of its study or sweep, which is made with the first of them."""
+        study = self._study
+        if not study:
             return {}
         client, root = self._connected(), str(self._output.resolve())
         quoted = study.replace("'", "''")
         wanted = f"tags.`{STUDY_TAG}` = '{quoted}' and tags.`{STAGE_TAG}` = '{PARENT}'"
         found = [run for run in client.search_runs([self._experiment_id], wanted) if run.data.tags.get(OUTPUT_TAG) == root]
         if found:
-            return {PARENT_TAG: found[0].info.run_id}
+            return {STUDY_TAG: study, PARENT_TAG: found[0].info.run_id}
         own = {"mlflow.runName": study, STUDY_TAG: study, STAGE_TAG: PARENT, OUTPUT_TAG: root}
         made = client.create_run(self._experiment_id, tags=own)
         client.set_terminated(made.info.run_id, "FINISHED")
-        return {PARENT_TAG: made.info.run_id}
+        return {STUDY_TAG: study, PARENT_TAG: made.info.run_id}
 
     def _log_model(self, artefact: Artefact, run_id: str) -> None:
         """The model as an entity of its own, once, that evaluations are linked to."""
