@@ -2,7 +2,7 @@
 
 After a study is done, a record in the output root says what it was made from and what is shown of it. The next run compares: the words of
 the command, every file of conf/ and pipelines/, the environment variables they read, vehest's own files, those of other packages that
-versions of the code were made from, and size and times of the raw files. If all are as they were and every artefact is there whole, the
+hold estimators and studies, and size and times of the raw files. If all are as they were and every artefact is there whole, the
 same lines and tables are printed. Whatever differs, be it a comment, the whole way is gone, which skips what is up to date and writes the
 record anew: the record decides nothing that keys do not decide, it only saves composing them again.
 """
@@ -10,6 +10,7 @@ record anew: the record decides nothing that keys do not decide, it only saves c
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import json
 import os
 import re
@@ -25,7 +26,6 @@ from vehest.data.files import file_name, remove_leftovers, sha256_of, written_as
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, read_artefact
-from vehest.run.code_version import file_of, files_read
 from vehest.run.config_files import find_pipeline, local_conf, packaged_conf, packaged_pipelines
 from vehest.run.console import WARNING
 from vehest.run.publishing import Publication
@@ -76,7 +76,7 @@ class Record:
     Args:
         format: of this record.
         fingerprint: of what was asked for, see `Asked`.
-        outside: modules of other packages that versions of the code were made from -> digest of their files.
+        outside: loaded modules of packages that extend vehest -> digest of their files.
         plugs: digest of the entry points of other packages, where there are such modules.
         libraries: version of those that data sets are simulated with.
         raw: raw files of each data set.
@@ -239,7 +239,7 @@ def _record(asked: Asked, seen: Outcome) -> Record | None:
     libraries = _libraries(seen.artefacts)
     if seen.raw is None or libraries is None:
         return None
-    outside = {name: sha256_of(path) for name, path in sorted(files_read().items())}
+    outside = _outside()
     artefacts = [*(artefact for artefact in seen.artefacts if artefact.folder != seen.report.folder), seen.report]
     return Record(
         format=FORMAT,
@@ -317,6 +317,32 @@ def _is_same_world(record: Record) -> bool:
     return not record.outside or _entry_points() == record.plugs
 
 
+def _outside() -> dict[str, str]:
+    """Loaded modules of packages that extend vehest -> digest of their files."""
+    packages = {value.split(":")[0].split(".")[0] for _, points in _extensions() for _, value in points} - {"vehest"}
+    files = {name: file_of(name) for name in sorted(sys.modules) if name.split(".")[0] in packages}
+    return {name: sha256_of(file) for name, file in files.items() if file is not None}
+
+
+def file_of(module: str) -> Path | None:
+    """The file of a module of another package, found without importing anything; none where there is no such module."""
+    first, *rest = module.split(".")
+    try:
+        spec = importlib.util.find_spec(first)
+    except (ImportError, AttributeError, ValueError):
+        return None
+    if spec is None:
+        return None
+    if not rest:
+        return Path(spec.origin) if spec.origin and spec.origin.endswith(".py") else None
+    for base in spec.submodule_search_locations or ():
+        place = Path(base).joinpath(*rest)
+        for path in (place.with_name(f"{place.name}.py"), place / "__init__.py"):
+            if path.is_file():
+                return path
+    return None
+
+
 def _libraries(artefacts: Iterable[Artefact]) -> dict[str, str] | None:
     """Inputs of ingests that are libraries rather than files; none if one is neither."""
     found: dict[str, str] = {}
@@ -335,10 +361,14 @@ def _version(library: str) -> str:
 
 def _entry_points() -> str:
     """Digest of what other packages offer to vehest."""
+    return hashlib.sha256(repr(_extensions()).encode()).hexdigest()
+
+
+def _extensions() -> list[tuple[str, list[tuple[str, str]]]]:
+    """Groups of entry points -> names and values, of all packages that extend vehest."""
     found = metadata.entry_points()
     groups = sorted(group for group in found.groups if group.startswith("vehest."))
-    points = [(group, sorted((point.name, point.value) for point in found.select(group=group))) for group in groups]
-    return hashlib.sha256(repr(points).encode()).hexdigest()
+    return [(group, sorted((point.name, point.value) for point in found.select(group=group))) for group in groups]
 
 
 def _fingerprint(asked: Asked) -> str:
