@@ -12,7 +12,7 @@ from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.registry import estimator_class, estimator_module, estimator_names
+from vehest.estimators.registry import estimator_class, estimator_names
 
 
 def test_parameter_counts_are_those_of_the_paper():
@@ -161,11 +161,10 @@ def test_window_network_has_no_state_to_start_from(drive):
         fitted("ksnn").estimate([drive], {"vy": 1.0})
 
 
-def test_registry_knows_names_and_modules():
+def test_registry_knows_names():
     first = "cnn_ukf, data_sheet, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, kinematic, ksnn, learned_ukf"
     names = f"{first}, learned_ukf_variant, lstm, luenberger, rational_ekf, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
     assert ", ".join(sorted(estimator_names())) == names
-    assert estimator_module("ksnn") == "vehest.estimators.ksnn"
     with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):
         estimator_class("kalman_filter_from_the_future")
     with pytest.raises(ConfigurationError, match="'windowed' is not one of"):

@@ -182,7 +182,7 @@ def test_without_faults_the_key_holds_nothing_of_them(trained):
     folder = evaluated(trained)[0]
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest["config"]) == {"sets", "protocol", "kinds", "split"}
-    assert manifest["code"] == code_of_evaluation("vehest.estimators.kinematic"), "and the code of faults does not count"
+    assert manifest["code"] == code_of_evaluation("kinematic"), "and the code of faults does not count"
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
 
 

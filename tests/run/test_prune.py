@@ -22,16 +22,15 @@ class Root:
 
     def __init__(self, output: Path) -> None:
         self.output = output
-        self.ingested = self.add(
-            "ingest", "drives", {"source": "tabular"}, {"lap.csv": "raw"}, ingest.code_of_ingest("vehest.sources.tabular")
-        )
+        dataset = {"source": "tabular"}
+        self.ingested = self.add("ingest", "drives", dataset, {"lap.csv": "raw"}, ingest.code_of_ingest(dataset))
         self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), downsample.code_of_downsampling())
-        module = "vehest.estimators.luenberger"
-        self.model = self.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, train.code_of_training(module))
+        name = "luenberger"
+        self.model = self.add("train", "one", {"estimator": {"name": name}}, {"drives/lap": "gone"}, train.code_of_training(name))
         of_model = {"model": self.model.digest}
-        self.trusted = self.add("calibrate", "one-trust", {}, of_model, calibrate.code_of_calibration(module))
+        self.trusted = self.add("calibrate", "one-trust", {}, of_model, calibrate.code_of_calibration(name))
         of_both = of_model | {"calibration": self.trusted.digest}
-        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(module))
+        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(name))
 
     def add(self, stage: str, label: str, config: dict, inputs: dict[str, str], code: str) -> Artefact:
         """Make an artefact with one file, whose content is its label."""

@@ -121,7 +121,7 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(
     shutil.copytree(published, place.folder)
     shutil.rmtree(place.folder / "outputs" / "finished")
     monkeypatch.chdir(place.folder)
-    monkeypatch.setattr(study_keys, "code_of_ingest", lambda module: "other")
+    monkeypatch.setattr(study_keys, "code_of_ingest", lambda dataset: "other")
     before = contents(place.folder / "results" / "small")
     assert place(*CHECK)[:2] == (3, "small: stale: code (ingest mine)\n")
     assert place(*RUN)[0] == 0

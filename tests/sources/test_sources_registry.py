@@ -16,7 +16,7 @@ from vehest.simulation.fleet import SensorVariation, variations_from_config, var
 from vehest.simulation.plant.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
 from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.recording import SensorLevels
-from vehest.sources.base import kind_of, open_source, source_module, source_names
+from vehest.sources.base import kind_of, open_source, source_class, source_names
 from vehest.sources.simulated import SimulatedSource
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -51,7 +51,7 @@ def test_every_source_has_a_module_that_opens() -> None:
 @pytest.mark.parametrize("name", ["revz", None, ""])
 def test_an_unknown_source_is_refused_with_those_there_are(name: str | None) -> None:
     with pytest.raises(ConfigurationError, match="is not one of: can, mdf, revs, rosbag, simulated, tabular"):
-        source_module({"name": "x", "source": name})
+        source_class({"name": "x", "source": name})
 
 
 def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate() -> None:

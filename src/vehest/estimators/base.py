@@ -87,6 +87,7 @@ class Estimator(ABC):
         skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
         open_weights: weights that may stay NaN, because each recording tells them.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
+        version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
 
@@ -98,6 +99,7 @@ class Estimator(ABC):
     skippable: ClassVar[tuple[str, ...]] = ()
     open_weights: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
+    version: ClassVar[str] = "1"
 
     def __init__(self, settings: EstimatorSettings) -> None:
         self.settings = settings

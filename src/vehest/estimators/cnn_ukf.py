@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -78,6 +78,7 @@ class EndToEndSettings:
         ConfigurationError: a value that makes no sense.
     """
 
+    version: ClassVar[str] = "1"
     pre_training: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10)  # noqa: RUF009
     pre_training_batch: int = 256
     end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30)  # noqa: RUF009

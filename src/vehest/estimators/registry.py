@@ -25,15 +25,6 @@ def estimator_names() -> list[str]:
     return [*sorted(own), *sorted(point.name for point in entry_points(group=ENTRY_POINTS) if point.name not in own)]
 
 
-def estimator_module(name: str) -> str:
-    """Name of the module that holds an estimator.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
-    return estimator_class(name).__module__
-
-
 @cache
 def estimator_class(name: str) -> type[Estimator]:
     """The class behind a name.

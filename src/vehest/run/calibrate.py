@@ -18,16 +18,16 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
-from vehest.estimators.registry import estimator_module
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
-from vehest.run.code_version import code_version
 from vehest.run.train import file_digest, recording_file
+from vehest.run.versions import version_of_estimator
 from vehest.trust.bands import Bands, Origin, Piece, band_inputs, calibrated
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 STAGE = "calibrate"
+VERSION = "1"
 WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
@@ -71,22 +71,19 @@ def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], 
         label=f"{model.label}-trust",
         config={role: [str(span) for span in spans] for role, spans in roles.items()},
         inputs=inputs,
-        code=code_of_calibration(estimator_module(read_description(model.folder).estimator)),
+        code=code_of_calibration(read_description(model.folder).estimator),
         output=output,
     )
     return CalibrateJob(plan, model, split, data)
 
 
-def code_of_calibration(module: str) -> str:
-    """Version of what a calibration runs.
+def code_of_calibration(estimator: str) -> str:
+    """Version of what a calibration of an estimator runs.
 
-    Args:
-        module: that of the estimator.
+    Raises:
+        ConfigurationError: the name is unknown.
     """
-    return code_version(
-        [module, "vehest.trust.bands", "vehest.trust.guard", "vehest.trust.health", "vehest.trust.record", "vehest.estimators.model_files"],
-        own=[__name__],
-    )
+    return f"calibrate={VERSION} {version_of_estimator(estimator)}"
 
 
 def write_calibration(job: CalibrateJob, folder: Path) -> None:

@@ -20,7 +20,6 @@ from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import About, load_model, read_description
-from vehest.estimators.registry import estimator_module
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
 from vehest.evaluation.blocks import Segments, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
@@ -39,13 +38,14 @@ from vehest.evaluation.metrics import (
 )
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
-from vehest.run.code_version import code_version
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
+from vehest.run.versions import version_of_estimator
 from vehest.studies.artefacts import read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.record import read_trust
 
 STAGE = "evaluate"
+VERSION = "1"
 METRICS = "metrics.csv"
 BLOCKS = "blocks.csv"
 TIMES = ("train_seconds", "step_seconds")
@@ -164,21 +164,19 @@ def plan_evaluate(
         label=f"{model.label}-on-{split.name}",
         config={"sets": sets, "protocol": asdict(protocol), "kinds": dict(kinds), "split": split.name},
         inputs=inputs,
-        code=code_of_evaluation(estimator_module(estimator)),
+        code=code_of_evaluation(estimator),
         output=output,
     )
     return EvaluateJob(plan, model, split, data, references, kinds, protocol, calibration)
 
 
-def code_of_evaluation(module: str) -> str:
-    """Version of what an evaluation runs.
+def code_of_evaluation(estimator: str) -> str:
+    """Version of what an evaluation of an estimator runs.
 
-    Args:
-        module: that of the estimator.
+    Raises:
+        ConfigurationError: the name is unknown.
     """
-    parts = ("bands", "blocks", "floors", "intervals", "lever_arm", "metrics", "regimes")
-    modules = [module, *(f"vehest.evaluation.{part}" for part in parts), "vehest.estimators.model_files", "vehest.trust.record"]
-    return code_version(modules, own=[__name__])
+    return f"evaluate={VERSION} {version_of_estimator(estimator)}"
 
 
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:

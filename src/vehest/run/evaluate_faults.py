@@ -6,7 +6,6 @@ Without faults it is the evaluation of `vehest.run.evaluate`, with the same key 
 from __future__ import annotations
 
 import csv
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -23,12 +22,13 @@ from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored, reference_state, score_all, sequences
 from vehest.evaluation.under_fault import FAULTED, UNITS, Flagged, Window, errors_under_fault, flags_under_fault
 from vehest.run.artefacts import StagePlan
-from vehest.run.code_version import code_version
 from vehest.run.evaluate import COLUMNS, METRICS, EvaluateJob, measured_range, test_sets, write_evaluation
 from vehest.run.faults import FaultSettings
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, inject, is_fault
 from vehest.trust.record import is_elsewhere, read_trust
+
+VERSION = "1"
 
 
 @dataclass(frozen=True)
@@ -49,15 +49,17 @@ class FaultedJob:
         plan = self.job.plan
         if not self.faults:
             return plan
-        code = hashlib.sha256(f"{plan.code} {code_of_faults()}".encode()).hexdigest()[:16]
-        return replace(plan, config={**plan.config, "faults": [asdict(fault) for fault in self.faults]}, code=code)
+        faults = [asdict(fault) for fault in self.faults]
+        return replace(plan, config={**plan.config, "faults": faults}, code=code_under_faults(plan.code))
 
 
-def code_of_faults() -> str:
-    """Version of what an evaluation under faults runs beyond one without."""
-    return code_version(
-        ["vehest.trust.faults", "vehest.trust.contract", "vehest.evaluation.under_fault"], own=[__name__, "vehest.run.faults"]
-    )
+def code_under_faults(code: str) -> str:
+    """Version of what an evaluation under faults runs.
+
+    Args:
+        code: version of the evaluation without faults.
+    """
+    return f"{code} faults={VERSION}"
 
 
 def write_faulted(job: FaultedJob, folder: Path) -> None:

@@ -15,16 +15,17 @@ from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
 from vehest.run.artefacts import StagePlan
-from vehest.run.code_version import code_version
 from vehest.run.config import Config, missing_keys
 from vehest.run.failures import Failure
 from vehest.run.launcher import Task, launch
 from vehest.run.locks import held_at_once
 from vehest.run.signals import StopSignals
-from vehest.sources.base import Source, open_source, source_module
+from vehest.run.versions import version_of_source
+from vehest.sources.base import Source, open_source
 from vehest.training.context import Progress
 
 STAGE = "ingest"
+VERSION = "1"
 PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
 Report = Callable[[int, int, str], None]
@@ -57,18 +58,18 @@ def plan_ingest(config: Config) -> StagePlan:
         label=source.name,
         config={key: value for key, value in dataset.items() if key not in PROSE},
         inputs=inputs,
-        code=code_of_ingest(source_module(dataset)),
+        code=code_of_ingest(dataset),
         output=Path(config["output"]),
     )
 
 
-def code_of_ingest(module: str) -> str:
+def code_of_ingest(dataset: Mapping[str, Any]) -> str:
     """Version of what an ingest runs.
 
     Args:
-        module: that of the source.
+        dataset: its configuration.
     """
-    return code_version([module, "vehest.data.store", "vehest.alignment.checks"], own=[__name__])
+    return f"ingest={VERSION} {version_of_source(dataset)}"
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:

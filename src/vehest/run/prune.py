@@ -22,11 +22,9 @@ from typing import Any
 from vehest.data.errors import VehestError
 from vehest.data.files import ASIDE_PREFIX, aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
-from vehest.estimators.registry import estimator_module
-from vehest.run import calibrate, downsample, evaluate, ingest, report, sweep, train
+from vehest.run import calibrate, downsample, evaluate, evaluate_faults, ingest, report, sweep, train
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.run_cache import FINISHED
-from vehest.sources.base import source_module
 
 CHECKPOINTS = "checkpoints"
 STAGES = (ingest.STAGE, downsample.STAGE, train.STAGE, calibrate.STAGE, evaluate.STAGE, report.STAGE, sweep.STAGE)
@@ -136,15 +134,18 @@ def _code_of(artefact: Artefact, models: Sequence[Artefact]) -> str | None:
     config = artefact.config
     try:
         if artefact.stage == ingest.STAGE:
-            return ingest.code_of_ingest(source_module(config))
+            return ingest.code_of_ingest(config)
         if artefact.stage == downsample.STAGE:
             return downsample.code_of_downsampling()
         if artefact.stage == train.STAGE:
-            return train.code_of_training(estimator_module(str(config["estimator"]["name"])))
+            return train.code_of_training(str(config["estimator"]["name"]))
         if artefact.stage in (calibrate.STAGE, evaluate.STAGE):
             model = next(model for model in models if model.digest == artefact.inputs["model"])
-            code_of = calibrate.code_of_calibration if artefact.stage == calibrate.STAGE else evaluate.code_of_evaluation
-            return code_of(estimator_module(str(model.config["estimator"]["name"])))
+            estimator = str(model.config["estimator"]["name"])
+            if artefact.stage == calibrate.STAGE:
+                return calibrate.code_of_calibration(estimator)
+            code = evaluate.code_of_evaluation(estimator)
+            return evaluate_faults.code_under_faults(code) if "faults" in config else code
         if artefact.stage == sweep.STAGE:
             return sweep.code_of_sweep()
         return report.code_of_report(str(config["module"]))

@@ -18,13 +18,13 @@ from vehest.data.errors import ConfigurationError
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
-from vehest.run.code_version import code_version
 from vehest.run.comparison import Compared
 from vehest.run.config import Config
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.publishing import PROVENANCE
 from vehest.run.study import Part, Study
 from vehest.run.train import read_fit_metrics, recording_file
+from vehest.run.versions import version_of_study
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
@@ -38,9 +38,10 @@ from vehest.studies.artefacts import (
 )
 from vehest.studies.kit.reference_minutes import start_in_words
 from vehest.studies.kit.timings import timings_of_study
-from vehest.studies.registry import study_module, study_module_name
+from vehest.studies.registry import study_module
 
 STAGE = "report"
+VERSION = "1"
 OVERVIEW = "tables/overview.csv"
 
 
@@ -122,9 +123,11 @@ def code_of_report(study: str) -> str:
 
     Args:
         study: name of the module that draws it, as `vehest.studies.registry` knows it.
+
+    Raises:
+        ConfigurationError: the name is unknown.
     """
-    drawn_with = [study_module_name(study), "vehest.studies.artefacts", "vehest.studies.kit.timings"]
-    return code_version(drawn_with, own=[__name__], files=["report/templates"])
+    return f"report={VERSION} {version_of_study(study)}"
 
 
 def write_report(job: ReportJob, folder: Path) -> None:

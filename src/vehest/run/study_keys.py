@@ -13,18 +13,17 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from vehest.data.split_files import dataset_names
-from vehest.estimators.registry import estimator_module
 from vehest.run.calibrate import code_of_calibration
 from vehest.run.comparison import resampling_fact, training_facts
 from vehest.run.config import Config
 from vehest.run.downsample import code_of_downsampling
 from vehest.run.evaluate import code_of_evaluation
-from vehest.run.evaluate_faults import code_of_faults
+from vehest.run.evaluate_faults import code_under_faults
 from vehest.run.faults import all_of, faults_of
 from vehest.run.ingest import PROSE, code_of_ingest
 from vehest.run.report import code_of_report
 from vehest.run.train import code_of_training
-from vehest.sources.base import kind_of, source_module
+from vehest.sources.base import kind_of
 
 if TYPE_CHECKING:
     from vehest.run.study import Study
@@ -80,21 +79,20 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     for name in dict.fromkeys(str(config["estimator"]["name"]) for config in configs):
         jobs = [config for config in configs if config["estimator"]["name"] == name]
         trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
-        module = estimator_module(name)
-        yield f"train {name}", {CODE: code_of_training(module), CONFIGURATION: _hash(trained)}
+        yield f"train {name}", {CODE: code_of_training(name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
-            yield f"calibrate {name}", {CODE: code_of_calibration(module), CONFIGURATION: _hash(None)}
+            yield f"calibrate {name}", {CODE: code_of_calibration(name), CONFIGURATION: _hash(None)}
         if not faults:
-            yield f"evaluate {name}", {CODE: code_of_evaluation(module), CONFIGURATION: _hash(first["evaluation"])}
+            yield f"evaluate {name}", {CODE: code_of_evaluation(name), CONFIGURATION: _hash(first["evaluation"])}
             continue
         told = [first["evaluation"], *map(asdict, faults)]
-        yield f"evaluate {name}", {CODE: _hash([code_of_evaluation(module), code_of_faults()]), CONFIGURATION: _hash(told)}
+        yield f"evaluate {name}", {CODE: code_under_faults(code_of_evaluation(name)), CONFIGURATION: _hash(told)}
 
 
 def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, str]:
     dataset = config["dataset"]
     told = {key: value for key, value in dataset.items() if key not in PROSE}
-    entry = {CODE: code_of_ingest(source_module(dataset)), CONFIGURATION: _hash(told)}
+    entry = {CODE: code_of_ingest(dataset), CONFIGURATION: _hash(told)}
     return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
 
 

@@ -16,7 +16,6 @@ from vehest.data.schema import settings_from_config
 from vehest.data.splits import VALIDATION, check_name
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import Artefact, StagePlan
-from vehest.run.code_version import code_version
 from vehest.run.comparison import Compared, failed_in, named
 from vehest.run.config import check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
 from vehest.run.evaluate import COLUMNS, METRICS
@@ -29,6 +28,7 @@ from vehest.studies.artefacts import read_frame
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, is_of_fault, short_names, shown_value, summary
 
 STAGE = "sweep"
+VERSION = "1"
 JOBS = "sweep.csv"
 SUMMARY = "summary.csv"
 ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
@@ -242,7 +242,7 @@ def _plan(artefacts: SweepArtefacts, members: Sequence[Member], output: Path) ->
 
 def code_of_sweep() -> str:
     """Version of what draws a sweep's tables and figures."""
-    return code_version(["vehest.studies.sweep"], own=[__name__])
+    return f"sweep={VERSION}"
 
 
 def _write(artefacts: SweepArtefacts, folder: Path) -> None:

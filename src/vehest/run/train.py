@@ -17,12 +17,13 @@ from vehest.data.store import read_recording
 from vehest.data.text_files import number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
-from vehest.estimators.registry import estimator_class, estimator_module
+from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
-from vehest.run.code_version import code_version
+from vehest.run.versions import version_of_estimator, version_of_training
 from vehest.training.context import FitContext
 
 STAGE = "train"
+VERSION = "1"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
 
@@ -101,19 +102,19 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
             **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
         },
         inputs=inputs,
-        code=code_of_training(estimator_module(estimator.name)),
+        code=code_of_training(estimator.name),
         output=Path(config["output"]),
     )
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
 
 
-def code_of_training(module: str) -> str:
-    """Version of what a training runs.
+def code_of_training(estimator: str) -> str:
+    """Version of what a training of an estimator runs.
 
-    Args:
-        module: that of the estimator.
+    Raises:
+        ConfigurationError: the name is unknown.
     """
-    return code_version([module, "vehest.estimators.model_files", "vehest.data.store"], own=[__name__])
+    return f"train={VERSION} {version_of_estimator(estimator)} {version_of_training(estimator)}"
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:

@@ -114,6 +114,7 @@ class Source(ABC):
     Attributes:
         keys: options of its own.
         options_type: dataclass of those options, which says of what type they are.
+        version: raised when the recordings that it makes change.
 
     Raises:
         ConfigurationError: a key that this source does not know, or one that is missing.
@@ -121,6 +122,7 @@ class Source(ABC):
 
     keys: ClassVar[frozenset[str]] = frozenset()
     options_type: ClassVar[type | None] = None
+    version: ClassVar[str] = "1"
     slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -240,8 +242,7 @@ def open_source(dataset: Mapping[str, Any]) -> Source:
     Raises:
         ConfigurationError: an unknown source or option.
     """
-    found: Source = importlib.import_module(source_module(dataset)).SOURCE(dataset)
-    return found
+    return source_class(dataset)(dataset)
 
 
 def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
@@ -259,8 +260,8 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     return open_source(dataset).read_file(file)
 
 
-def source_module(dataset: Mapping[str, Any]) -> str:
-    """The module of a data set's source: ``vehest.sources.NAME``, with its class as ``SOURCE``.
+def source_class(dataset: Mapping[str, Any]) -> type[Source]:
+    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``.
 
     Raises:
         ConfigurationError: there is none of that name.
@@ -268,7 +269,8 @@ def source_module(dataset: Mapping[str, Any]) -> str:
     name = str(dataset.get("source"))
     if name not in source_names():
         raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}")
-    return f"{package.__name__}.{name}"
+    found: type[Source] = importlib.import_module(f"{package.__name__}.{name}").SOURCE
+    return found
 
 
 @cache

@@ -7,6 +7,7 @@ those that re-create papers come so, from ``vehest_papers``. Such a module has
 - ``documents(artefacts: StudyArtefacts) -> {name: Document}``, of which one starts with ``report``;
 - ``SHOWS_FAILED = True``, if its report can leave out what failed and say so;
 - ``METRICS``, if its metrics.csv is to hold these alone, over all samples;
+- ``VERSION``, if its tables or figures changed since it was first published: raised each time they do;
 - ``verdict(artefacts: StudyArtefacts) -> list[str]``, if it says in words at the end what came of it;
 - ``leaderboard(artefacts: PartArtefacts) -> DataFrame``, if it takes a split, or a table ``overview`` in its report, for the terminal.
 """
@@ -30,27 +31,18 @@ def study_names() -> list[str]:
     return [*OWN, *sorted({point.name for point in entry_points(group=ENTRY_POINTS)} - set(OWN))]
 
 
-def study_module_name(name: str) -> str:
-    """Import path of the module behind a name.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
-    if name in OWN:
-        return f"{ENTRY_POINTS}.{name}"
-    point = _entry_point(name)
-    if point is None:
-        raise ConfigurationError(f"there is no study module '{name}'; there are: {', '.join(study_names())}")
-    return point.module
-
-
 def study_module(name: str) -> ModuleType:
     """The module behind a name.
 
     Raises:
         ConfigurationError: the name is unknown.
     """
-    return importlib.import_module(study_module_name(name))
+    if name in OWN:
+        return importlib.import_module(f"{ENTRY_POINTS}.{name}")
+    point = _entry_point(name)
+    if point is None:
+        raise ConfigurationError(f"there is no study module '{name}'; there are: {', '.join(study_names())}")
+    return importlib.import_module(point.module)
 
 
 def _entry_point(name: str) -> EntryPoint | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from vehest.data.errors import ConfigurationError
 from vehest.training.search import DirectSearchSettings
@@ -24,6 +24,7 @@ class NoiseTuningSettings:
         skip_seconds: first seconds of each recording that do not count [s].
     """
 
+    version: ClassVar[str] = "1"
     method: Literal["data", "nelder_mead", "optuna"] = "nelder_mead"
     curves_from: str = "*"
     grid: int = 2

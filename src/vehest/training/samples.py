@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -46,6 +46,7 @@ class SampleSettings:
         ConfigurationError: a value that makes no sense.
     """
 
+    version: ClassVar[str] = "1"
     phase: PhaseSettings = PhaseSettings(learning_rate=1e-3, max_epochs=300, patience=20)  # noqa: RUF009
     batch_size: int = 1024
     dtype: Literal["float32", "float64"] = "float32"

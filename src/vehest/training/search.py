@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy import optimize
@@ -26,6 +27,7 @@ class DirectSearchSettings:
         tolerance: relative change of the parameters at which a search ends.
     """
 
+    version: ClassVar[str] = "1"
     grid: int = 4
     max_evaluations: int = 400
     tolerance: float = 1e-4

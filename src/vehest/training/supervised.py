@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ class SupervisedSettings:
         checkpoint_seconds: time between two checkpoints [s].
     """
 
+    version: ClassVar[str] = "1"
     learning_rate: float = 1e-3
     batch_size: int = 64
     max_epochs: int = 1000

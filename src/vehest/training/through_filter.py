@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -91,6 +91,7 @@ class ThroughFilterSettings:
         checkpoint_seconds: time between two checkpoints [s].
     """
 
+    version: ClassVar[str] = "1"
     one_step: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine")  # noqa: RUF009
     one_step_batch: int = 2048
     through: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine")  # noqa: RUF009

@@ -56,6 +56,7 @@ class SequenceSettings:
         ConfigurationError: a value that makes no sense.
     """
 
+    version: ClassVar[str] = "1"
     phase: PhaseSettings = PhaseSettings()  # noqa: RUF009
     sequence_steps: int = 300
     validation_steps: int = 1000

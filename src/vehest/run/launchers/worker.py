@@ -27,7 +27,6 @@ from typing import Any, TypeVar
 from vehest.data.errors import MissingError, VehestError
 from vehest.data.files import no_room, writing_error
 from vehest.data.limits import Limits, use_limits
-from vehest.estimators.registry import estimator_module
 from vehest.run.artefacts import Artefact, find, library_versions, read_artefact
 from vehest.run.failures import Failure, failure_of
 from vehest.run.finished import own_files
@@ -255,15 +254,15 @@ def _run(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[P
 
 
 def _check_code(group: Group) -> None:
-    """Make sure that an estimator of another package is the one that the parent has.
+    """Make sure that estimators are of the version that the parent has.
 
     Raises:
         MissingError: it is another one.
     """
     for name in {str(job.estimator["name"]) for job in group.jobs}:
-        module = estimator_module(name)
-        if module.split(".")[0] != "vehest" and code_of_training(module) != group.jobs[0].plan.code:
-            raise MissingError(f"'{module}' on {socket.gethostname()} is not the one of the parent; install the same on every machine")
+        if code_of_training(name) != group.jobs[0].plan.code:
+            what = f"estimator '{name}' on {socket.gethostname()} is not of the parent's version"
+            raise MissingError(f"{what}; install the same on every machine")
 
 
 def _fetch(group: Group, inputs: Sequence[Artefact], store: Store) -> None:

@@ -1,0 +1,314 @@
+"""Numbers of every estimator family, source and stage on small recordings, and what is recorded of them; `make golden` records anew."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import numpy as np
+import yaml
+
+from conftest import planar_drive
+from every_estimator import drive_for, fitted
+from place import DATASET, write_csv
+from vehest.data.recording import Recording
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run import calibrate, downsample, evaluate, evaluate_faults
+from vehest.sources.base import open_source, source_class
+from vehest.trust.faults import is_fault
+
+FILE = Path(__file__).with_name("digests.json")
+DIGITS = 6
+LEARNT, SIMULATED, FIXED = 1e-3, 1e-6, 1e-9  # tolerances elsewhere than on the machine that recorded, of an array's largest value
+LIBRARIES = ("numpy", "scipy", "numba", "torch")
+VEHICLE = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
+TRAINED = ("estimator=luenberger", "estimator.rate_hz=20", "training.grid=1", "training.max_evaluations=20", "split=mine", "tracking=none")
+Arrays = dict[str, np.ndarray[Any, Any]]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Something with versions whose numbers are recorded.
+
+    Args:
+        versions: what to raise when numbers move, for example ``Ksnn.version``, and its value.
+        tolerance: of values elsewhere than on the machine that recorded.
+        numbers: makes them: ``weights`` and ``estimates`` of an estimator, else one part.
+    """
+
+    versions: Mapping[str, str]
+    tolerance: float
+    numbers: Callable[[], Mapping[str, Arrays]]
+
+    def record(self) -> dict[str, Any]:
+        """What digests.json holds of it."""
+        parts = self.numbers()
+        return {
+            "versions": dict(self.versions),
+            "digests": {part: _digest(arrays) for part, arrays in parts.items()},
+            "values": {part: {name: _values(array) for name, array in arrays.items()} for part, arrays in parts.items()},
+        }
+
+
+def subjects() -> dict[str, Subject]:
+    """All of them, by name."""
+    found = {name: _estimator(name) for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")}
+    for name, make in SOURCES.items():
+        tolerance = SIMULATED if name == "simulated" else FIXED
+        told = source_class({"source": name})
+        found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(_in_folder, make))
+    for stage, numbers in {downsample: _downsampled, calibrate: _calibrated, evaluate: _evaluated, evaluate_faults: _faulted}.items():
+        name = stage.__name__.removeprefix("vehest.run.")
+        tolerance = FIXED if stage is downsample else LEARNT
+        found[f"stage {name}"] = Subject({f"VERSION of {stage.__name__}": stage.VERSION}, tolerance, partial(_in_folder, numbers))
+    return found
+
+
+def this_machine() -> dict[str, str]:
+    """What digits depend on."""
+    libraries = {name: metadata.version(name) for name in LIBRARIES}
+    return {"cpu": str(llvmlite.binding.get_host_cpu_name()), "python": platform.python_version(), **libraries}
+
+
+def moved(name: str, recorded: Mapping[str, Any], now: Mapping[str, Any], tolerance: float | None) -> str:
+    """What to do about numbers that are not those recorded; empty where they are.
+
+    Args:
+        name: of the subject.
+        recorded: of it in digests.json.
+        now: its `Subject.record`.
+        tolerance: of values, of an array's largest; none to compare digests.
+    """
+    if recorded["versions"] != now["versions"]:
+        return f"a version of {name} was raised: record its numbers with `make golden`"
+    if tolerance is None:
+        parts = [part for part, digest in recorded["digests"].items() if now["digests"].get(part) != digest]
+    else:
+        parts = [part for part in recorded["values"] if not _are_close(recorded["values"][part], now["values"].get(part, {}), tolerance)]
+    if not parts:
+        return ""
+    own, *training = now["versions"]
+    what = own if not training or "weights" not in parts else f"{own}, or {training[0]} if all that it trains moved,"
+    return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
+
+
+def _digest(arrays: Arrays) -> str:
+    digest = hashlib.sha256()
+    for name, array in sorted(arrays.items()):
+        numbers = np.asarray(array, np.float64)
+        largest = np.max(np.abs(numbers[np.isfinite(numbers)]), initial=0.0)
+        if largest > 0:
+            numbers = np.round(numbers / 10.0 ** np.ceil(np.log10(largest)), DIGITS) + 0.0
+        digest.update(f"{name} {numbers.shape} ".encode() + numbers.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _values(array: np.ndarray[Any, Any]) -> list[float | None]:
+    """Largest value, and the first, middle and last; none where it is not finite."""
+    flat = np.asarray(array, np.float64).ravel()
+    if not flat.size:
+        return []
+    picked = [np.max(np.abs(flat[np.isfinite(flat)]), initial=0.0), flat[0], flat[flat.size // 2], flat[-1]]
+    return [float(f"{value:.12g}") if np.isfinite(value) else None for value in picked]
+
+
+def _are_close(recorded: Mapping[str, list[float | None]], now: Mapping[str, list[float | None]], tolerance: float) -> bool:
+    if set(recorded) != set(now):
+        return False
+    for name, values in recorded.items():
+        then, today = np.array(values, float), np.array(now[name], float)
+        if then.shape != today.shape or not np.allclose(then, today, rtol=0, atol=tolerance * then[0] if then.size else 0, equal_nan=True):
+            return False
+    return True
+
+
+def _estimator(name: str) -> Subject:
+    cls = estimator_class(name)
+    versions = {f"{cls.__name__}.version": cls.version}
+    if hasattr(cls.training_type, "version"):
+        versions[f"{cls.training_type.__name__}.version"] = cls.training_type.version
+
+    def numbers() -> dict[str, Arrays]:
+        estimator = fitted(name)
+        estimate = estimator.estimate([drive_for(estimator)])[0]
+        return {"weights": dict(estimator.weights()), "estimates": dict(estimate.channels)}
+
+    return Subject(versions, LEARNT if len(versions) > 1 else FIXED, numbers)
+
+
+def _in_folder(make: Callable[[Path], Arrays]) -> dict[str, Arrays]:
+    with tempfile.TemporaryDirectory() as folder:
+        return {"numbers": make(Path(folder))}
+
+
+def _channels(recording: Recording) -> Arrays:
+    return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
+
+
+# Sources
+
+
+def _tabular(folder: Path) -> Arrays:
+    write_csv(folder / "lap.csv", 1, 5.0)
+    return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
+
+
+def _text_log(folder: Path) -> Arrays:
+    write_csv(folder / "lap.csv", 1, 5.0)
+    lines = (folder / "lap.csv").read_text().splitlines()
+    (folder / "lap.csv").write_text("\n".join([lines[0], "s,km/h,deg/s,,,", *lines[1:]]) + "\n")
+    return _channels(open_source(DATASET | {"path": str(folder), "source": "text_log", "rows_below_names": 1}).read("lap"))
+
+
+def _vbo(folder: Path) -> Arrays:
+    from vbo_log import dataset, write_log
+
+    write_log(folder / "lap.vbo")
+    return _channels(open_source(dataset(folder)).read("lap"))
+
+
+def _can(folder: Path) -> Arrays:
+    from can_drive import SIGNALS, write_log
+
+    write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
+    channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
+    told = {"files": "drive.*", "dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": channels}
+    return _channels(open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive"))
+
+
+def _rosbag(folder: Path) -> Arrays:
+    from test_sources_rosbag import configuration, drive, write_bag
+
+    write_bag(folder, drive(2.0))
+    return _channels(open_source(configuration(folder)).read("lap"))
+
+
+def _mdf(folder: Path) -> Arrays:
+    from fuzz.families.mdf import DECLARED, _signals, _write
+
+    _write(folder / "lap.mf4", _signals())
+    return _channels(open_source(DECLARED | {"path": str(folder)}).read("lap"))
+
+
+def _revs(folder: Path) -> Arrays:
+    from test_sources_revs import configuration
+
+    time = np.arange(300) / 100.0
+    (folder / "lap").mkdir()
+    for name, values in {"t": time, "vx": 20.0 + np.sin(time), "ayCG": 0.3 * np.cos(time)}.items():
+        np.savetxt(folder / "lap" / f"{name}.txt", values, fmt="%.6f")
+    return _channels(open_source(configuration(folder)).read("lap"))
+
+
+def _simulated(folder: Path) -> Arrays:
+    drive = {"id": "a", "seed": 1, "manoeuvre": {"name": "laps", "course": "handling", "duration": 3.0}}
+    vehicle = yaml.safe_load(VEHICLE.read_text(encoding="utf-8"))
+    dataset = {"name": "sim", "source": "simulated", "vehicle": vehicle, "rate_hz": 50, "drives": [drive]}
+    return _channels(open_source(dataset).read("a"))
+
+
+SOURCES = {
+    "can": _can,
+    "mdf": _mdf,
+    "revs": _revs,
+    "rosbag": _rosbag,
+    "simulated": _simulated,
+    "tabular": _tabular,
+    "text_log": _text_log,
+    "vbo": _vbo,
+}
+
+
+# Stages
+
+
+def _downsampled(folder: Path) -> Arrays:
+    recording = planar_drive(10.0, 100.0, seed=1, noise=0.02)
+    for transform in downsample.transforms_of({"rate_hz": 20.0, "method": "polyphase", "transforms": []}):
+        recording = transform(recording)
+    return _channels(recording)
+
+
+def _calibrated(folder: Path) -> Arrays:
+    (trust,) = _outputs().glob("calibrate/*/trust.yaml")
+    return {"trust": np.array(list(_leaves(yaml.safe_load(trust.read_text(encoding="utf-8")))))}
+
+
+def _evaluated(folder: Path) -> Arrays:
+    return _metrics(lambda condition: not is_fault(condition))
+
+
+def _faulted(folder: Path) -> Arrays:
+    return _metrics(is_fault)
+
+
+def _metrics(chosen: Callable[[str], bool]) -> Arrays:
+    (file,) = _outputs().glob("evaluate/*/metrics.csv")
+    with file.open(newline="", encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
+    metrics: dict[str, list[float]] = {}
+    for row in rows:
+        metrics.setdefault(row["metric"], []).extend(float(row[column] or "nan") for column in ("value", "low", "high"))
+    return {metric: np.array(values) for metric, values in metrics.items()}
+
+
+@cache
+def _study() -> tempfile.TemporaryDirectory[str]:
+    """A folder with a small study: one model, calibrated, evaluated without faults and under one."""
+    made = tempfile.TemporaryDirectory()
+    folder = Path(made.name)
+    (folder / "raw").mkdir()
+    for seed, name in enumerate(("one", "two", "three"), start=1):
+        write_csv(folder / "raw" / f"{name}.csv", seed)
+    spans = {"train": [{"recording": "one"}], "validation": [{"recording": "two"}], "tests": {"test": [{"recording": "three"}]}}
+    for group, content in {"dataset": DATASET, "split": {"name": "mine", "dataset": "mine", **spans}}.items():
+        (folder / "conf" / group).mkdir(parents=True)
+        (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
+    environment = os.environ | {"VEHEST_DATA": str(folder / "raw"), "VEHEST_OUTPUT": str(folder / "outputs")}
+    for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
+        command = [sys.executable, "-c", "from vehest.cli import main; main()", *words]
+        subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
+    return made
+
+
+def _outputs() -> Path:
+    return Path(_study().name) / "outputs"
+
+
+def _leaves(content: Any) -> Iterator[float]:
+    """Numbers in plain values, in order."""
+    if isinstance(content, Mapping):
+        content = [content[name] for name in sorted(content, key=str)]
+    if isinstance(content, list):
+        for value in content:
+            yield from _leaves(value)
+    elif isinstance(content, int | float):
+        yield float(content)
+
+
+def main() -> None:
+    """Record the numbers of this machine."""
+    former = json.loads(FILE.read_text(encoding="utf-8"))["subjects"] if FILE.is_file() else {}
+    made = {}
+    for name, subject in subjects().items():
+        made[name] = subject.record()
+        print(f"{name}: {'as before' if made[name] == former.get(name) else 'recorded'}")
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(record)}" for name, record in made.items())
+    FILE.write_text(f'{{"machine": {json.dumps(this_machine())},\n"subjects": {{\n{lines}\n}}}}\n', encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

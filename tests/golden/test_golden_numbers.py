@@ -1,0 +1,59 @@
+"""Numbers stay as recorded unless a version is raised; on another machine within the tolerance of golden_numbers.py."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import Any
+
+import pytest
+from golden_numbers import FILE, LEARNT, moved, subjects, this_machine
+
+RECORDED = json.loads(FILE.read_text(encoding="utf-8"))
+SUBJECTS = subjects()
+
+
+@cache
+def now(name: str) -> dict[str, Any]:
+    return SUBJECTS[name].record()
+
+
+def test_every_family_source_and_stage_is_recorded():
+    assert set(RECORDED["subjects"]) == set(SUBJECTS), "run `make golden`"
+
+
+@pytest.mark.parametrize("name", SUBJECTS)
+def test_numbers_are_those_recorded(name):
+    if name == "factor_graph":
+        pytest.importorskip("gtsam")
+    here = RECORDED["machine"] == this_machine()
+    complaint = moved(name, RECORDED["subjects"][name], now(name), None if here else SUBJECTS[name].tolerance)
+    assert not complaint, complaint
+
+
+@pytest.mark.parametrize("name", ["luenberger", "source tabular"])
+def test_numbers_within_the_tolerance_pass_on_another_machine(name):
+    assert not moved(name, RECORDED["subjects"][name], now(name), SUBJECTS[name].tolerance)
+
+
+@pytest.mark.parametrize("tolerance", [None, LEARNT])
+def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
+    from vehest.estimators import luenberger
+
+    former = luenberger.Luenberger._estimate_one
+
+    def shifted(self: Any, recording: Any, state: Any) -> Any:
+        estimate = former(self, recording, state)
+        estimate.channels["vy"][:] *= 1.01
+        return estimate
+
+    monkeypatch.setattr(luenberger.Luenberger, "_estimate_one", shifted)
+    complaint = moved("luenberger", now("luenberger"), SUBJECTS["luenberger"].record(), tolerance)
+    assert complaint.startswith("estimates of luenberger moved: raise Luenberger.version if that is meant")
+
+
+def test_a_raised_version_asks_for_a_new_record():
+    raised = now("luenberger") | {"versions": {"Luenberger.version": "2"}}
+    assert moved("luenberger", now("luenberger"), raised, None) == (
+        "a version of luenberger was raised: record its numbers with `make golden`"
+    )

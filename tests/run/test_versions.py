@@ -1,0 +1,72 @@
+"""Keys hold versions: readable texts that say nothing of where code stands."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.ksnn import Ksnn
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.calibrate import code_of_calibration
+from vehest.run.downsample import code_of_downsampling
+from vehest.run.evaluate import code_of_evaluation
+from vehest.run.evaluate_faults import code_under_faults
+from vehest.run.ingest import code_of_ingest
+from vehest.run.report import code_of_report
+from vehest.run.sweep import code_of_sweep
+from vehest.run.train import code_of_training
+from vehest.run.versions import version_of_study, version_of_training
+from vehest.sources.base import source_names
+from vehest.studies.registry import study_names
+from vehest.training.supervised import SupervisedSettings
+
+PLAIN = re.compile(r"\w+=[\w.]+( \w+=[\w.]+)*")
+
+
+def trainings() -> dict[str, str]:
+    """Estimator -> version of its training."""
+    return {name: code_of_training(name) for name in estimator_names()}
+
+
+def test_versions_are_names_and_numbers_without_modules_and_hashes():
+    texts = [code_of_downsampling(), code_of_sweep(), *trainings().values()]
+    texts += [code_of_ingest({"source": name}) for name in source_names()]
+    texts += [code_of_report(name) for name in study_names()]
+    texts += [code(name) for name in estimator_names() for code in (code_of_calibration, code_of_evaluation)]
+    for text in texts:
+        assert PLAIN.fullmatch(text), text
+        assert "vehest." not in text
+        assert not re.search(r"[0-9a-f]{8}", text), text
+    assert code_of_training("ksnn") == "train=1 ksnn=1 training=1"
+    assert code_under_faults(code_of_evaluation("ksnn")) == "evaluate=1 ksnn=1 faults=1"
+    assert code_of_ingest({"source": "tabular"}) == "ingest=1 tabular=1"
+
+
+def test_a_module_that_is_renamed_retrains_nothing(monkeypatch):
+    before = trainings()
+    for name in estimator_names():
+        monkeypatch.setattr(estimator_class(name), "__module__", "vehest.elsewhere")
+    assert trainings() == before
+
+
+def test_a_raised_version_of_an_estimator_retrains_it_alone(monkeypatch):
+    before = trainings()
+    monkeypatch.setattr(Ksnn, "version", "2")
+    assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn"}
+    assert code_of_evaluation("ksnn") == "evaluate=1 ksnn=2"
+
+
+def test_a_raised_version_of_a_training_retrains_those_trained_by_it(monkeypatch):
+    before = trainings()
+    monkeypatch.setattr(SupervisedSettings, "version", "2")
+    assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn", "gru", "lstm"}
+    assert code_of_calibration("ksnn") == "calibrate=1 ksnn=1", "weights tell a calibration what changed"
+
+
+def test_what_has_no_version_is_of_version_1():
+    assert version_of_training("zero") == "training=1"
+    assert version_of_study("drive") == "drive=1"
+    with pytest.raises(ConfigurationError, match="no study module 'nobody'"):
+        version_of_study("nobody")
