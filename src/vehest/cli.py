@@ -7,9 +7,8 @@ import json
 import math
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,16 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError, is_printable, printable
+from vehest.data.errors import ConfigurationError, DataError, MissingError, is_printable, printable
 from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
-from vehest.run.launchers.where import LAUNCHERS, Where
+from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
 from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.run.config import Config
-    from vehest.run.finished import Finished
-    from vehest.run.shown import Shown
-    from vehest.run.workshop import Workshop
+    from vehest.run.study_run import Ran
 
 app = typer.Typer(
     name="vehest",
@@ -125,14 +122,6 @@ Address = Annotated[
         "--address",
         help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is part of. "
         "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: local, to try it here.",
-        show_default=False,
-    ),
-]
-StoreAddress = Annotated[
-    str | None,
-    typer.Option(
-        "--store",
-        help="With --launcher ray, where machines share no folder: file:///FOLDER or s3://BUCKET/FOLDER to keep artefacts in.",
         show_default=False,
     ),
 ]
@@ -253,16 +242,15 @@ def ingest(
     jobs: Jobs = None,
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
-    config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
-    with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
-        if download:
-            from vehest.run.download import download_files
+    from vehest.run.download import download_files
+    from vehest.run.study_run import RunOptions, open_runner
 
-            download_files(config, workshop)
-        artefact = workshop.ingest(config)
-    _say(
-        as_json, {"folder": str(artefact.folder), "recordings": sorted(Path(n).stem for n in artefact.outputs), "skipped": artefact.skipped}
-    )
+    config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
+    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
+        if download:
+            download_files(config, runner)
+        made = runner.ingest(config)
+    _emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
 
 
 @app.command()
@@ -281,14 +269,15 @@ def simulate(
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
     from vehest.run.simulate import outcome_of, simulation_config
+    from vehest.run.study_run import RunOptions, open_runner
 
     config = simulation_config(dataset, overrides or [])
-    with _workshop(config, force={"ingest"} if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs) as workshop:
-        artefact = workshop.ingest(config)
+    with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
+        artefact = runner.ingest(config)
     outcome = outcome_of(artefact).as_plain()
     if not as_json:
         outcome |= {name: _counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
-    _say(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
+    _emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
 
 
 @app.command(epilog=_offered("dataset"))
@@ -301,11 +290,14 @@ def downsample(
     quiet: Quiet = False,
 ) -> None:
     """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
+    from vehest.run.config import positive_rate
+    from vehest.run.study_run import RunOptions, open_runner
+
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
-    rate = _positive(config["rate_hz"], "rate_hz")
-    with _workshop(config, force={"downsample"} if force else set(), dry_run=dry_run, quiet=quiet) as workshop:
-        artefact = workshop.downsample(workshop.ingest(config), rate, config["downsample"])
-    _say(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
+    rate = positive_rate(config["rate_hz"], "rate_hz")
+    with open_runner(config, RunOptions(force, dry_run, quiet), frozenset({"downsample"})) as runner:
+        artefact = runner.downsample(runner.ingest(config), rate, config["downsample"])
+    _emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
 
 
 @app.command(epilog=_offered("split", "estimator", "training", "tracking"))
@@ -320,18 +312,10 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.run.group import Group
+    from vehest.run.single import train_one
+    from vehest.run.study_run import RunOptions
 
-    config = _compose("train", overrides or [])
-    with _workshop(config, force={"train", "calibrate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
-        _, job = _train_job(config, workshop)
-        members, failures = workshop.run_groups([Group([job], None, workshop.force, split=workshop.split(config))])
-        _raise_failure(failures)
-    from vehest.run.train import read_fit_metrics
-
-    model = members[0].model
-    if model is not None:
-        _say(as_json, {"model": str(model.folder), "status": model.status, "skipped": model.skipped, **read_fit_metrics(model.folder)})
+    _emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"))
@@ -356,43 +340,10 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.run.artefacts import find
-    from vehest.run.comparison import plain_resampling
-    from vehest.run.estimate import find_model, model_artefact, preparation_of
-    from vehest.run.evaluate import protocol_from_config
-    from vehest.run.evaluate_faults import fault_figures, write_faulted
-    from vehest.run.faults import check_channels, faults_of
-    from vehest.run.fitting import fitted_evaluation
-    from vehest.run.group import Evaluation
-    from vehest.run.train import trained_rate
-    from vehest.run.workshop import test_figures
+    from vehest.run.single import evaluate_one
+    from vehest.run.study_run import RunOptions
 
-    config = _compose("eval", overrides or [])
-    faults = faults_of(config)
-    with _workshop(config, force={"calibrate", "evaluate"} if force else set(), dry_run=dry_run, quiet=quiet, track=True) as workshop:
-        split = workshop.split(config)
-        if model is not None:
-            config = fitted_evaluation(config, workshop)
-            trained = model_artefact(find_model(model, workshop.output, _note))
-            rate = trained_rate(trained)
-            if not _names("downsample", overrides):
-                config["downsample"] = preparation_of(trained.folder)
-        else:
-            config, job = _train_job(config, workshop)
-            found, rate, plan = find(job.plan), float(config["estimator"]["rate_hz"]), job.plan
-            if found is None:
-                raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides or [])}' first")
-            trained = found
-        protocol = protocol_from_config(config["evaluation"])
-        data, references = workshop.data_for(split, rate, config), workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-        check_channels(faults, split, data)
-        calibration = workshop.calibration(trained, split, data)
-        how = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, workshop.output, faults)
-        scoring = how.of(trained, calibration)
-        artefact = workshop.ensure(scoring.plan, lambda folder: write_faulted(scoring, folder))
-        figures = test_figures(artefact) | fault_figures(artefact.folder)
-        workshop.log_evaluation(artefact, trained, how)
-    _say(as_json, {"folder": str(artefact.folder), "skipped": artefact.skipped, **figures})
+    _emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), _note))
 
 
 @app.command()
@@ -476,7 +427,7 @@ def estimate(
     write_estimate_table(result, out)
     note = {"note": pretrained_note()} if name == PRETRAINED else {}
     said = {"verdict": verdict_of(result, drive, trust), "findings": [finding_in_words(finding) for finding in findings]}
-    _say(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
+    _emit(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
 
 
 def _note(text: str) -> None:
@@ -538,7 +489,7 @@ def replay(
     stop = StopSignals()
     with stop.installed(), stop.deferred():
         outcome = replay_log(words, overrides or [], stop.requested, _note)
-    _say(as_json, outcome)
+    _emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)
 
@@ -584,10 +535,10 @@ def export(
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
-        _say(as_json, {"out": str(out), "model": str(folder)})
+        _emit(as_json, {"out": str(out), "model": str(folder)})
         return
     found = export_model(fitted, trust_of(folder, output), out, precision, bus_rate, elsewhere=elsewhere)
-    _say(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
+    _emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
 
 
 def _is_file_name(word: str) -> bool:
@@ -681,27 +632,16 @@ def run(
     ] = None,
     launcher: LauncherName = "local",
     address: Address = None,
-    store: StoreAddress = None,
     slurm: Slurm = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
     What is there is skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    if minutes is not None and not minutes > 0:
-        raise ConfigurationError(f"--minutes must be positive, not {minutes:g}")
-    _run_pipeline(
-        pipeline,
-        overrides or [],
-        dry_run=dry_run,
-        force=force,
-        as_json=as_json,
-        quiet=quiet,
-        jobs=jobs,
-        only_report=False,
-        minutes=minutes,
-        where=Where(launcher, address, store, tuple(slurm or ())),
-    )
+    from vehest.run.study_run import RunOptions, run_study
+
+    options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
+    _print_ran(run_study(pipeline, overrides or [], options), as_json)
 
 
 @app.command()
@@ -738,12 +678,14 @@ def report(
         return
     if pipeline is None:
         raise ConfigurationError(f"say which pipeline, of: {', '.join(pipeline_names())}; or --check")
-    _run_pipeline(pipeline, overrides or [], dry_run=dry_run, force=force, as_json=as_json, quiet=quiet, jobs=1, only_report=True)
+    from vehest.run.study_run import RunOptions, run_study
+
+    _print_ran(run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), only_report=True), as_json)
 
 
 def _check_published(words: list[str], as_json: bool) -> None:
     """Say of published studies whether they are those of today; exit code 3 unless all are."""
-    from vehest.run.published_check import check_published
+    from vehest.run.published import check_published
 
     verdicts = check_published([word for word in words if _is_file_name(word)], [word for word in words if not _is_file_name(word)])
     if as_json:
@@ -768,7 +710,6 @@ def sweep(
     jobs: Jobs = None,
     launcher: LauncherName = "local",
     address: Address = None,
-    store: StoreAddress = None,
     slurm: Slurm = None,
 ) -> None:
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
@@ -776,62 +717,10 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.run.finished import Asked, Outcome, recall, remember, stamps_of
+    from vehest.run.study_run import RunOptions, run_sweep
 
-    words = tuple(overrides or [])
-    asked = Asked(("sweep", name or "", *words), words)
-    finished = None if force else recall(asked)
-    if finished is not None:
-        folder, _ = _repeat(finished, dry_run=dry_run, quiet=quiet)
-        _print_sweep(finished.record.shown, as_json, folder, skipped=True)
-        return
-    from vehest.run.shown import shown_of_sweep
-    from vehest.run.sweep import SweepOutcome, plan_sweep, run_sweep
-
-    planned = plan_sweep(words, name)
-
-    def whole_way(workshop: Workshop) -> tuple[Outcome, SweepOutcome]:
-        raw = stamps_of(workshop.datasets_of(planned.first))
-        swept = run_sweep(planned, workshop)
-        return workshop.outcome(swept.folder, shown_of_sweep(swept), None, planned.first["tracking"], raw), swept
-
-    forced = {"train", "calibrate", "evaluate", "sweep"} if force else set()
-    where = Where(launcher, address, store, tuple(slurm or ()))
-    with _workshop(planned.first, force=forced, dry_run=dry_run, quiet=quiet, jobs=jobs, track=True, where=where) as workshop:
-        outcome, swept = whole_way(workshop)
-        _print_sweep(outcome.shown, as_json, outcome.report.folder, skipped=swept.folder.skipped)
-        if not dry_run:
-            swept.raise_failures()
-            remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
-
-
-@app.command()
-def plan(
-    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
-    cores: Annotated[
-        int | None, typer.Option(min=1, help="Cores that the time is for; by default those of this machine.", show_default=False)
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Say what is left to do of a study and what it would cost, by what trainings of the same kinds took; runs nothing.
-
-    Trainings, tasks of a cluster, core hours, memory, data to move, and the time on so many cores. What is guessed, since nothing like it
-    was trained into this output root, is called a guess.
-    """
-    from vehest.run.launcher import default_jobs
-    from vehest.run.launchers.plan import plan_study
-    from vehest.run.pipeline import pipeline_configs, read_pipeline
-
-    study = read_pipeline(pipeline)
-    configs = pipeline_configs(study, overrides or [])
-    with _workshop(next(iter(configs.values()))[0], force=set(), dry_run=True, quiet=True) as workshop:
-        cost = plan_study(study, configs, workshop, cores or default_jobs())
-    if as_json:
-        _echo(_json(cost.figures()), keep="\n")
-    else:
-        for name, value in cost.rows():
-            _echo(f"{name:<11} {value}")
+    options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
+    _print_ran(run_sweep(overrides or [], name, options), as_json, sweep=True)
 
 
 @app.command("config")
@@ -1092,13 +981,15 @@ def data_align(
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
-    from vehest.run.signals import Stopped
+    from vehest.run.signals import DryRunStop, Stopped
 
     _open_streams()
     try:
         code = app(prog_name="vehest", standalone_mode=False)
     except _USAGE_ERROR as error:
         _fail_usage(error)
+    except DryRunStop:
+        code = 0
     except (_OutputClosed, BrokenPipeError):
         _silence(sys.stdout)
         sys.exit(141)
@@ -1195,101 +1086,31 @@ def _echo(text: str, keep: str = "") -> None:
         raise MissingError(f"cannot write to standard output ({error.strerror})") from error
 
 
-def _run_pipeline(
-    name: str,
-    overrides: list[str],
-    *,
-    dry_run: bool,
-    force: bool,
-    as_json: bool,
-    quiet: bool,
-    jobs: int | None,
-    only_report: bool,
-    minutes: float | None = None,
-    where: Where | None = None,
-) -> None:
-    begun = time.monotonic()
-    from vehest.run.finished import Asked, Outcome, recall, remember, stamps_of
+def _print_ran(ran: Ran, as_json: bool, *, sweep: bool = False) -> None:
+    """Print a study's tables and the path of its report, or all as one JSON object.
 
-    asked = Asked(("run", name, *overrides), tuple(overrides), name)
-    finished = None if force else recall(asked)
-    if finished is not None:
-        folder, published = _repeat(finished, dry_run=dry_run, quiet=quiet)
-        _print_shown(finished.record.shown, as_json, folder, {"published": str(published) if published else None})
-        return
-    from vehest.run.pipeline import PipelineOutcome, content_overrides, datasets_of, pipeline_configs, read_pipeline, run_pipeline
-    from vehest.run.shown import shown_of_pipeline
-
-    pipeline = read_pipeline(name)
-    configs = pipeline_configs(pipeline, overrides)
-    first = next(iter(configs.values()))[0]
-
-    def whole_way(workshop: Workshop) -> tuple[Outcome, PipelineOutcome]:
-        raw = stamps_of(datasets_of(pipeline, configs, workshop))
-        outcome = run_pipeline(pipeline, configs, content_overrides(overrides), workshop, only_report=only_report)
-        shown = shown_of_pipeline(pipeline.title, outcome)
-        tracking = first.get("tracking", {})
-        return workshop.outcome(outcome.report, shown, outcome.publication, tracking, raw), outcome
-
-    forced = {"report"} if only_report else {"ingest", "downsample", "train", "calibrate", "evaluate", "report"}
-    with _workshop(first, force=forced if force else set(), dry_run=dry_run, quiet=quiet, jobs=jobs, where=where) as workshop:
-        workshop.until = _until(minutes, begun)
-        outcome, made = whole_way(workshop)
-        _print_shown(outcome.shown, as_json, outcome.report.folder, {"published": str(made.published) if made.published else None})
-        if made.failed is not None:
-            raise made.failed
-        if not dry_run and not made.unfinished:
-            remember(asked, outcome, workshop.rehearsed(lambda again: whole_way(again)[0]), workshop.messages.warn)
-
-
-def _until(minutes: float | None, begun: float) -> float | None:
-    """When trainings have to end, as ``time.monotonic`` reads, so that the report is drawn in time.
-
-    Args:
-        minutes: for all; none for no limit.
-        begun: when the command did.
+    Raises:
+        JobsFailedError: some jobs failed.
     """
-    if minutes is None:
-        return None
-    seconds = 60.0 * minutes
-    return begun + seconds - min(max(30.0, 0.06 * seconds), 0.5 * seconds)
-
-
-def _repeat(finished: Finished, *, dry_run: bool, quiet: bool) -> tuple[Path, Path | None]:
-    """Say what the whole way would say of a finished study, publish it where its copy is not there; returns its report and that copy."""
-    from vehest.run.console import Messages
-    from vehest.run.publishing import publish_study
-
-    messages = Messages(quiet=quiet)
-    messages.again(finished.record.said)
-    published = None if dry_run else publish_study(finished.record.publication, finished.report, messages)
-    return finished.report.folder, published
-
-
-def _print_sweep(shown: Shown, as_json: bool, folder: Path, *, skipped: bool) -> None:
-    """Print a sweep's table, or all as one JSON object."""
+    page, summary = ran.folder / ran.summary.page, ran.summary
     if as_json:
-        _echo(_json({"folder": str(folder), "skipped": skipped, **json.loads(shown.figures)}), keep="\n")
+        own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
+        if not sweep:
+            own = {"report": str(page), "published": str(ran.published) if ran.published else None}
+        _echo(_json({**own, **json.loads(summary.figures)}), keep="\n")
     else:
-        _print_shown(shown, as_json, folder, {})
-
-
-def _print_shown(shown: Shown, as_json: bool, folder: Path, further: dict[str, Any]) -> None:
-    """Print a study's tables and where its report is, or all as one JSON object."""
-    page = folder / shown.page
-    if as_json:
-        _echo(_json({"report": str(page), **further, **json.loads(shown.figures)}), keep="\n")
-        return
-    for table in shown.tables:
-        if table.title:
-            _echo("")
-            _echo(table.title)
-        _table([*table.header], [[*row] for row in table.rows])
-    if shown.note:
-        _echo(shown.note, keep="\n")
-    _echo(f"report: {page}")
-    if further.get("published"):
-        _echo(f"published: {further['published']}")
+        for table in summary.tables:
+            if table.title:
+                _echo("")
+                _echo(table.title)
+            _table([*table.header], [[*row] for row in table.rows])
+        if summary.note:
+            _echo(summary.note, keep="\n")
+        _echo(f"report: {page}")
+        if ran.published:
+            _echo(f"published: {ran.published}")
+    if ran.failed is not None:
+        raise ran.failed
 
 
 def _compose(command: str, overrides: list[str]) -> Config:
@@ -1303,67 +1124,7 @@ def _names(group: str, overrides: list[str] | None) -> bool:
     return any(override.lstrip("+~").startswith((f"{group}.", f"{group}=")) for override in overrides or [])
 
 
-def _train_job(config: Config, workshop: Workshop) -> tuple[Config, Any]:
-    """The configuration at a rate that the recordings have, and what it trains."""
-    from vehest.run.fitting import fitted_job
-    from vehest.run.starting import plan_training
-
-    _positive(config["estimator"].get("rate_hz"), "estimator.rate_hz")
-    split, config = workshop.split(config), fitted_job(config, workshop)
-    return config, plan_training(config, split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config))
-
-
-@contextmanager
-def _workshop(
-    config: Config,
-    *,
-    force: set[str],
-    dry_run: bool,
-    quiet: bool,
-    jobs: int | None = None,
-    track: bool = False,
-    where: Where | None = None,
-) -> Iterator[Workshop]:
-    """A workshop that listens to signals; a dry run ends where it meets something that is not there yet."""
-    from vehest.data.limits import limits_from_config, use_limits
-    from vehest.run.console import Messages
-    from vehest.run.launcher import default_jobs
-    from vehest.run.launchers.base import chosen_launcher
-    from vehest.run.signals import StopSignals
-    from vehest.run.tracking import Tracker
-    from vehest.run.workshop import NotThereYet, Workshop
-
-    messages, stop, output = Messages(quiet=quiet), StopSignals(), Path(config["output"])
-    tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if track else None
-    workshop = Workshop(output, messages, stop, jobs or default_jobs(), frozenset(force), dry_run, tracker)
-    if where is not None:
-        workshop.launcher = chosen_launcher(where, jobs, output, messages)
-    with use_limits(limits_from_config(config["limits"])), stop.installed():
-        try:
-            yield workshop
-        except NotThereYet:
-            raise typer.Exit from None
-        finally:
-            if workshop.launcher is not None:
-                workshop.launcher.close()
-
-
-def _raise_failure(failures: list[tuple[str, Any]]) -> None:
-    for _, failure in failures:
-        if failure.detail:
-            _complain(printable(failure.detail, keep="\n"))
-        error = VehestError(failure.message)
-        error.exit_code = failure.exit_code
-        raise error
-
-
-def _positive(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
-        raise ConfigurationError(f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20")
-    return float(value)
-
-
-def _say(as_json: bool, outcome: dict[str, Any]) -> None:
+def _emit(as_json: bool, outcome: dict[str, Any]) -> None:
     """Print an outcome: one JSON object, or a line a figure."""
     if as_json:
         _echo(_json(outcome), keep="\n")

@@ -23,10 +23,10 @@ from vehest.run.group import Group
 from vehest.run.launchers.base import LocalLauncher, chosen_launcher
 from vehest.run.launchers.on_slurm import slurm_parameters
 from vehest.run.launchers.plan import StudyCost, Unit, makespan
-from vehest.run.launchers.standing import Standing
+from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.launchers.store import Store
 from vehest.run.launchers.times import Cost, Times, next_lot
-from vehest.run.launchers.where import Where
+from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.worker import World, moved
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
@@ -132,7 +132,7 @@ def test_a_plan_counts_what_is_left_and_makes_nothing(place):
 
 def test_standing_counts_and_estimates_the_end():
     now = iter([0.0])
-    standing = Standing(10, clock=lambda: next(now, 5.0))
+    standing = LaunchProgress(10, clock=lambda: next(now, 5.0))
     standing.runs(0)
     standing.runs(1)
     assert (standing.running, standing.waiting, standing.seconds_left(2)) == (2, 8, None)
@@ -141,7 +141,7 @@ def test_standing_counts_and_estimates_the_end():
     assert (standing.done, standing.failed, standing.waiting) == (1, 1, 8)
     assert standing.seconds_left(4) == 8 * 15.0 / 4
     assert standing.row(4)["core hours"] == "0.008"
-    assert Standing(1).row(4) == {}
+    assert LaunchProgress(1).row(4) == {}
 
 
 def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
@@ -282,7 +282,7 @@ def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
 
 
 def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
-    launcher = chosen_launcher(Where(), 1, tmp_path, FINE)
+    launcher = chosen_launcher(LauncherOptions(), 1, tmp_path, FINE)
     assert isinstance(launcher, LocalLauncher)
     group = Group([job(tmp_path)])
     (done,) = launcher.launch([group], StopSignals(), lambda *_: None)
@@ -295,13 +295,13 @@ def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
 @pytest.mark.parametrize(
     ("where", "says"),
     [
-        (Where("cloud"), "--launcher must be one of local, ray, slurm, not 'cloud'"),
-        (Where("local", address="auto"), "--address is for --launcher ray and slurm, not for local"),
-        (Where("slurm", store="file:///x"), "--store is for --launcher ray, not for slurm"),
-        (Where("ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
-        (Where("slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
-        (Where("slurm", "local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
-        (Where("slurm", "local", slurm=("nodes=4",)), "--slurm 'nodes=4' must be NAME=VALUE with one of the names account"),
+        (LauncherOptions("cloud"), "--launcher must be one of local, ray, slurm, not 'cloud'"),
+        (LauncherOptions("local", address="auto"), "--address is for --launcher ray and slurm, not for local"),
+        (LauncherOptions("slurm", store="file:///x"), "--store is for --launcher ray, not for slurm"),
+        (LauncherOptions("ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
+        (LauncherOptions("slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
+        (LauncherOptions("slurm", "local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
+        (LauncherOptions("slurm", "local", slurm=("nodes=4",)), "--slurm 'nodes=4' must be NAME=VALUE with one of the names account"),
     ],
 )
 def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path):
@@ -320,4 +320,4 @@ def test_without_slurm_a_line_says_where_to_run(tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingError, match="there is no SLURM here"):
-        chosen_launcher(Where("slurm"), None, tmp_path, FINE)
+        chosen_launcher(LauncherOptions("slurm"), None, tmp_path, FINE)

@@ -1,6 +1,6 @@
 """A comparison of estimators on one split, from its jobs to what the report stage draws.
 
-jobs -> `check` (rates, required channels) -> CheckedJobs -> `plan` (trainings in groups) -> Planned -> `Runner.run` -> `collect` -> Compared
+jobs -> `check` (rates, required channels) -> `plan` (trainings in groups) -> `Runner.run` -> `collect` -> Compared
 """
 
 from __future__ import annotations
@@ -263,7 +263,8 @@ def _check_name(job: Job, training: TrainJob, names: dict[Any, Any], *, sweep: b
             raise ConfigurationError(f"it is the same training as {twin}")
     elif names.setdefault(training.plan.label, key) != key:
         raise ConfigurationError(
-            f"two jobs are both called {training.plan.label}: they differ in what its name does not say; sweep that in a pipeline of its own"
+            f"two jobs are both called {training.plan.label}: they differ in what its name does not say; "
+            "sweep that in a pipeline of its own"
         )
 
 
@@ -334,10 +335,8 @@ def named(failures: Mapping[int, Failure], jobs: Sequence[Job]) -> list[tuple[st
     """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
     seeds: dict[tuple[str, Failure], list[str]] = {}
     for position, failure in failures.items():
-        seeds.setdefault((_stem(jobs[position]), failure), []).append(str(jobs[position].config.get("seed", "")))
-    return [
-        (f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}".removesuffix(" seed "), failure) for (stem, failure), own in seeds.items()
-    ]
+        seeds.setdefault((_stem(jobs[position]), failure), []).append(str(jobs[position].config["seed"]))
+    return [(f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}", failure) for (stem, failure), own in seeds.items()]
 
 
 def failed_in(compared: Sequence[Compared], runner: Runner) -> JobsFailedError | None:
@@ -390,9 +389,9 @@ def training_facts(configs: Sequence[Config]) -> list[str]:
     schemes: dict[str, set[str]] = {}
     for config in configs:
         schemes.setdefault(json.dumps(config["training"], default=str), set()).add(config["estimator"]["name"])
-    facts = dict[str, None]()
+    facts = []
     for text, names in schemes.items():
         training = json.loads(text)
         options = ", ".join(f"{key} {value}" for key, value in training.items() if key not in {"name", "checkpoint_seconds", "compiled"})
-        facts[f"{', '.join(sorted(names))}: {training['name']} ({options})" if options else f"{', '.join(sorted(names))}: nothing is trained"] = None
-    return list(facts)
+        facts.append(f"{', '.join(sorted(names))}: " + (f"{training['name']} ({options})" if options else "nothing is trained"))
+    return list(dict.fromkeys(facts))

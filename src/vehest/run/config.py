@@ -185,6 +185,17 @@ def as_yaml(config: Config) -> str:
     return yaml.safe_dump(config, sort_keys=False, allow_unicode=False, width=120)
 
 
+def positive_rate(value: Any, name: str) -> float:
+    """A rate [Hz] of a configuration.
+
+    Raises:
+        ConfigurationError: it is no positive number.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+        raise ConfigurationError(f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20")
+    return float(value)
+
+
 def missing_keys(config: Any, prefix: str = "") -> list[str]:
     """Dotted keys that still hold ``???``."""
     if isinstance(config, dict):

@@ -291,7 +291,9 @@ def _code() -> list[tuple[str, Path]]:
     for group in sorted(group for group in found.groups if group.startswith("vehest.")):
         for point in found.select(group=group):
             spec = importlib.util.find_spec(point.module.partition(".")[0])
-            packages |= {Path(spec.origin).parent if spec.submodule_search_locations else Path(spec.origin)} if spec and spec.origin else set()
+            packages |= (
+                {Path(spec.origin).parent if spec.submodule_search_locations else Path(spec.origin)} if spec and spec.origin else set()
+            )
     files: list[tuple[str, Path]] = []
     for package in sorted(packages):
         if package.is_file():

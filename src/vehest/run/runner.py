@@ -21,13 +21,13 @@ from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.calibrate import calibration_of, plan_calibrate, write_calibration
 from vehest.run.compiling import has_to_compile
 from vehest.run.config import Config, compose_config, missing_keys
-from vehest.run.console import Messages
+from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing, is_calibrated, is_finished
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.run.launchers.base import Launcher, LocalLauncher
-from vehest.run.launchers.standing import Standing
+from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.locks import Waiting
 from vehest.run.rates import Note
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
@@ -204,22 +204,14 @@ class Runner:
         waiting = self._missing(groups, members)
         launcher = self.launcher or LocalLauncher(self.jobs)
         while waiting:
-            standing, alone = Standing(len(waiting)), []
+            progress, alone = LaunchProgress(len(waiting)), []
             with self.messages.bars() as bars:
-
-                def report(at: int, progress: Progress | Waiting | None, now: Standing = standing, of: Sequence[Group] = waiting) -> None:
-                    if isinstance(progress, Waiting):
-                        self._print_waiting(progress)
-                    else:
-                        now.runs(at)
-                        bars.fit(of[at].name, progress)
-                        bars.count(now.row(launcher.cores))
-
+                report = partial(self._report, waiting, progress, bars, launcher.cores)
                 for done in launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
                     group, outcome = waiting[done.position], done.outcome
-                    standing.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
+                    progress.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
                     bars.close(group.name)
-                    bars.count(standing.row(launcher.cores))
+                    bars.count(progress.row(launcher.cores))
                     if not isinstance(outcome, Failure):
                         members |= self._received(group, outcome)
                         for member in outcome:
@@ -262,6 +254,17 @@ class Runner:
         for split in dict.fromkeys(group.split_of_bands.name for group in waiting if group.split_of_bands and not is_calibrated(group)):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
         return waiting
+
+    def _report(
+        self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, cores: int, at: int, progress: Progress | Waiting | None
+    ) -> None:
+        """Draw the progress of a group, or print for whom it waits."""
+        if isinstance(progress, Waiting):
+            self._print_waiting(progress)
+        else:
+            of_all.runs(at)
+            bars.fit(groups[at].name, progress)
+            bars.count(of_all.row(cores))
 
     def print_trainings(self, labels: Sequence[str], then: Sequence[str]) -> None:
         """What a dry run would train."""

@@ -8,7 +8,7 @@ from typing import Any
 from vehest.data.errors import MissingError, VehestError
 from vehest.run.artefacts import find
 from vehest.run.comparison import check_evaluation, check_job, plan_training
-from vehest.run.config import Config, compose_config, key_of
+from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.estimate import find_model, model_artefact, preparation_of
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.evaluate_faults import fault_figures, write_faulted
@@ -88,5 +88,6 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
 
 def _training(config: Config, runner: Runner) -> tuple[Config, TrainJob]:
     """The configuration at a rate that the recordings have, and its training."""
+    positive_rate(config["estimator"].get("rate_hz"), "estimator.rate_hz")
     split, config = runner.split(config), check_job(config, runner)
     return config, plan_training(config, split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config))

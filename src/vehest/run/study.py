@@ -336,9 +336,9 @@ def _part_jobs(
                 config["seed"] = value_of(seeds[-1])
             configs.setdefault(json.dumps({key: value for key, value in config.items() if key != GIVEN}, sort_keys=True), config)
     jobs = [Job(config) for config in configs.values()]
-    for job in jobs:
+    for other in jobs:
         for key in SAME_IN_A_PART:
-            if job.config[key] != jobs[0].config[key]:
+            if other.config[key] != jobs[0].config[key]:
                 raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
     return jobs
 

@@ -17,20 +17,21 @@ from vehest.run.artefacts import Artefact, find
 from vehest.run.comparison import NO_TIME, CheckedJobs, Compared, check, collect, failed_in, only_there, plan
 from vehest.run.config import Config
 from vehest.run.console import Messages
+from vehest.run.failures import Failure
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launcher import default_jobs
 from vehest.run.launchers.base import chosen_launcher
-from vehest.run.launchers.where import Where
+from vehest.run.launchers.options import LauncherOptions
+from vehest.run.published import Keys, keys_of_study
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.report import ReportJob, ShownDatasets, absent_dataset, leaderboard, overview, plan_report, verdict, write_report
 from vehest.run.run_cache import Outcome, RunCache, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Part, Study, content_overrides, jobs_of, read_study
-from vehest.run.study_keys import Keys, keys_of_study
 from vehest.run.sweep import STAGE as SWEEP
-from vehest.run.sweep import Sweep, draw_sweep, plan_sweep
+from vehest.run.sweep import draw_sweep, plan_sweep
 from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
 from vehest.run.tracking import Tracker
 from vehest.studies.artefacts import AbsentDataset
@@ -59,7 +60,7 @@ class RunOptions:
     jobs: int | None = None
     track: bool = False
     minutes: float | None = None
-    launcher: Where | None = None
+    launcher: LauncherOptions | None = None
 
 
 @dataclass(frozen=True)
@@ -141,12 +142,11 @@ def run_study(name: str, overrides: Sequence[str], options: RunOptions, *, only_
         for part in study.parts:
             if part.name in checked:
                 try:
-                    planned, missing = plan(checked[part.name], runner), {}
+                    planned, missing = plan(checked[part.name], runner), dict[str, Failure]()
                     if only_report:
                         planned, missing = only_there(planned, f"vehest run {study.file}")
                     found, failed = runner.run(planned.groups)
-                    title = part.title if part.name else ""
-                    compared[part.name] = collect(title, planned, found, failed | missing, runner)
+                    compared[part.name] = collect(part.title, planned, found, failed | missing, runner)
                 except DryRunStop:
                     waits = True
         if waits:
@@ -326,5 +326,4 @@ def _ingest_all(study: Study, jobs: Sequence[Job], runner: Runner, *, only_repor
 def _keys(study: Study, jobs: Jobs, absent: Mapping[str, str], runner: Runner) -> Keys:
     """What determined the results: raw files as they were ingested."""
     inputs = {artefact.label: artefact.inputs for artefact in runner.artefacts.values() if artefact.stage == INGEST}
-    configs = {part: [job.config for job in own] for part, own in jobs.items()}
-    return keys_of_study(study, configs, absent, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])
+    return keys_of_study(study, jobs, absent, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])

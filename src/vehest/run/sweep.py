@@ -17,7 +17,7 @@ from vehest.data.splits import VALIDATION, check_name
 from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.comparison import Compared, failed_in, named
-from vehest.run.config import check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
+from vehest.run.config import Config, check_jobs, compose_config, count, expand, key_of, limits_of, parse, value_of
 from vehest.run.evaluate import COLUMNS, METRICS
 from vehest.run.faults import FaultSettings, chosen_fault, faults_of
 from vehest.run.group import Member

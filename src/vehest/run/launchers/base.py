@@ -11,7 +11,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.run.console import Messages
 from vehest.run.group import Group, Member, run_group
 from vehest.run.launcher import Done, Reporter, Task, default_jobs, launch
-from vehest.run.launchers.where import LAUNCHERS, Where
+from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
 from vehest.run.signals import StopSignals, TimeLimit
 
 
@@ -56,7 +56,7 @@ class LocalLauncher:
         """Nothing is kept."""
 
 
-def chosen_launcher(where: Where, jobs: int | None, output: Path, messages: Messages) -> Launcher:
+def chosen_launcher(where: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
     """The launcher of a command.
 
     Args:
@@ -71,7 +71,7 @@ def chosen_launcher(where: Where, jobs: int | None, output: Path, messages: Mess
     """
     if where.launcher not in LAUNCHERS:
         raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{where.launcher}'")
-    given = {"--address": where.address, "--store": where.store, "--slurm": where.slurm}
+    given = {"--address": where.address, "--store": None, "--slurm": where.slurm}
     takes = {"local": (), "ray": ("--address", "--store"), "slurm": ("--address", "--slurm")}
     for option, value in given.items():
         if value and option not in takes[where.launcher]:
@@ -84,6 +84,5 @@ def chosen_launcher(where: Where, jobs: int | None, output: Path, messages: Mess
 
         return SlurmLauncher(where.address, jobs, where.slurm, output, messages)
     from vehest.run.launchers.on_ray import RayLauncher
-    from vehest.run.launchers.store import Store
 
-    return RayLauncher(where.address, jobs, None if where.store is None else Store(where.store), output, messages)
+    return RayLauncher(where.address, jobs, None, output, messages)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Standing:
+class LaunchProgress:
     """Counts of the groups of a launch.
 
     Args:
