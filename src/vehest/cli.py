@@ -23,7 +23,7 @@ from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.run.config import Config
-    from vehest.run.study_run import Ran
+    from vehest.run.run_cache import Ran
 
 app = typer.Typer(
     name="vehest",
@@ -243,7 +243,8 @@ def ingest(
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     from vehest.run.download import download_files
-    from vehest.run.study_run import RunOptions, open_runner
+    from vehest.run.run_cache import RunOptions
+    from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
@@ -268,8 +269,9 @@ def simulate(
     The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
+    from vehest.run.run_cache import RunOptions
     from vehest.run.simulate import outcome_of, simulation_config
-    from vehest.run.study_run import RunOptions, open_runner
+    from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
@@ -291,7 +293,8 @@ def downsample(
 ) -> None:
     """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
     from vehest.run.config import positive_rate
-    from vehest.run.study_run import RunOptions, open_runner
+    from vehest.run.run_cache import RunOptions
+    from vehest.run.study_run import open_runner
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
     rate = positive_rate(config["rate_hz"], "rate_hz")
@@ -312,8 +315,8 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
+    from vehest.run.run_cache import RunOptions
     from vehest.run.single import train_one
-    from vehest.run.study_run import RunOptions
 
     _emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
@@ -340,8 +343,8 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
+    from vehest.run.run_cache import RunOptions
     from vehest.run.single import evaluate_one
-    from vehest.run.study_run import RunOptions
 
     _emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), _note))
 
@@ -638,10 +641,17 @@ def run(
 
     What is there is skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    from vehest.run.study_run import RunOptions, run_study
+    from vehest.run.run_cache import RunCache, RunOptions
 
+    words = overrides or []
     options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
-    _print_ran(run_study(pipeline, overrides or [], options), as_json)
+    cache = RunCache(("run", pipeline, *words), words, pipeline)
+    ran = cache.repeat(options)
+    if ran is None:
+        from vehest.run.study_run import run_study
+
+        ran = run_study(pipeline, words, options, cache)
+    _print_ran(ran, as_json)
 
 
 @app.command()
@@ -678,9 +688,16 @@ def report(
         return
     if pipeline is None:
         raise ConfigurationError(f"say which pipeline, of: {', '.join(pipeline_names())}; or --check")
-    from vehest.run.study_run import RunOptions, run_study
+    from vehest.run.run_cache import RunCache, RunOptions
 
-    _print_ran(run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), only_report=True), as_json)
+    words, options = overrides or [], RunOptions(force, dry_run, quiet, 1)
+    cache = RunCache(("run", pipeline, *words), words, pipeline)
+    ran = cache.repeat(options)
+    if ran is None:
+        from vehest.run.study_run import run_study
+
+        ran = run_study(pipeline, words, options, cache, only_report=True)
+    _print_ran(ran, as_json)
 
 
 def _check_published(words: list[str], as_json: bool) -> None:
@@ -717,10 +734,17 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.run.study_run import RunOptions, run_sweep
+    from vehest.run.run_cache import RunCache, RunOptions
 
+    words = overrides or []
     options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
-    _print_ran(run_sweep(overrides or [], name, options), as_json, sweep=True)
+    cache = RunCache(("sweep", name or "", *words), words)
+    ran = cache.repeat(options)
+    if ran is None:
+        from vehest.run.study_run import run_sweep
+
+        ran = run_sweep(words, name, options, cache)
+    _print_ran(ran, as_json, sweep=True)
 
 
 @app.command("config")

@@ -21,14 +21,15 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import VehestError
+from vehest.data.errors import JobsFailedError, VehestError
 from vehest.data.files import file_name, remove_leftovers, written_aside
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
 from vehest.run.config_files import find_pipeline, local_conf, packaged_conf, packaged_pipelines
-from vehest.run.console import WARNING
-from vehest.run.publishing import Publication
+from vehest.run.console import WARNING, Messages
+from vehest.run.launchers.options import LauncherOptions
+from vehest.run.publishing import Publication, publish_study
 from vehest.run.terminal import TerminalSummary
 from vehest.run.tracking import TRACKED_STAGES, Tracker
 
@@ -104,6 +105,48 @@ class Finished:
     report: Artefact
 
 
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a command that runs stages.
+
+    Args:
+        force: run although artefacts are there.
+        dry_run: print what would run, run nothing.
+        quiet: print warnings and results alone.
+        jobs: processes; none for one a core.
+        track: log runs.
+        minutes: time for everything, report included; none for no limit.
+        launcher: where trainings run; none for this machine.
+    """
+
+    force: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+    jobs: int | None = None
+    track: bool = False
+    minutes: float | None = None
+    launcher: LauncherOptions | None = None
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A study or sweep that is done.
+
+    Args:
+        summary: to print.
+        folder: of its report.
+        skipped: whether the report was there already.
+        published: folder in results/, if it was published.
+        failed: error to end with.
+    """
+
+    summary: TerminalSummary
+    folder: Path
+    skipped: bool
+    published: Path | None = None
+    failed: JobsFailedError | None = None
+
+
 class RunCache:
     """The record of one command.
 
@@ -156,6 +199,16 @@ class RunCache:
             if artefact.stage in TRACKED_STAGES and not tracker.is_tracked(artefact):
                 return None
         return Finished(record, artefacts[-1])
+
+    def repeat(self, options: RunOptions) -> Ran | None:
+        """The finished study, printed and published as the next run in full would; none where there is no valid record, or under force."""
+        finished = None if options.force else self.load()
+        if finished is None:
+            return None
+        messages = Messages(quiet=options.quiet)
+        messages.again(finished.record.lines)
+        published = None if options.dry_run else publish_study(finished.record.publication, finished.report, messages)
+        return Ran(finished.record.summary, finished.report.folder, True, published)
 
     def save(self, outcome: Outcome, warn: Callable[[str], None]) -> None:
         """Keep a finished study, unless something changed meanwhile or the next run cannot tell whether it did.

@@ -14,8 +14,9 @@ from vehest.run.evaluate import protocol_from_config
 from vehest.run.evaluate_faults import fault_figures, write_faulted
 from vehest.run.faults import check_channels, faults_of
 from vehest.run.group import Evaluation, Group
+from vehest.run.run_cache import RunOptions
 from vehest.run.runner import Runner
-from vehest.run.study_run import RunOptions, open_runner
+from vehest.run.study_run import open_runner
 from vehest.run.tracked_runs import log_calibration, log_evaluation, test_figures
 from vehest.run.train import TrainJob, read_fit_metrics, trained_rate
 

@@ -1,6 +1,6 @@
-"""Runs studies and sweeps, from a command's words to what is printed and published.
+"""Runs studies and sweeps, from a command's overrides to what is printed and published.
 
-words -> `RunCache` -> jobs (`study`, `sweep`) -> `comparison.check`, `plan` -> `Runner.run` -> `collect` -> report -> results/
+jobs (`study`, `sweep`) -> `comparison.check`, `plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
@@ -22,64 +22,21 @@ from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launcher import default_jobs
 from vehest.run.launchers.base import chosen_launcher
-from vehest.run.launchers.options import LauncherOptions
 from vehest.run.published import Keys, keys_of_study
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.report import ReportJob, ShownDatasets, absent_dataset, leaderboard, overview, plan_report, verdict, write_report
-from vehest.run.run_cache import Outcome, RunCache, stamps_of
+from vehest.run.run_cache import Outcome, Ran, RunCache, RunOptions, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Part, Study, content_overrides, jobs_of, read_study
 from vehest.run.sweep import STAGE as SWEEP
 from vehest.run.sweep import draw_sweep, plan_sweep
-from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
+from vehest.run.terminal import summary_of_leaderboard, summary_of_overview, summary_of_sweep
 from vehest.run.tracking import Tracker
 from vehest.studies.artefacts import AbsentDataset
 
 STUDY_STAGES = frozenset({"ingest", "downsample", "train", "calibrate", "evaluate", "report"})
 SWEEP_STAGES = frozenset({"train", "calibrate", "evaluate", SWEEP})
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a command that runs stages.
-
-    Args:
-        force: run although artefacts are there.
-        dry_run: print what would run, run nothing.
-        quiet: print warnings and results alone.
-        jobs: processes; none for one a core.
-        track: log runs.
-        minutes: time for everything, report included; none for no limit.
-        launcher: where trainings run; none for this machine.
-    """
-
-    force: bool = False
-    dry_run: bool = False
-    quiet: bool = False
-    jobs: int | None = None
-    track: bool = False
-    minutes: float | None = None
-    launcher: LauncherOptions | None = None
-
-
-@dataclass(frozen=True)
-class Ran:
-    """A study or sweep that is done.
-
-    Args:
-        summary: to print.
-        folder: of its report.
-        skipped: whether the report was there already.
-        published: folder in results/, if it was published.
-        failed: error to end with.
-    """
-
-    summary: TerminalSummary
-    folder: Path
-    skipped: bool
-    published: Path | None = None
-    failed: JobsFailedError | None = None
 
 
 @contextmanager
@@ -105,13 +62,14 @@ def open_runner(config: Config, options: RunOptions, stages: frozenset[str] = fr
             runner.launcher.close()
 
 
-def run_study(name: str, overrides: Sequence[str], options: RunOptions, *, only_report: bool = False) -> Ran:
+def run_study(name: str, overrides: Sequence[str], options: RunOptions, cache: RunCache, *, only_report: bool = False) -> Ran:
     """Run every stage of a pipeline; what is there is skipped. A study that overrides changed is not published.
 
     Args:
         name: of the pipeline, or its path.
         overrides: for all jobs that have their key.
         options: of the command.
+        cache: keeps the finished study.
         only_report: draw the report from what is there, train and evaluate nothing.
 
     Raises:
@@ -123,10 +81,6 @@ def run_study(name: str, overrides: Sequence[str], options: RunOptions, *, only_
         Stopped: a signal came.
     """
     begun = time.monotonic()
-    cache = RunCache(("run", name, *overrides), overrides, name)
-    cached = None if options.force else _print_cached(cache, options)
-    if cached is not None:
-        return cached
     study = read_study(name)
     jobs = jobs_of(study, overrides)
     first = next(iter(jobs.values()))[0].config
@@ -176,8 +130,14 @@ def run_study(name: str, overrides: Sequence[str], options: RunOptions, *, only_
     return Ran(summary, report.folder, report.skipped, published, error)
 
 
-def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions) -> Ran:
+def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions, cache: RunCache) -> Ran:
     """Run a study with one sweep: train and evaluate every job, draw tables and heat maps; a failed job stops no other.
+
+    Args:
+        overrides: several values allowed.
+        name: start of the folder's name; none for the estimators and the split.
+        options: of the command.
+        cache: keeps the finished sweep.
 
     Raises:
         ConfigurationError: overrides that make no sweep, or a split without test ranges.
@@ -186,10 +146,6 @@ def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions) -
         DryRunStop: in a dry run.
         Stopped: a signal came; finished artefacts stay.
     """
-    cache = RunCache(("sweep", name or "", *overrides), overrides)
-    cached = None if options.force else _print_cached(cache, options)
-    if cached is not None:
-        return cached
     sweep = plan_sweep(overrides, name)
     first = next(job.config for job in sweep.jobs if not job.refusal)
     with open_runner(first, replace(options, track=False), SWEEP_STAGES) as runner:
@@ -210,17 +166,6 @@ def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions) -
             outcome = Outcome(runner.output, made, list(runner.messages.said), summary, None, first["tracking"], raw)
             cache.save(outcome, runner.messages.warn)
     return Ran(summary, swept.folder.folder, swept.folder.skipped, failed=error)
-
-
-def _print_cached(cache: RunCache, options: RunOptions) -> Ran | None:
-    """A finished study from its record, published again where its copy is gone; none where there is no valid record."""
-    finished = cache.load()
-    if finished is None:
-        return None
-    messages = Messages(quiet=options.quiet)
-    messages.again(finished.record.lines)
-    published = None if options.dry_run else publish_study(finished.record.publication, finished.report, messages)
-    return Ran(finished.record.summary, finished.report.folder, True, published)
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
