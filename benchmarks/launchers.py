@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from vehest.data.files import remove_leftovers
-from vehest.run.comparison import plain_resampling
+from vehest.run.comparison import plan_training
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.evaluate import protocol_from_config
@@ -34,10 +34,9 @@ from vehest.run.group import Evaluation, Group
 from vehest.run.launchers import on_ray
 from vehest.run.launchers.base import Launcher, LocalLauncher
 from vehest.run.launchers.on_ray import RayLauncher
+from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.starting import plan_training
 from vehest.run.sweep import plan_sweep
-from vehest.run.workshop import Workshop
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "launchers.json"
 CORES = 2
@@ -48,12 +47,12 @@ STUDIES = (20, 200, 2000)  # tasks of a study, for which the break-even is compu
 def groups_of(output: Path, number: int) -> list[Group]:
     """Groups of one member each, which differ in their seed."""
     config = compose_config("eval", ["split=quickstart", "estimator=zero", f"output={output}", "tracking=none"])
-    workshop = Workshop(output, QUIET, StopSignals())
-    split = workshop.split(config)
-    data = workshop.data_for(split, float(config["estimator"]["rate_hz"]), config)
+    runner = Runner(output, QUIET, StopSignals())
+    split = runner.split(config)
+    data = runner.data_for(split, float(config["estimator"]["rate_hz"]), config)
     protocol = protocol_from_config(config["evaluation"])
-    references = workshop.data_for(split, protocol.rate_hz, plain_resampling(config))
-    evaluation = Evaluation(split, data, references, workshop.kinds_of(split, config), protocol, output)
+    references = runner.references_for(split, protocol.rate_hz, config)
+    evaluation = Evaluation(split, data, references, runner.kinds_of(split, config), protocol, output)
     return [Group([plan_training({**config, "seed": seed}, split, data)], evaluation) for seed in range(number)]
 
 

@@ -76,14 +76,14 @@ def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
     """Seconds, peak memory of the largest process [MB], and how many drives there are."""
     from vehest.run.config import compose_config
     from vehest.run.console import Messages
+    from vehest.run.runner import Runner
     from vehest.run.signals import StopSignals
     from vehest.run.simulate import outcome_of
-    from vehest.run.workshop import Workshop
 
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         config = compose_config("ingest", [f"dataset={name}", f"output={folder}"])
         started = time.perf_counter()
-        artefact = Workshop(Path(folder), Messages(quiet=True), StopSignals(), jobs).ingest(config)
+        artefact = Runner(Path(folder), Messages(quiet=True), StopSignals(), jobs).ingest(config)
         seconds = time.perf_counter() - started
         n_drives = outcome_of(artefact).drives
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

@@ -21,8 +21,8 @@ from vehest.run.calibrate import plan_calibrate, write_calibration
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
+from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.workshop import Workshop
 from vehest.trust.record import read_trust, write_trust
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -70,10 +70,10 @@ def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
     """Learn from a step's training and validation ranges, all of them simulated, how far the model can be trusted."""
     words = [f"split=sim_to_real_{step}", f"estimator={read_description(target).estimator}", f"output={output}", "tracking=none"]
     config = compose_config("eval", words)
-    workshop = Workshop(output, Messages(), StopSignals())
-    whole = workshop.split(config)
+    runner = Runner(output, Messages(), StopSignals())
+    whole = runner.split(config)
     split = replace(whole, tests={})
-    job = plan_calibrate(model_artefact(target), split, workshop.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
+    job = plan_calibrate(model_artefact(target), split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
     if job is None:
         raise SystemExit(f"split '{split.name}' has no validation range")
     write_calibration(job, target)

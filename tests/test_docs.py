@@ -30,7 +30,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import UNITS
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices
-from vehest.run.pipeline import PartFile, PipelineFile, pipeline_configs, read_pipeline
+from vehest.run.study import PartFile, PipelineFile, jobs_of, read_study
 from vehest.sources.base import COMMON_KEYS, open_source, source_names
 from vehest.studies.artefacts import METRIC_COLUMNS
 
@@ -146,7 +146,7 @@ def test_example_files_are_valid(workplace):
         split = split_from_config(compose_config("train", [f"split={file.stem}"])["split"], lambda _: {"lap": lambda _: lap})
         assert set(split.datasets) <= set(choices("dataset"))
     for file in sorted((workplace / "pipelines").glob("*.yaml")):
-        assert pipeline_configs(read_pipeline(str(file)), [])
+        assert jobs_of(read_study(str(file)), [])
 
 
 def test_python_examples_run(workplace, drive, monkeypatch, request):
@@ -257,11 +257,11 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
         return
     if given.command[0] == "report" and "--check" in line:
         for name in (*given.arguments, *given.overrides):
-            assert PLACEHOLDER.search(name) or read_pipeline(name).publish
+            assert PLACEHOLDER.search(name) or read_study(name).publish
     elif given.command[0] in {"run", "report"}:
         if not PLACEHOLDER.search(" ".join([*given.arguments, *given.overrides])):
-            pipeline = read_pipeline(given.arguments[0])  # what composes without overrides is known from test_config
-            assert not given.overrides or pipeline_configs(pipeline, given.overrides)
+            pipeline = read_study(given.arguments[0])  # what composes without overrides is known from test_config
+            assert not given.overrides or jobs_of(pipeline, given.overrides)
     else:
         for root, overrides in overrides_of(given):
             if not PLACEHOLDER.search(" ".join([root, *overrides])):

@@ -53,7 +53,7 @@ HEADER += ("leftovers", "outcome")
 HEAVY = (
     "mlflow",
     "matplotlib.pyplot",
-    "vehest.run.pipeline",
+    "vehest.run.study_run",
     "vehest.studies.drive",
     "vehest.report.document",
     "vehest.report.run_figures",

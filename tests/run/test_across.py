@@ -13,7 +13,7 @@ import yaml
 
 from place import Place, write_csv
 from vehest.data.store import read_estimate, read_recording
-from vehest.run.pipeline import read_pipeline
+from vehest.run.study import read_study
 
 PLAIN = ["estimator=zero,static_map,kinematic"]
 LUENBERGER = ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"]
@@ -135,7 +135,7 @@ def test_missing_files_are_said_before_anything_is_made(across) -> None:
 
 
 def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
-    parts = read_pipeline("folds_of_mine").parts
+    parts = read_study("folds_of_mine").parts
     assert [(part.name, part.overrides) for part in parts] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]
 
 

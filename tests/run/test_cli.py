@@ -23,7 +23,7 @@ from conftest import planar_drive
 from place import DATASET, PIPELINE, Place, write_csv
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
-from vehest.run import workshop
+from vehest.run import runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.signals import TimeLimit
 from vehest.trust.verdict import reason_in_words
@@ -358,7 +358,7 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
             return any((outputs / "evaluate").glob("*/manifest.json"))
 
     with monkeypatch.context() as patched:
-        patched.setattr(workshop, "TimeLimit", OneEvaluation)
+        patched.setattr(runner, "TimeLimit", OneEvaluation)
         code, out, err = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out

@@ -14,7 +14,7 @@ from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.completion import complete_override
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import choices
-from vehest.run.pipeline import pipeline_configs, read_pipeline
+from vehest.run.study import jobs_of, read_study
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_sweeps_expand_to_every_combination():
 
 
 def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
-    configs = pipeline_configs(read_pipeline("ferrari_drive"), [])[""]
+    configs = [job.config for job in jobs_of(read_study("ferrari_drive"), [])[""]]
     names = [config["estimator"]["name"] for config in configs]
     baselines = {"zero": 1, "kinematic": 1, "data_sheet": 1, "static_map": 1}
     assert {name: names.count(name) for name in set(names)} == {**baselines, "luenberger": 1, "ksnn": 20, "gru": 5, "lstm": 5}
@@ -93,23 +93,23 @@ SHIPPED = {file.stem for file in (Path(__file__).parents[2] / "pipelines").glob(
 
 @pytest.mark.parametrize("name", sorted(SHIPPED - {"ksnn", "ksnn_revs"}))  # these two: test_parts
 def test_first_and_last_job_of_every_sweep_of_shipped_pipelines_compose(elsewhere, name):
-    pipeline = read_pipeline(name)
+    pipeline = read_study(name)
     if pipeline.datasets:
-        assert pipeline_configs(pipeline, [])
+        assert jobs_of(pipeline, [])
     ends = {(part.split, *job) for part in pipeline.parts for sweep in part.sweeps for job in (expand(sweep)[0], expand(sweep)[-1])}
     for split, *job in sorted(ends):
         assert compose_config("eval", [f"split={split}", *pipeline.evaluation, *job])["split"]["name"] == split
 
 
 def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
-    configs = pipeline_configs(read_pipeline("quickstart"), ["training.learning_rate=0.01"])[""]
+    configs = [job.config for job in jobs_of(read_study("quickstart"), ["training.learning_rate=0.01"])[""]]
     rates = {config["estimator"]["name"]: config["training"].get("learning_rate") for config in configs}
     fitted_otherwise = dict.fromkeys(("zero", "kinematic", "data_sheet", "static_map", "luenberger"))
     assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
-    seeds = [c["seed"] for c in pipeline_configs(read_pipeline("quickstart"), ["seed=7"])[""]]
+    seeds = [job.config["seed"] for job in jobs_of(read_study("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
     with pytest.raises(ConfigurationError, match=r"suits no sweep"):
-        pipeline_configs(read_pipeline("quickstart"), ["training.momentum=0.9"])
+        jobs_of(read_study("quickstart"), ["training.momentum=0.9"])
 
 
 @pytest.mark.parametrize(
@@ -126,12 +126,12 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
 def test_wrong_pipelines_are_one_line_that_helps(elsewhere, text, message):
     (elsewhere / "mine.yaml").write_text(text)
     with pytest.raises(ConfigurationError, match=message):
-        read_pipeline("mine.yaml")
+        read_study("mine.yaml")
 
 
 def test_unknown_pipeline_names_the_nearest(elsewhere):
     with pytest.raises(MissingError, match=r"did you mean pipelines/quickstart\.yaml\?"):
-        read_pipeline("quikstart")
+        read_study("quikstart")
 
 
 def test_completion_offers_groups_options_and_values(elsewhere):

@@ -23,7 +23,7 @@ from vehest.run.config_files import choices, packaged_conf
 from vehest.run.evaluate import code_of_evaluation, plan_evaluate
 from vehest.run.evaluate_faults import FaultedJob
 from vehest.run.faults import FaultSettings, all_of, faults_of
-from vehest.run.pipeline import pipeline_configs, read_pipeline
+from vehest.run.study import jobs_of, read_study
 from vehest.trust.faults import KINDS, is_fault
 
 TRAINED = ("split=mine", "estimator=kinematic", "tracking=none")
@@ -257,8 +257,8 @@ def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):
 
 
 def test_a_fault_can_be_added_to_any_study_on_the_command_line(place):
-    configs = pipeline_configs(read_pipeline("small"), ["fault=held", "fault.channel=vx"])
-    assert {fault.condition for config in configs[""] for fault in faults_of(config)} == {"held:vx:medium"}
+    configs = jobs_of(read_study("small"), ["fault=held", "fault.channel=vx"])
+    assert {fault.condition for job in configs[""] for fault in faults_of(job.config)} == {"held:vx:medium"}
 
 
 @pytest.mark.parametrize(

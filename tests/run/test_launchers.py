@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from vehest.run.launchers.plan import StudyCost, Unit, makespan
 
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, MissingError
@@ -22,11 +23,10 @@ from vehest.run.failures import Failure
 from vehest.run.group import Group
 from vehest.run.launchers.base import LocalLauncher, chosen_launcher
 from vehest.run.launchers.on_slurm import slurm_parameters
-from vehest.run.launchers.plan import StudyCost, Unit, makespan
+from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.launchers.store import Store
 from vehest.run.launchers.times import Cost, Times, next_lot
-from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.worker import World, moved
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob

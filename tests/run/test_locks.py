@@ -142,7 +142,7 @@ def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place: Place, stage: 
 SIDE_BY_SIDE = """
 import os, sys
 from vehest.cli import main
-import vehest.run.pipeline, vehest.studies.drive, vehest.report.document, mlflow
+import vehest.run.study_run, vehest.studies.drive, vehest.report.document, mlflow
 
 def run(output, said, gate):
     os.dup2(os.open(said, os.O_WRONLY | os.O_CREAT), 2)

@@ -13,7 +13,7 @@ import yaml
 
 from place import Place, write_csv
 from vehest.report.document import Document
-from vehest.run.pipeline import pipeline_configs, read_pipeline
+from vehest.run.study import jobs_of, read_study
 from vehest.run.train import new_estimator
 from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
@@ -157,7 +157,7 @@ def test_files_of_a_part_that_must_be_there_are_missed_in_one_line(parts_place):
 
 
 def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
-    both, turned = read_pipeline("both"), read_pipeline("turned")
+    both, turned = read_study("both"), read_study("turned")
     assert [part.split for part in both.parts] == ["forth", "back", "other"]
     assert [part.split for part in turned.parts] == ["back", "back", "other"]
     assert [part.sweeps for part in turned.parts] == [part.sweeps for part in both.parts]
@@ -165,7 +165,7 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
 
 
 def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
-    simulated, official = read_pipeline("ksnn"), read_pipeline("ksnn_revs")
+    simulated, official = read_study("ksnn"), read_study("ksnn_revs")
     shared = [part for part in simulated.parts if not part.name.startswith("same_")]
     changed = {part.split: other.split for part, other in zip(shared, official.parts, strict=True) if part != other}
     assert changed == {
@@ -180,7 +180,8 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
 
 
 def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
-    configs = pipeline_configs(read_pipeline("ksnn"), [])
+    jobs = jobs_of(read_study("ksnn"), [])
+    configs = {part: [job.config for job in own] for part, own in jobs.items()}
     baselines = ("zero", "static_map", "kinematic")
     for scheme in ("scheme_1", "scheme_2"):
         names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
@@ -193,7 +194,7 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
 
 
 def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_static_map_beside_it():
-    for part in read_pipeline("ksnn").parts:
+    for part in read_study("ksnn").parts:
         said = {name for sweep in part.sweeps for name in sweep[0].removeprefix("estimator=").split(",")}
         assert {"zero", "static_map"} <= said or part.name == "ferrari_whole", part.name
 

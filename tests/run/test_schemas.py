@@ -36,8 +36,8 @@ from vehest.run.downsample import write_downsample
 from vehest.run.estimate import preparation_of
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.ingest import recording_file
-from vehest.run.pipeline import read_pipeline
 from vehest.run.publishing import PROVENANCE, publish, shown_in
+from vehest.run.study import read_study
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.sources.base import open_source
 from vehest.studies.artefacts import read_frame
@@ -458,7 +458,7 @@ def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path: Path, changes: dict[
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(changed(PIPELINE, **changes)))
     with pytest.raises(ConfigurationError) as caught:
-        read_pipeline(str(path))
+        read_study(str(path))
     assert message in str(caught.value)
     assert "mine.yaml" in str(caught.value)
 
@@ -471,7 +471,7 @@ def test_a_pipeline_that_is_none_is_one_line(tmp_path: Path, text: str | bytes) 
     path = tmp_path / "mine.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigurationError, match=r"mine\.yaml"):
-        read_pipeline(str(path))
+        read_study(str(path))
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""A finished study is recognised by what it was made from, and prints what the whole way would print."""
+"""A finished study is recognised by what it was made from, and prints what a run in full would print."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from place import PIPELINE
-from vehest.run.finished import ABSENT, Asked, recall, stamp_of
+from vehest.run.run_cache import ABSENT, RunCache, stamp_of
 
 HEAVY = ("torch", "mlflow", "numba", "pandas", "scipy", "matplotlib", "hydra")
 WORDS = ("small", "tracking=none")
@@ -29,8 +29,8 @@ def study(place):
     return place
 
 
-def asked() -> Asked:
-    return Asked(("run", *WORDS), WORDS[1:], "small")
+def cached() -> bool:
+    return RunCache(("run", *WORDS), WORDS[1:], "small").load() is not None
 
 
 def forget(place) -> None:
@@ -39,8 +39,8 @@ def forget(place) -> None:
 
 
 @pytest.mark.parametrize("options", [(), ("--json",), ("--dry-run",), ("--quiet",)])
-def test_a_finished_study_prints_what_the_whole_way_prints(study, options):
-    assert recall(asked()) is not None
+def test_a_finished_study_prints_what_a_run_in_full_prints(study, options):
+    assert cached()
     recognised = study("run", *WORDS, *options)
     forget(study)
     assert study("run", *WORDS, *options) == recognised
@@ -62,10 +62,10 @@ def test_a_finished_study_imports_nothing_that_made_it(study):
     assert not {name.split(".")[0] for name in result.stderr.split()} & set(HEAVY)
 
 
-def test_a_finished_sweep_prints_what_the_whole_way_prints(place):
+def test_a_finished_sweep_prints_what_a_run_in_full_prints(place):
     code, first, err = place("sweep", *SWEEP, "--jobs", "1")
     assert code == 0, err
-    assert recall(Asked(("sweep", "", *SWEEP), SWEEP)) is not None
+    assert RunCache(("sweep", "", *SWEEP), SWEEP).load() is not None
     recognised = place("sweep", *SWEEP)
     assert recognised[1] == first
     forget(place)
@@ -80,7 +80,7 @@ def test_a_published_copy_that_is_gone_is_published_again(study):
     published = study.folder / "results" / "small" / "metrics.csv"
     assert published.is_file()
     published.unlink()
-    assert recall(asked()) is not None
+    assert cached()
     code, out, err = study("run", *WORDS)
     assert code == 0, err
     assert published.is_file()
@@ -93,10 +93,10 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
         former, about = file.read_bytes(), file.stat()
         file.write_bytes(content)
         os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))
-        assert recall(asked()) is None, file
+        assert not cached(), file
         file.write_bytes(former)
 
-    assert recall(asked()) is not None
+    assert cached()
     for file in [study.folder / "conf" / "split" / "mine.yaml", study.folder / "pipelines" / "small.yaml"]:
         changed(file, file.read_bytes() + b"\n# a comment\n")
     manifest = next((study.folder / "outputs" / "evaluate").glob("*/manifest.json"))
@@ -105,19 +105,19 @@ def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
     changed(estimate, b"")
     record = next((study.folder / "outputs" / "finished").glob("*.json"))
     changed(record, b'{"format": 1}')
-    assert recall(asked()) is not None
+    assert cached()
     with monkeypatch.context() as patch:
         patch.setenv("VEHEST_DATA", "/elsewhere")
-        assert recall(asked()) is None
+        assert not cached()
     (study.folder / "raw" / "four.csv").write_text("Time\n")
-    assert recall(asked()) is None
+    assert not cached()
     (study.folder / "raw" / "four.csv").unlink()
-    assert recall(asked()) is not None
+    assert cached()
     raw = study.folder / "raw" / "one.csv"
     changed(raw, raw.read_bytes().replace(b"1", b"2", 1))
-    assert recall(asked()) is None  # its time of change stays; only reading it shows that it is what it was
+    assert not cached()  # its time of change stays; only reading it shows that it is what it was
     assert study("run", *WORDS)[0] == 0
-    assert recall(asked()) is not None
+    assert cached()
 
 
 def test_a_study_on_raw_files_that_changed_is_made_anew(study):
@@ -134,12 +134,12 @@ def test_force_runs_what_is_there(study):
     code, _, err = study("run", *WORDS, "--force", "--jobs", "1")
     assert code == 0, err
     assert "skipped" not in err
-    assert recall(asked()) is not None
+    assert cached()
 
 
 def test_other_overrides_are_another_study(study):
-    assert recall(Asked(("run", *WORDS, "seed=1"), (*WORDS[1:], "seed=1"), "small")) is None
-    assert Asked(("run", "small", "output='a b'"), ("output='a b'",), "small").output is None
+    assert RunCache(("run", *WORDS, "seed=1"), (*WORDS[1:], "seed=1"), "small").load() is None
+    assert RunCache(("run", "small", "output='a b'"), ("output='a b'",), "small").output is None
 
 
 def test_a_file_replaced_by_one_of_the_same_size_and_date_is_seen(tmp_path):
