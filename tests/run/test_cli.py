@@ -79,7 +79,7 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
     code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
     assert code == 5
-    assert "1 of 4 groups of jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert "1 of 5 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
     assert "Traceback" not in err
     kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
     assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}

@@ -224,7 +224,7 @@ def test_a_fault_that_suits_no_channel_is_named_and_the_others_go_on(place):
     quick = ("split=mine", "estimator=kinematic", "tracking=none", "--jobs", "1")
     code, out, err = place("sweep", *quick, "fault=sign,bias", "fault.channel=vx,ay", "--json")
     assert code == 5
-    assert "fault=sign, channel=vx: a fault 'sign' makes no sense for channel 'vx'" in err.splitlines()[-1]
+    assert "fault=sign, channel=vx seed 0: a fault 'sign' makes no sense for channel 'vx'" in err.splitlines()[-1]
     assert [row["n_seeds"] for row in json.loads(out)["summary"]] == [0, 1, 1, 1]
 
 

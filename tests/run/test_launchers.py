@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from vehest.run.launchers.plan import StudyCost, Unit, makespan
 
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, MissingError
@@ -26,7 +25,7 @@ from vehest.run.launchers.on_slurm import slurm_parameters
 from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.launchers.store import Store
-from vehest.run.launchers.times import Cost, Times, next_lot
+from vehest.run.launchers.times import Times, next_lot
 from vehest.run.launchers.worker import World, moved
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
@@ -88,43 +87,6 @@ def test_a_guess_gives_way_to_what_the_first_groups_took(tmp_path):
 
 
 # What a study would cost
-
-
-def test_the_time_on_some_cores_is_that_of_a_list_schedule():
-    assert makespan([3.0, 3.0, 3.0, 3.0], 2) == 6.0
-    assert makespan([1.0, 1.0, 10.0], 2) == 11.0
-    assert makespan([5.0], 100) == 5.0
-    assert makespan([], 3) == 0.0
-
-
-def test_a_cost_says_what_is_guessed():
-    units = [Unit(["a"], [Cost(3600.0, 1000.0, "same")]), Unit(["b", "b"], [Cost(1800.0, 1000.0, "guess")] * 2)]
-    cost = StudyCost("s", units, done=4, cores=2, input_bytes=None, peak_mb=None)
-    rows = dict(cost.rows())
-    assert rows["core hours"] == "2, 50 % of it guessed"
-    assert rows["guessed"] == "nothing like it was trained here: b (2)"
-    assert rows["time"].startswith("60 min on 2 cores")
-    assert "guessed" in rows["memory"]
-    assert "not all ingested" in rows["data"]
-    assert cost.figures()["core_hours_guessed"] == 1.0
-
-
-def test_a_plan_counts_what_is_left_and_makes_nothing(place):
-    code, out, err = place("plan", "small", "--cores", "4", "--json")
-    assert code == 0, err
-    before = json.loads(out)
-    assert (before["trainings"], before["done"], before["groups"]) == (4, 0, 3)
-    assert before["input_bytes"] is None
-    assert set(before["by"]) == {"guess"}
-    assert not place.files()
-    assert place("run", "small", "--jobs", "1", "tracking=none")[0] == 0
-    after = json.loads(place("plan", "small", "--json")[1])
-    assert (after["trainings"], after["done"], after["core_hours"]) == (0, 4, 0.0)
-    more = json.loads(place("plan", "small", "training.max_epochs=3", "--json")[1])
-    assert more["trainings"] == 3
-    assert set(more["by"]) == {"variant"}
-    assert more["input_bytes"] > 0
-    assert "core hours" in place("plan", "small", "training.max_epochs=3")[1]
 
 
 # How far a launch is

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from place import PIPELINE, Place, run_vehest
-from vehest.run import study_keys
+from vehest.run import published as study_keys
 from vehest.run.artefacts import TIMINGS
 from vehest.run.publishing import PROVENANCE
 

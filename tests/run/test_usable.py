@@ -462,4 +462,4 @@ def test_setting_that_makes_no_sense_at_the_lower_rate_is_told_with_it():
 def test_lengths_that_a_training_counts_in_samples_are_told():
     config = compose_config("eval", ["estimator=velocity_gru"])
     _, (note,) = at_estimator_rate(config, Contents("lap", 50.0, frozenset()))
-    assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in note.told
+    assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in note.text

@@ -6,7 +6,7 @@ jobs -> `check` (rates, required channels) -> `plan` (trainings in groups) -> `R
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -132,7 +132,7 @@ def check(jobs: Sequence[Job], runner: Runner) -> CheckedJobs:
     try:
         split, contents = runner.split(first), runner.contents(first)
     except DryRunStop:
-        runner.print_trainings([_labelled(job) for job in jobs if not job.refusal], ["evaluate"])
+        runner.print_trainings(_names(job for job in jobs if not job.refusal), ["evaluate"])
         raise
     limit, notes, reasons = slowest(contents), dict[Note, None](), dict[str, str]()
     lacking: dict[int, Failure] = {}
@@ -240,7 +240,7 @@ def plan(checked: CheckedJobs, runner: Runner, *, sweep: bool = False) -> Planne
                     raise
                 failures[position] = failure_of(error)
     except DryRunStop:
-        runner.print_trainings([_labelled(checked.jobs[position]) for position in checked.usable], ["evaluate"])
+        runner.print_trainings(_names(checked.jobs[position] for position in checked.usable), ["evaluate"])
         raise
     if not trainings:
         raise DataError("; ".join(dict.fromkeys(failure.message for failure in failures.values())))
@@ -333,10 +333,20 @@ def collect(title: str, planned: Planned, found: Mapping[str, Member], failed: M
 
 def named(failures: Mapping[int, Failure], jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
     """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
-    seeds: dict[tuple[str, Failure], list[str]] = {}
+    alike: dict[Failure, list[Job]] = {}
     for position, failure in failures.items():
-        seeds.setdefault((_stem(jobs[position]), failure), []).append(str(jobs[position].config["seed"]))
-    return [(f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}", failure) for (stem, failure), own in seeds.items()]
+        alike.setdefault(failure, []).append(jobs[position])
+    return [(name, failure) for failure, own in alike.items() for name in _names(own)]
+
+
+def _names(jobs: Iterable[Job]) -> list[str]:
+    """Names of jobs; those that differ in their seed alone have one."""
+    seeds: dict[str, list[str]] = {}
+    for job in jobs:
+        estimator = None if job.label else new_estimator(job.config["estimator"])
+        stem = job.label if estimator is None else f"{estimator.name}-{estimator.variant}"
+        seeds.setdefault(stem, []).append(str(job.config["seed"]))
+    return [f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()]
 
 
 def failed_in(compared: Sequence[Compared], runner: Runner) -> JobsFailedError | None:
@@ -358,18 +368,6 @@ def failed_in(compared: Sequence[Compared], runner: Runner) -> JobsFailedError |
 def _print_failures(failures: Mapping[int, Failure], jobs: Sequence[Job], runner: Runner) -> None:
     for name, failure in named(failures, jobs) if len(jobs) > 1 else ():
         runner.messages.line("fail", "train", name, failure.message)
-
-
-def _stem(job: Job) -> str:
-    """The name of a job without its seed."""
-    if job.label:
-        return job.label
-    estimator = new_estimator(job.config["estimator"])
-    return f"{estimator.name}-{estimator.variant}"
-
-
-def _labelled(job: Job) -> str:
-    return f"{_stem(job)} seed {job.config['seed']}" if job.label else f"{_stem(job)}-seed{job.config['seed']}"
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:

@@ -240,7 +240,7 @@ class RunCache:
         digest = hashlib.sha256(repr((FORMAT, sys.version_info[:2], self._words, self._folder, library_versions())).encode())
         texts = list(self._overrides)
         try:
-            for name, file in [*_configuration(self._pipeline), *_code()]:
+            for name, file in [*_configuration(self._pipeline), *_code_files()]:
                 content = file.read_bytes()
                 digest.update(repr((name, hashlib.sha256(content).hexdigest())).encode("utf-8", "surrogateescape"))
                 if file.suffix == ".yaml":
@@ -257,13 +257,13 @@ class RunCache:
 def _next_time(outcome: Outcome) -> list[Line]:
     """The lines that the next run in full would print: artefacts are up to date, notes and warnings stay."""
     made = {(artefact.stage, artefact.label) for artefact in outcome.artefacts}
-    lines: dict[Line, None] = {}
+    lines: list[Line] = []
     for status, stage, label, detail in outcome.lines:
-        if (stage, label) in made:
-            lines[("skip", stage, label, "up to date")] = None
+        if (stage, label) in made and status in ("done", "skip", "note"):
+            lines.append(("skip", stage, label, "up to date"))
         elif (status in ("note", WARNING) and stage != "calibrate") or stage == "split":
-            lines[(status, stage, label, detail)] = None
-    return list(lines)
+            lines.append((status, stage, label, detail))
+    return lines
 
 
 def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, RawFolder] | None:
@@ -337,7 +337,7 @@ def _configuration(pipeline: str) -> list[tuple[str, Path]]:
     return files
 
 
-def _code() -> list[tuple[str, Path]]:
+def _code_files() -> list[tuple[str, Path]]:
     """Name and file of the modules and templates of vehest and of every package that offers it estimators, sources or studies."""
     packages = {Path(__file__).resolve().parents[1]}
     found = metadata.entry_points()

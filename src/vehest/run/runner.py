@@ -247,6 +247,8 @@ class Runner:
             for group in waiting:
                 then = [stage for stage, wanted in (("calibrate", is_calibrated(group)), ("evaluate", group.evaluation)) if wanted]
                 self.print_trainings([job.plan.label for job in group.jobs], then)
+            to_do = sum(len(group.jobs) for group in waiting)
+            self.messages.line("plan", "train", f"{to_do} in all", f"{len(members)} more are there")
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(name):

@@ -71,7 +71,7 @@ def chosen_launcher(where: LauncherOptions, jobs: int | None, output: Path, mess
     """
     if where.launcher not in LAUNCHERS:
         raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{where.launcher}'")
-    given = {"--address": where.address, "--store": None, "--slurm": where.slurm}
+    given = {"--address": where.address, "--store": where.store, "--slurm": where.slurm}
     takes = {"local": (), "ray": ("--address", "--store"), "slurm": ("--address", "--slurm")}
     for option, value in given.items():
         if value and option not in takes[where.launcher]:
@@ -84,5 +84,6 @@ def chosen_launcher(where: LauncherOptions, jobs: int | None, output: Path, mess
 
         return SlurmLauncher(where.address, jobs, where.slurm, output, messages)
     from vehest.run.launchers.on_ray import RayLauncher
+    from vehest.run.launchers.store import Store
 
-    return RayLauncher(where.address, jobs, None, output, messages)
+    return RayLauncher(where.address, jobs, None if where.store is None else Store(where.store), output, messages)

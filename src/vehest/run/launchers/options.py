@@ -15,9 +15,11 @@ class LauncherOptions:
     Args:
         launcher: one of `LAUNCHERS`.
         address: of the cluster, for ``ray``; ``local`` for ``slurm`` on this machine.
+        store: where artefacts are kept where machines share no folder, for ``ray``.
         slurm: what jobs ask the queue for, ``NAME=VALUE`` each, for ``slurm``.
     """
 
     launcher: str = "local"
     address: str | None = None
+    store: str | None = None
     slurm: Sequence[str] = ()

@@ -6,7 +6,6 @@ tells the parent where trainings stand, learns from it whether to stop, and keep
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -27,9 +26,8 @@ from typing import Any, TypeVar
 from vehest.data.errors import MissingError, VehestError
 from vehest.data.files import no_room, writing_error
 from vehest.data.limits import Limits, use_limits
-from vehest.run.artefacts import Artefact, find, library_versions, read_artefact
+from vehest.run.artefacts import Artefact, commit, find, library_versions, read_artefact
 from vehest.run.failures import Failure, failure_of
-from vehest.run.finished import own_files
 from vehest.run.group import Group, Member, calibration_job, run_group
 from vehest.run.launcher import Task, guarded
 from vehest.run.launchers.store import CHECKPOINT, Store
@@ -37,6 +35,7 @@ from vehest.run.locks import Waiting
 from vehest.run.train import TrainJob, code_of_training
 from vehest.training.checkpoints import resume_epoch
 from vehest.training.context import Progress
+from vehest.version import __version__
 
 JOURNAL = "journal"  # folder in an output root: what was begun and made by which process, a file a process
 SHARED = "shared"  # in a run's journal: by which other machines know that they see the same folder
@@ -133,12 +132,9 @@ class Report:
 @cache
 def this_world() -> World:
     """What results depend on here."""
-    digest = hashlib.sha256()
-    for name, file in own_files():
-        digest.update(f"{name} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
     versions = library_versions()
     libraries = {name: versions.get(name, "missing") for name in DIGITS} | {"python": platform.python_version()}
-    return World(digest.hexdigest(), libraries, _cpu())
+    return World(f"{__version__} {commit()}", libraries, _cpu())
 
 
 def _cpu() -> str:
