@@ -162,6 +162,23 @@ def test_a_manifest_that_names_files_outside_of_its_folder_brings_nothing(store,
     assert not list(tmp_path.rglob("escaped"))
 
 
+def test_a_digest_that_is_a_path_removes_nothing(store, tmp_path):
+    precious = tmp_path / "home" / "precious.txt"
+    precious.parent.mkdir()
+    precious.write_text("precious")
+    made = trained(job(tmp_path / "here"), 1.0)
+    store.push(made)
+    (tmp_path / "store" / "objects" / "..").mkdir(parents=True, exist_ok=True)
+    manifest = json.loads((made.folder / MANIFEST).read_text())
+    for up in range(1, 6):
+        manifest["outputs"]["model.safetensors"]["sha256"] = "../" * up + "home/precious.txt"
+        (tmp_path / "store" / "artefacts" / "train" / f"{made.folder.name}.json").write_text(json.dumps(manifest))
+        assert store.fetch("train", tmp_path / "there" / "train" / made.folder.name) is None
+    assert precious.read_text() == "precious"
+    (made.folder / MANIFEST).write_text(json.dumps(manifest))
+    assert find(job(tmp_path / "here").plan) is None
+
+
 def test_the_checkpoint_that_is_further_on_counts(store, tmp_path):
     import torch
 

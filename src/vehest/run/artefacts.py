@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping
@@ -31,6 +32,7 @@ from vehest.version import __version__
 MANIFEST = "manifest.json"
 TIMINGS = "timings.csv"  # what a stage took; no part of its content, since it is never the same twice
 FORMAT = 1
+DIGEST = re.compile(r"[0-9a-f]{64}")
 Status = Literal["complete", "interrupted"]
 
 
@@ -210,6 +212,8 @@ def _check_output(folder: Path, name: str, entry: Output, stage: str) -> None:
         raise DataError(
             f"'{folder / MANIFEST}': outputs names {name[:80]!r}, which is no file inside the folder; run the stage '{stage}' again"
         )
+    if not DIGEST.fullmatch(entry.sha256):
+        raise DataError(f"'{folder / MANIFEST}': the digest of '{name}' is not 64 hexadecimal digits; run the stage '{stage}' again")
     path = folder.joinpath(*parts)
     if any(folder.joinpath(*parts[: n + 1]).is_symlink() for n in range(len(parts))):
         raise DataError(f"'{path}' is a link; an artefact holds its files itself: run the stage '{stage}' again")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.files import remove_leftovers, written_aside
-from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
+from vehest.run.artefacts import DIGEST, MANIFEST, Artefact, read_artefact
 from vehest.training.checkpoints import resume_epoch
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -92,6 +92,8 @@ class Store:
         try:
             outputs = {str(name): str(entry["sha256"]) for name, entry in json.loads(text)["outputs"].items()}
         except (ValueError, KeyError, TypeError, AttributeError):
+            return None
+        if not all(DIGEST.fullmatch(digest) for digest in outputs.values()):
             return None
         remove_leftovers(folder.parent)
         try:
