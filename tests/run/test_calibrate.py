@@ -5,12 +5,15 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
+from conftest import planar_drive
 from place import Place
 from vehest.data.store import read_estimate
 from vehest.run.artefacts import read_artefact
@@ -51,6 +54,21 @@ def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
     assert trust.bands.vehicles == ("my car",)
     assert trust.bands.calibrated_on == ("two (all)",)
     assert trust.bands.scaled_on == ("one (all)",)
+
+
+def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evaluated, tmp_path):
+    place, model, _ = evaluated
+    lap, out = place.folder / "lap.csv", tmp_path / "estimate.csv"
+    drive = planar_drive(20.0, 100.0).without_references()
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv(lap, index=False)
+    for name, folder in (("here", place.folder / model), ("away", shutil.copytree(place.folder / model, tmp_path / "away"))):
+        code, said, err = place("estimate", str(folder), str(lap), "-o", str(out), f"output={tmp_path / 'other'}", "--json")
+        assert code == 0, err
+        with open(out, encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        found = any(row.get("band_sideslip") for row in rows)
+        assert found == (name == "here")
+        assert ("this model has no calibration" in json.loads(said)["verdict"]) != found
 
 
 def test_estimates_hold_the_bands_of_the_calibration(evaluated):

@@ -139,7 +139,7 @@ def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_
     lap()
     code, out, err = saved("estimate", "zero", "lap.csv", "--json")
     assert (code, err) == (0, "")
-    assert "nobody calibrated this model" in json.loads(out)["verdict"]
+    assert "this model has no calibration" in json.loads(out)["verdict"]
 
 
 def test_without_a_validation_recording_there_is_no_band():

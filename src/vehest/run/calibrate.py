@@ -158,9 +158,13 @@ def calibration_figures(folder: Path) -> dict[str, float]:
 
 
 def trust_of(model_folder: Path, output: Path) -> Trust | None:
-    """What is known of how far a model can be trusted: trust.yaml in its folder, else its calibration in an output root.
+    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root, else in another.
 
     Of several calibrations, which a model that learns nothing has, the one that was made last.
+
+    Args:
+        model_folder: of the model, wherever it is.
+        output: an output root.
 
     Raises:
         DataError: it is damaged.
@@ -172,13 +176,14 @@ def trust_of(model_folder: Path, output: Path) -> Trust | None:
 
 
 def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
-    """The calibration of a model in an output root, see `trust_of`."""
+    """The calibration of a model in its own output root or in another, see `trust_of`."""
     try:
         digest = read_artefact(model_folder).digest
     except VehestError:
         return None
     found = []
-    for folder in sorted((output / STAGE).glob("[!.]*")):
+    own = model_folder.resolve().parent.parent
+    for folder in sorted({place for root in (own, output.resolve()) for place in (root / STAGE).glob("[!.]*")}):
         try:
             artefact = read_artefact(folder)
         except VehestError:

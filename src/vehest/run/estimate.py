@@ -272,7 +272,7 @@ def finding_in_words(finding: Finding) -> str:
 def verdict_of(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
     """How far an estimate can be trusted, in a line."""
     if trust is None or trust.health is None:
-        return "nobody calibrated this model: there is no band, and health knows gaps and speeds alone"
+        return "this model has no calibration: no band, and health from gaps and speeds alone"
     status, reasons = estimate["health"], estimate["health_reason"]
     outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
     bad = status[~np.isnan(estimate["vy"])] > 0
