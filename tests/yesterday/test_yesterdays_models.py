@@ -1,0 +1,60 @@
+"""Models that were saved before a refactoring give the estimates that they gave then, with their bands and their health."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from place import run_vehest
+from vehest.data.store import read_estimate, read_recording
+from vehest.estimators.model_files import load_model
+from vehest.run.calibrate import trust_of
+from vehest.run.estimate import estimate_recording, preparation_of
+
+HERE = Path(__file__).parent
+MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
+TOLERANCE = 1e-6
+
+
+def drive_file(channels: tuple[str, ...], rate_hz: float) -> Path:
+    kind = "small_car" if "motor_current" in channels else "steered" if "steer" in channels else "planar"
+    return HERE / "drives" / f"{kind}_{rate_hz:g}hz.parquet"
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
+    if name == "factor_graph":
+        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
+    folder = HERE / "models" / name
+    model = load_model(folder)
+    drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
+    then = read_estimate(folder / "estimate.parquet")
+    now = estimate_recording(model, drive, preparation_of(folder), trust_of(folder, folder))
+    assert set(now.channels) == set(then.channels)
+    for channel, values in then.channels.items():
+        np.testing.assert_allclose(now[channel], values, rtol=0.0, atol=TOLERANCE, equal_nan=True, err_msg=f"{name}: {channel}")
+
+
+def test_the_command_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = HERE / "models" / "ksnn"
+    model = load_model(folder)
+    drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
+    monkeypatch.chdir(tmp_path)
+    pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
+    code, out, err = run_vehest(capsys, "estimate", str(folder), "lap.csv", "-o", "out.csv", "--json")
+    assert code == 0, err
+    assert "of the drive" in json.loads(out)["verdict"]
+    table, then = pd.read_csv("out.csv"), read_estimate(folder / "estimate.parquet")
+    for channel in ("vy", "sideslip", "band_sideslip", "health"):
+        np.testing.assert_allclose(table[channel], then[channel], rtol=0.0, atol=TOLERANCE, equal_nan=True)
+
+
+def test_every_family_has_a_model_of_yesterday() -> None:
+    from vehest.estimators.registry import estimator_class, estimator_names
+
+    own = [name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")]
+    assert sorted(own) == MODELS
