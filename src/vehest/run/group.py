@@ -142,9 +142,9 @@ def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callab
     On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
     """
     torch.set_num_threads(1)
-    models = {member.job.plan.key: member.model for member in existing(group)}
-    waiting = [job for job in group.jobs if models[job.plan.key] is None]
     with one_blas_thread():
+        models = {member.job.plan.key: member.model for member in existing(group)}
+        waiting = [job for job in group.jobs if models[job.plan.key] is None]
         while waiting and not should_stop():
             with _held(waiting, should_stop, on_progress) as jobs:
                 for job in jobs:
