@@ -32,7 +32,8 @@ from vehest.run.evaluate import protocol_from_config
 from vehest.run.failures import Failure
 from vehest.run.group import Evaluation, Group
 from vehest.run.launchers import on_ray
-from vehest.run.launchers.base import Launcher, LocalLauncher
+from vehest.run.launchers.base import Launcher
+from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.on_ray import RayLauncher
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
@@ -80,7 +81,7 @@ def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
         for name, own in found.items():
             output = scratch / f"{name}-{repeat}"
             shutil.copytree(recordings, output)
-            launcher = LocalLauncher(CORES) if name == "local" else RayLauncher("local", CORES, None, output, QUIET)
+            launcher = LocalLauncher(CORES) if name == "local" else RayLauncher("local", CORES, output, QUIET)
             own.append(timed(launcher, groups_of(output, number)))
     return {name: {key: round(float(np.median([one[key] for one in own])), 5) for key in own[0]} for name, own in found.items()}
 
@@ -91,14 +92,14 @@ def scheduler(number: int) -> dict[str, float]:
 
     ray.init(address="local", num_cpus=CORES, include_dashboard=False, log_to_driver=False, logging_level=50)
     nothing = ray.remote(num_cpus=1)(_nothing)
-    board = ray.remote(on_ray.Board).remote()
+    board = ray.remote(on_ray.ProgressMailbox).remote()
     ray.get([nothing.remote() for _ in range(200)])
     begun = time.perf_counter()
     ray.get([nothing.remote() for _ in range(number)])
     tasks = number / (time.perf_counter() - begun)
     ray.get(board.drain.remote(False))
     begun = time.perf_counter()
-    ray.get([board.exchange.remote([(0, None)]) for _ in range(number)])
+    ray.get([board.exchange.remote(0, None) for _ in range(number)])
     exchanges = number / (time.perf_counter() - begun)
     ray.shutdown()
     return {"empty_tasks_a_second": round(tasks), "board_exchanges_a_second": round(exchanges)}

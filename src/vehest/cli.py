@@ -125,14 +125,6 @@ Address = Annotated[
         show_default=False,
     ),
 ]
-StoreAddress = Annotated[
-    str | None,
-    typer.Option(
-        "--store",
-        help="With --launcher ray, where machines share no folder: file:///FOLDER or s3://BUCKET/FOLDER to keep artefacts in.",
-        show_default=False,
-    ),
-]
 Slurm = Annotated[
     list[str] | None,
     typer.Option(
@@ -643,7 +635,6 @@ def run(
     ] = None,
     launcher: LauncherName = "local",
     address: Address = None,
-    store: StoreAddress = None,
     slurm: Slurm = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
@@ -653,9 +644,7 @@ def run(
     from vehest.run.run_cache import RunCache, RunOptions
 
     words = overrides or []
-    options = RunOptions(
-        force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, store, tuple(slurm or ()))
-    )
+    options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
     cache = RunCache(("run", pipeline, *words), words, pipeline)
     ran = cache.repeat(options)
     if ran is None:
@@ -738,7 +727,6 @@ def sweep(
     jobs: Jobs = None,
     launcher: LauncherName = "local",
     address: Address = None,
-    store: StoreAddress = None,
     slurm: Slurm = None,
 ) -> None:
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
@@ -749,7 +737,7 @@ def sweep(
     from vehest.run.run_cache import RunCache, RunOptions
 
     words = overrides or []
-    options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, store, tuple(slurm or ())))
+    options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
     cache = RunCache(("sweep", name or "", *words), words)
     ran = cache.repeat(options)
     if ran is None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +22,24 @@ PATIENCE = 900.0  # s, after which an event that never came is a failure of the 
 class TwoNodes:
     """A cluster of a head and a further node, a core each, on loopback."""
 
-    def __init__(self, folder: Path, scratch_of_second: str = "") -> None:
+    def __init__(self, **environment: str) -> None:
         from ray.cluster_utils import Cluster
 
         self._cluster = Cluster()
-        second = scratch_of_second or str(folder / "scratch-second")
-        self.nodes = [self._add(str(folder / "scratch-head"), include_dashboard=False), self._add(second)]
+        self.nodes = [self._add(environment, include_dashboard=False), self._add(environment)]
         self._cluster.wait_for_nodes()
 
-    def _add(self, scratch: str, **options: Any) -> Any:
-        """A node, which keeps its copies in a folder of its own, as another machine would."""
-        own = {"VEHEST_SCRATCH": scratch, "RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+    def _add(self, environment: dict[str, str], **options: Any) -> Any:
+        own = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0", **environment}
         return self._cluster.add_node(num_cpus=1, env_vars=own, **options)
 
     @property
     def address(self) -> str:
         return str(self._cluster.address)
+
+    def holds(self, node: Any, pid: int) -> bool:
+        """Whether a worker is one of a node's."""
+        return pid in _children(_raylet(node))
 
     def lose(self, node: Any) -> None:
         """End a node's daemons by SIGKILL, as a power cut does; its workers end when they notice."""
@@ -76,12 +76,20 @@ def _kill(pid: int) -> None:
 class Driver:
     """``vehest`` in a process of its own."""
 
-    def __init__(self, folder: Path, output: Path, *words: str, **environment: str) -> None:
+    def __init__(self, folder: Path, output: Path, *words: str, alone: bool = False, **environment: str) -> None:
+        """Start it; ``alone``: in an output root that no other process sees, and which is copied to ``output`` at the end."""
         self.output = output
         self._log = output.with_suffix(".log")
         command = [sys.executable, "-c", "from vehest.cli import main; main()", *words]
+        if alone:
+            hidden = output.with_name("hidden")
+            hidden.mkdir()
+            environment["VEHEST_OUTPUT"] = str(hidden)
+            script = 'hidden=$0; seen=$1; shift; mount -t tmpfs none "$hidden" && cp -r "$seen/." "$hidden" && "$@"; '
+            script += 'code=$?; cp -r "$hidden/." "$seen"; exit $code'
+            command = ["unshare", "--mount", "sh", "-c", script, str(hidden), str(output), *command]
         with open(self._log, "ab") as log:
-            own = {**os.environ, **environment, "VEHEST_OUTPUT": str(output)}
+            own = {**os.environ, "VEHEST_OUTPUT": str(output), **environment}
             self.process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=own, start_new_session=True)
 
     def ended(self) -> int:
@@ -104,32 +112,21 @@ class Driver:
         return self._log.read_text(encoding="utf-8")
 
 
-def journal(*roots: Path) -> list[dict[str, Any]]:
-    """What workers have written down of their groups, each entry with its process and the parent's run."""
-    entries = []
-    for root in roots:
-        for file in sorted(root.glob("journal/*/*.jsonl")):
-            pid = int(file.stem.rpartition("-")[2])
-            lines = [line for line in file.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
-            entries += [{**json.loads(line), "pid": pid, "run": file.parent.name} for line in lines]
-    return entries
+def under_way(output: Path) -> list[dict[str, Any]]:
+    """Trainings that a process holds the lock of, with its process and the epoch of their checkpoints."""
+    found = []
+    for file in sorted((output / "locks").glob("train-*.lock")):
+        name = file.name.removeprefix("train-").removesuffix(".lock")
+        words = file.read_text(encoding="utf-8").split()
+        alive = len(words) > 1 and Path(f"/proc/{words[1]}").exists()
+        if alive and not (output / "train" / name).exists() and (output / "checkpoints" / name / "checkpoint.safetensors").exists():
+            found.append({"name": name, "pid": int(words[1])})
+    return found
 
 
-def under_way(*roots: Path) -> list[dict[str, Any]]:
-    """Groups that were begun and have not ended."""
-    entries = journal(*roots)
-    over = {(entry["pid"], *entry["keys"]) for entry in entries if entry["event"] == "ended"}
-    return [entry for entry in entries if entry["event"] == "begun" and (entry["pid"], *entry["keys"]) not in over]
-
-
-def trained(*roots: Path) -> Counter[str]:
-    """Key -> how often a training was brought to its end."""
-    return Counter(key for entry in journal(*roots) for key in entry.get("made", ()))
-
-
-def begun(*roots: Path) -> Counter[str]:
-    """Key -> how often a worker set about it."""
-    return Counter(key for entry in journal(*roots) if entry["event"] == "begun" for key in entry["keys"])
+def manifests(output: Path) -> dict[str, bytes]:
+    """Finished model -> its manifest, with the time at which it was made."""
+    return {file.parent.name: file.read_bytes() for file in sorted((output / "train").glob("[!.]*/manifest.json"))}
 
 
 def metrics(output: Path) -> dict[str, str]:
@@ -153,19 +150,3 @@ def with_recordings(source: Path, output: Path) -> Path:
     for stage in ("ingest", "downsample"):
         shutil.copytree(source / stage, output / stage)
     return output
-
-
-@contextmanager
-def server(command: Sequence[str], answers: Callable[[], bool]) -> Iterator[None]:
-    """A process that serves until the end, from when it answers on."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    limit = time.monotonic() + PATIENCE
-    try:
-        while not answers():
-            assert process.poll() is None
-            assert time.monotonic() < limit
-            time.sleep(MOMENT)
-        yield
-    finally:
-        process.terminate()
-        process.wait()

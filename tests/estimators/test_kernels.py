@@ -210,6 +210,6 @@ def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest
 
     monkeypatch.setattr(group, "existing", lambda _: seen.extend(threads()) or [])
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with
-        group.run_group(group.Group([], None, frozenset()), lambda: False, lambda progress: None)
+        group.Group([], None, frozenset()).run(lambda: False, lambda progress: None)
         assert set(seen) == {1}
         assert set(threads()) == {2}

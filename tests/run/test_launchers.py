@@ -1,4 +1,4 @@
-"""What launchers share: packing by recorded times, what a study would cost, artefacts in a store, paths of another machine."""
+"""What launchers share: progress, artefacts that travel, paths of another machine, options."""
 
 from __future__ import annotations
 
@@ -6,30 +6,27 @@ import importlib.util
 import json
 import os
 import time
-from collections import deque
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from vehest.data import files
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
+from vehest.data.limits import current_limits
 from vehest.run import console
-from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make
+from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.base import LocalLauncher, chosen_launcher
+from vehest.run.launchers.base import chosen_launcher
+from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.on_slurm import slurm_parameters
 from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.progress import LaunchProgress
-from vehest.run.launchers.store import Store
-from vehest.run.launchers.times import Times, next_lot
-from vehest.run.launchers.worker import World, moved
+from vehest.run.launchers.task import TaskSpec, moved, pack, run_task, unpack, versions_here
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
-from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 
 FINE = Messages(silent=True)
 
@@ -53,40 +50,6 @@ def trained(own: TrainJob, seconds: float, text: str = "weights") -> Artefact:
         (folder / "timings.csv").write_text(f"metric,value\ntrain_seconds,{seconds}\n")
 
     return make(own.plan, write)
-
-
-# Packing
-
-
-def test_lots_keep_the_order_and_last_as_long_as_they_should():
-    seconds = [4.0, 4.0, 4.0, 25.0, 1.0, 1.0]
-    waiting, lots = deque(range(6)), []
-    while waiting:
-        lots.append(next_lot(waiting, seconds.__getitem__, 10.0))
-    assert lots == [[0, 1, 2], [3], [4, 5]]
-
-
-def test_a_training_takes_what_its_own_kind_took_then_its_variant_then_its_family_and_is_else_a_guess(tmp_path):
-    trained(job(tmp_path, 0, epochs=10), 3.0)
-    trained(job(tmp_path, 1, epochs=10), 5.0)
-    trained(job(tmp_path, 0, epochs=99), 40.0)
-    times = Times(tmp_path)
-    assert (times.cost_of(job(tmp_path, 7, epochs=10)).seconds, times.cost_of(job(tmp_path, 7, epochs=10)).basis) == (4.0, "same")
-    assert (times.cost_of(job(tmp_path, 7, epochs=50)).seconds, times.cost_of(job(tmp_path, 7, epochs=50)).basis) == (5.0, "variant")
-    assert times.cost_of(job(tmp_path, variant="large")).basis == "estimator"
-    assert Times(tmp_path / "fresh").cost_of(job(tmp_path)).basis == "guess"
-
-
-def test_a_guess_gives_way_to_what_the_first_groups_took(tmp_path):
-    times = Times(tmp_path)
-    first = Group([job(tmp_path, 0), job(tmp_path, 1)])
-    other = Group([job(tmp_path, 0, variant="large")])
-    assert times.seconds_of(first) == 2 * times.seconds_of(other) == 20.0
-    times.learn(first, 3.0)
-    assert times.seconds_of(other) == 1.5
-
-
-# What a study would cost
 
 
 # How far a launch is
@@ -113,102 +76,40 @@ def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
         assert len(bars._tasks) == console.MOST_BARS
 
 
-# The store
+# Artefacts that travel
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> Store:
-    return Store(f"file://{tmp_path / 'store'}")
-
-
-def test_an_artefact_comes_back_from_the_store_with_its_digest(store, tmp_path):
+def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
     made = trained(job(tmp_path / "here"), 1.0)
-    store.push(made)
-    plan = replace(job(tmp_path / "there").plan, output=tmp_path / "there")
-    found = store.fetch("train", plan.folder)
-    assert found is not None
-    assert (found.digest, found.key) == (made.digest, plan.key)
-    assert find(plan) is not None
-    assert store.fetch("train", tmp_path / "there" / "train" / "other-000000000000") is None
+    there = tmp_path / "there" / "train" / made.folder.name
+    unpack(pack(made.folder), there)
+    assert read_artefact(there).digest == made.digest
+    cut = {**pack(made.folder), "model.safetensors": b"weigh"}
+    with pytest.raises(DataError, match="gone or truncated"):
+        unpack(cut, tmp_path / "other" / "train" / made.folder.name)
+    assert not list((tmp_path / "other" / "train").iterdir())
 
 
-def test_files_of_equal_content_are_kept_once(store, tmp_path):
-    for seed in range(3):
-        store.push(trained(job(tmp_path / "here", seed), 1.0))
-    assert len(list((tmp_path / "store" / "objects").rglob("*/*"))) == 3
-    assert len(list((tmp_path / "store" / "artefacts" / "train").iterdir())) == 3
-
-
-def test_what_was_damaged_in_the_store_counts_as_not_there_and_is_put_there_anew(store, tmp_path):
-    made = trained(job(tmp_path / "here"), 1.0)
-    store.push(made)
-    digest = made.outputs["model.safetensors"]
-    kept = tmp_path / "store" / "objects" / digest[:2] / digest
-    kept.write_text("weightz")
-    target = tmp_path / "there" / "train" / made.folder.name
-    assert store.fetch("train", target) is None
-    assert not target.exists()
-    store.push(made)
-    assert store.fetch("train", target) is not None
-
-
-def test_a_manifest_that_names_files_outside_of_its_folder_brings_nothing(store, tmp_path):
-    made = trained(job(tmp_path / "here"), 1.0)
-    manifest = json.loads((made.folder / MANIFEST).read_text())
-    manifest["outputs"]["../../escaped"] = manifest["outputs"].pop("model.safetensors")
-    store.push(made)
-    (tmp_path / "store" / "artefacts" / "train" / f"{made.folder.name}.json").write_text(json.dumps(manifest))
-    assert store.fetch("train", tmp_path / "there" / "train" / made.folder.name) is None
-    assert not list(tmp_path.rglob("escaped"))
-
-
-def test_a_digest_that_is_a_path_removes_nothing(store, tmp_path):
+def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
     precious = tmp_path / "home" / "precious.txt"
     precious.parent.mkdir()
     precious.write_text("precious")
     made = trained(job(tmp_path / "here"), 1.0)
-    store.push(made)
-    (tmp_path / "store" / "objects" / "..").mkdir(parents=True, exist_ok=True)
     manifest = json.loads((made.folder / MANIFEST).read_text())
-    for up in range(1, 6):
-        manifest["outputs"]["model.safetensors"]["sha256"] = "../" * up + "home/precious.txt"
-        (tmp_path / "store" / "artefacts" / "train" / f"{made.folder.name}.json").write_text(json.dumps(manifest))
-        assert store.fetch("train", tmp_path / "there" / "train" / made.folder.name) is None
-    assert precious.read_text() == "precious"
+    manifest["outputs"]["model.safetensors"]["sha256"] = "../home/precious.txt"
     (made.folder / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(DataError, match="64 hexadecimal digits"):
+        unpack(pack(made.folder), tmp_path / "there" / "train" / made.folder.name)
     assert find(job(tmp_path / "here").plan) is None
+    assert precious.read_text() == "precious"
 
 
-def test_the_checkpoint_that_is_further_on_counts(store, tmp_path):
-    import torch
-
-    def at(epoch: int) -> Checkpoint:
-        return Checkpoint({"w": torch.zeros(2)}, {"epoch": epoch})
-
-    here, there = tmp_path / "a" / "model", tmp_path / "b" / "model"
-    save_checkpoint(here, at(5))
-    store.push_checkpoint(here)
-    store.fetch_checkpoint(there)
-    assert load_checkpoint(there).values["epoch"] == 5  # type: ignore[union-attr]
-    save_checkpoint(there, at(9))
-    store.fetch_checkpoint(there)
-    assert load_checkpoint(there).values["epoch"] == 9  # type: ignore[union-attr]
-    store.drop_checkpoint(here)
-    store.fetch_checkpoint(tmp_path / "c" / "model")
-    assert not (tmp_path / "c" / "model").exists()
-
-
-@pytest.mark.parametrize("address", ["ftp://host/folder", "folder", "file://", "s3:///"])
-def test_an_address_that_is_none_is_refused(address):
-    with pytest.raises(ConfigurationError, match="--store must be"):
-        Store(address)
-
-
-def test_a_store_that_cannot_be_written_to_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(MissingError, match="write") as error:
-        Store(f"file://{tmp_path / 'file' / 'store'}").push(trained(job(tmp_path / "here"), 1.0))
-    assert "\n" not in str(error.value)
+def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
+    spec = TaskSpec(Group([job(tmp_path)]), tmp_path, "run", {**versions_here(), "torch": "1.0"}, current_limits(), 1.0)
+    report = run_task(spec, {}, lambda _: False)
+    assert "torch" in report.unsuitable
+    assert "instead of 1.0" in report.unsuitable
+    assert report.outcome is None
 
 
 # Paths, machines and choices
@@ -236,13 +137,6 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert remove_leftovers(tmp_path) == 1
     assert growing.exists()
     assert not old.exists()
-
-
-def test_other_code_or_libraries_are_named():
-    here = World("a", {"torch": "2", "python": "3.11"}, "zen")
-    assert here.differs(World("a", {"torch": "2", "python": "3.11"}, "skylake")) == ""
-    assert "other code of vehest" in here.differs(World("b", here.libraries, "zen"))
-    assert "torch 1 instead of 2" in here.differs(World("a", {"torch": "1", "python": "3.11"}, "zen"))
 
 
 def test_options_of_a_cluster_are_refused_elsewhere(place):
@@ -276,7 +170,6 @@ def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
     [
         (LauncherOptions("cloud"), "--launcher must be one of local, ray, slurm, not 'cloud'"),
         (LauncherOptions("local", address="auto"), "--address is for --launcher ray and slurm, not for local"),
-        (LauncherOptions("slurm", store="file:///x"), "--store is for --launcher ray, not for slurm"),
         (LauncherOptions("ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
         (LauncherOptions("slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
         (LauncherOptions("slurm", "local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),

@@ -118,7 +118,7 @@ def _disk() -> Item:
 
 
 def _cores() -> Item:
-    from vehest.run.launcher import default_jobs
+    from vehest.run.launchers.local import default_jobs
 
     return Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")
 

@@ -85,6 +85,31 @@ class Group:
         """Whose validation range members are calibrated on."""
         return self.split if self.evaluation is None else self.evaluation.split
 
+    def run(self, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
+        """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
+
+        An artefact that another process is making is taken from it once it is done; those that no process makes come first.
+
+        On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
+        """
+        torch.set_num_threads(1)
+        with one_blas_thread():
+            models = {member.job.plan.key: member.model for member in existing(self)}
+            waiting = [job for job in self.jobs if models[job.plan.key] is None]
+            while waiting and not should_stop():
+                with _held(waiting, should_stop, on_progress) as jobs:
+                    for job in jobs:
+                        if STAGE in self.force:
+                            drop_checkpoint(job.plan.checkpoint_folder)
+                        else:
+                            models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
+                    for together in _together([job for job in jobs if models[job.plan.key] is None]):
+                        if should_stop():
+                            break
+                        models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
+                waiting = [job for job in waiting if job not in jobs]
+            return [_followed_up(self, job, models[job.plan.key], should_stop, on_progress) for job in self.jobs]
+
 
 @dataclass(frozen=True)
 class Member:
@@ -132,32 +157,6 @@ def drop_finished_checkpoint(job: TrainJob) -> None:
         with held_at_once(job.plan.lock) as free:
             if free:
                 drop_checkpoint(job.plan.checkpoint_folder)
-
-
-def run_group(group: Group, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
-    """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
-
-    An artefact that another process is making is taken from it once it is done; those that no process makes come first.
-
-    On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
-    """
-    torch.set_num_threads(1)
-    with one_blas_thread():
-        models = {member.job.plan.key: member.model for member in existing(group)}
-        waiting = [job for job in group.jobs if models[job.plan.key] is None]
-        while waiting and not should_stop():
-            with _held(waiting, should_stop, on_progress) as jobs:
-                for job in jobs:
-                    if STAGE in group.force:
-                        drop_checkpoint(job.plan.checkpoint_folder)
-                    else:
-                        models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
-                for together in _together([job for job in jobs if models[job.plan.key] is None]):
-                    if should_stop():
-                        break
-                    models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
-            waiting = [job for job in waiting if job not in jobs]
-        return [_followed_up(group, job, models[job.plan.key], should_stop, on_progress) for job in group.jobs]
 
 
 @contextmanager

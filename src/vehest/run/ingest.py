@@ -17,7 +17,7 @@ from vehest.data.store import write_recording
 from vehest.run.artefacts import StagePlan
 from vehest.run.config import Config, missing_keys
 from vehest.run.failures import Failure
-from vehest.run.launcher import Task, launch
+from vehest.run.launchers.local import Task, launch
 from vehest.run.locks import held_at_once
 from vehest.run.signals import StopSignals
 from vehest.run.versions import version_of_source

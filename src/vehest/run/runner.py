@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.data.contents import Contents, stored_contents
+from vehest.data.errors import DataError
 from vehest.data.split_files import Catalogue, Reader, dataset_names, split_from_config
 from vehest.data.splits import Split
 from vehest.data.store import read_recording
@@ -26,7 +27,8 @@ from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing, is_calibrated, is_finished
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
-from vehest.run.launchers.base import Launcher, LocalLauncher
+from vehest.run.launchers.base import Launcher
+from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.locks import Waiting
 from vehest.run.rates import Note
@@ -189,7 +191,7 @@ class Runner:
         return found
 
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
-        """Train and evaluate groups, side by side where there are cores; where members of a group fail together, each is tried alone.
+        """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
 
         Returns:
             Key of a training -> its member, and key of a training -> why it failed. Where the time is up, members lack what was not
@@ -217,7 +219,7 @@ class Runner:
                         for member in outcome:
                             if member.evaluation is not None:
                                 bars.stands(member.job.plan.label, rmse_of_tests(member.evaluation))
-                    elif outcome.detail or len(group.jobs) == 1:
+                    elif outcome.exit_code != DataError.exit_code or len(group.jobs) == 1:
                         failures |= {job.plan.key: outcome for job in group.jobs}
                         self.messages.line("fail", "train", group.name, outcome.message)
                     else:

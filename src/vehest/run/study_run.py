@@ -20,8 +20,8 @@ from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
-from vehest.run.launcher import default_jobs
 from vehest.run.launchers.base import chosen_launcher
+from vehest.run.launchers.local import default_jobs
 from vehest.run.published import Keys, keys_of_study
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.report import ReportJob, ShownDatasets, absent_dataset, leaderboard, overview, plan_report, verdict, write_report

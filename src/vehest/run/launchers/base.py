@@ -1,22 +1,21 @@
-"""What runs groups of members: one interface, behind which are this machine's cores or a cluster."""
+"""Launchers: one interface for this machine's cores, a Ray cluster and a SLURM queue."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
 from vehest.data.errors import ConfigurationError
 from vehest.run.console import Messages
-from vehest.run.group import Group, Member, run_group
-from vehest.run.launcher import Done, Reporter, Task, default_jobs, launch
+from vehest.run.group import Group, Member
+from vehest.run.launchers.local import Done, LocalLauncher, Reporter, default_jobs
 from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
 from vehest.run.signals import StopSignals, TimeLimit
 
 
 class Launcher(Protocol):
-    """Runs groups somewhere; what ended comes back in this process, which alone tracks and draws."""
+    """Runs groups; finished ones come back to this process, which alone tracks and draws."""
 
     @property
     def cores(self) -> int:
@@ -35,55 +34,34 @@ class Launcher(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of what it runs on."""
+        """Release processes and connections."""
 
 
-class LocalLauncher:
-    """Runs groups in processes of this machine.
-
-    Args:
-        jobs: processes that run side by side; 1 runs everything in this one.
-    """
-
-    def __init__(self, jobs: int = 1) -> None:
-        self.cores = jobs
-
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[list[Member]]]:
-        """See `Launcher`."""
-        yield from launch([Task(group.name, partial(run_group, group)) for group in groups], self.cores, stop, report)
-
-    def close(self) -> None:
-        """Nothing is kept."""
-
-
-def chosen_launcher(where: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
+def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
     """The launcher of a command.
 
     Args:
-        where: what its options say.
+        options: of the command.
         jobs: most groups at a time; none for as many as there are cores.
         output: the output root.
-        messages: where the launcher says what happens.
+        messages: prints what happens on a cluster.
 
     Raises:
         ConfigurationError: there is no such launcher, or it takes no such option.
-        MissingError: what it needs is not installed.
+        MissingError: a package that it needs is not installed.
     """
-    if where.launcher not in LAUNCHERS:
-        raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{where.launcher}'")
-    given = {"--address": where.address, "--store": where.store, "--slurm": where.slurm}
-    takes = {"local": (), "ray": ("--address", "--store"), "slurm": ("--address", "--slurm")}
-    for option, value in given.items():
-        if value and option not in takes[where.launcher]:
-            own = " and ".join(name for name, options in takes.items() if option in options)
-            raise ConfigurationError(f"{option} is for --launcher {own}, not for {where.launcher}")
-    if where.launcher == "local":
+    if options.launcher not in LAUNCHERS:
+        raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{options.launcher}'")
+    if options.address and options.launcher == "local":
+        raise ConfigurationError("--address is for --launcher ray and slurm, not for local")
+    if options.slurm and options.launcher != "slurm":
+        raise ConfigurationError(f"--slurm is for --launcher slurm, not for {options.launcher}")
+    if options.launcher == "local":
         return LocalLauncher(jobs or default_jobs())
-    if where.launcher == "slurm":
+    if options.launcher == "slurm":
         from vehest.run.launchers.on_slurm import SlurmLauncher
 
-        return SlurmLauncher(where.address, jobs, where.slurm, output, messages)
+        return SlurmLauncher(options.address, jobs, options.slurm, output, messages)
     from vehest.run.launchers.on_ray import RayLauncher
-    from vehest.run.launchers.store import Store
 
-    return RayLauncher(where.address, jobs, None if where.store is None else Store(where.store), output, messages)
+    return RayLauncher(options.address, jobs, output, messages)

@@ -1,4 +1,4 @@
-"""Where trainings run, as a command is told."""
+"""Options of a command that say where trainings run."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ LAUNCHERS = ("local", "ray", "slurm")
 
 @dataclass(frozen=True)
 class LauncherOptions:
-    """Where trainings run, as options of a command say it.
+    """Where trainings run.
 
     Args:
         launcher: one of `LAUNCHERS`.
         address: of the cluster, for ``ray``; ``local`` for ``slurm`` on this machine.
-        store: where artefacts are kept where machines share no folder, for ``ray``.
-        slurm: what jobs ask the queue for, ``NAME=VALUE`` each, for ``slurm``.
+        slurm: resources of a job, ``NAME=VALUE`` each, for ``slurm``.
     """
 
     launcher: str = "local"
     address: str | None = None
-    store: str | None = None
     slurm: Sequence[str] = ()

@@ -12,21 +12,33 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from multiprocessing import get_context
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
+from vehest.run.group import Group, Member
 from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
 
-Outcome = TypeVar("Outcome")
+Outcome = TypeVar("Outcome", covariant=True)
 PR_SET_PDEATHSIG = 1  # of Linux's prctl: the signal that a process gets when the one that started it ends
+
+
+class Runnable(Protocol[Outcome]):
+    """Something to run, picklable: a `Task`, or a group of trainings."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+
+    def run(self, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Outcome:
+        """Run it until it is done, or ``should_stop`` says so."""
 
 
 @dataclass(frozen=True)
 class Task(Generic[Outcome]):
-    """Something to run.
+    """A function to run.
 
     Args:
         name: for people.
@@ -49,7 +61,25 @@ class Done(Generic[Outcome]):
 Reporter = Callable[[int, Progress | Waiting | None], None]
 
 
-def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[Outcome]]:
+class LocalLauncher:
+    """Runs groups in processes of this machine.
+
+    Args:
+        jobs: processes that run side by side; 1 runs everything in this one.
+    """
+
+    def __init__(self, jobs: int = 1) -> None:
+        self.cores = jobs
+
+    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[list[Member]]]:
+        """See `Launcher`."""
+        return launch(groups, self.cores, stop, report)
+
+    def close(self) -> None:
+        """Nothing is kept."""
+
+
+def launch(tasks: Sequence[Runnable[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[Outcome]]:
     """Run tasks, as many at a time as ``jobs`` says, and yield them as they end.
 
     Args:
@@ -58,20 +88,9 @@ def launch(tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLi
         stop: when a signal came or the time is up, running tasks are asked to end and no other is started.
         report: called with the task's position and its progress (None when it starts), or what it waits for.
     """
-    if stop.requested():
-        return
-    if min(jobs, len(tasks)) <= 1:
-        yield from _launch_here(tasks, stop, report)
-    else:
+    if min(jobs, len(tasks)) > 1 and not stop.requested():
         yield from _launch_in_processes(tasks, min(jobs, len(tasks)), stop, report)
-
-
-def default_jobs() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[Outcome]]:
+        return
     for position, task in enumerate(tasks):
         if stop.requested():
             return
@@ -82,8 +101,13 @@ def _launch_here(tasks: Sequence[Task[Outcome]], stop: StopSignals | TimeLimit, 
         yield Done(position, outcome, time.monotonic() - begun)
 
 
+def default_jobs() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _launch_in_processes(
-    tasks: Sequence[Task[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
+    tasks: Sequence[Runnable[Outcome]], jobs: int, stop: StopSignals | TimeLimit, report: Reporter
 ) -> Iterator[Done[Outcome]]:
     context = get_context("spawn")
     stopping, messages = context.Event(), context.SimpleQueue()
@@ -130,7 +154,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _work(position: int, task: Task[Outcome]) -> tuple[Outcome | Failure | None, float]:
+def _work(position: int, task: Runnable[Outcome]) -> tuple[Outcome | Failure | None, float]:
     stopping, messages = _worker["stopping"], _worker["messages"]
     if stopping.is_set():
         return None, 0.0
@@ -147,7 +171,9 @@ def _work(position: int, task: Task[Outcome]) -> tuple[Outcome | Failure | None,
         return guarded(task, stopping.is_set, on_progress), time.monotonic() - begun
 
 
-def guarded(task: Task[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> Outcome | Failure:
+def guarded(
+    task: Runnable[Outcome], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]
+) -> Outcome | Failure:
     """Run a task; what it raises comes back as a value."""
     try:
         return task.run(should_stop, on_progress)
