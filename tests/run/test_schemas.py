@@ -214,10 +214,11 @@ def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path
         ({"outputs": []}, "outputs must be a mapping"),
         ({"outputs": {"a.txt": {"sha256": "0"}}}, "outputs.a.txt.bytes is missing"),
         ({"outputs": {"a.txt": {"sha256": "0", "bytes": "1"}}}, "outputs.a.txt.bytes must be a whole number"),
-        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "is gone or truncated"),
+        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "is not 64 hexadecimal digits"),
+        ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": 2}}}, "is gone or truncated"),
         ({"config": "a"}, "config must be a mapping"),
         ({"inputs": {"a": 3}}, "inputs.a must be text"),
-        *[({"outputs": {name: {"sha256": "0", "bytes": 1}}}, "") for name in HOSTILE],
+        *[({"outputs": {name: {"sha256": "0" * 64, "bytes": 1}}}, "") for name in HOSTILE],
     ],
 )
 def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
