@@ -334,8 +334,15 @@ def test_learned_filters_agree_over_a_real_drive_of_the_small_car(dynamics, data
 
 @LEARNT
 def test_learned_filters_in_float_stray_no_further_than_python_in_float32_does(dynamics, data_root, tmp_path):
-    """A network that learnt for seconds makes a filter that forgets slowly: rounding alone moves Python's by centimetres a second."""
-    case = small_car(data_root, dynamics)
-    exact, rounded = (stepped(estimator, case.rows)[0][:, 0] for estimator in (case.in_float64, case.estimator))
-    said = built(case.estimator, "float", tmp_path)(case.rows)[0][:, 0]
-    assert np.abs(said - exact).max() <= FLOAT + 2.0 * np.abs(rounded - exact).max()
+    """A network that learnt for seconds makes a filter that forgets slowly, and its largest error from rounding is a matter of chance.
+
+    Inputs that differ by half a last digit move that largest error from 0.001 to 0.03 m/s, in Python and in C alike; the median
+    hardly moves. So both are compared over nine such drives.
+    """
+    case, generator = small_car(data_root, dynamics), np.random.default_rng(0)
+    library, exact = built(case.estimator, "float", tmp_path), stepped(case.in_float64, case.rows)[0][:, 0]
+    drives = [case.rows, *(case.rows * (1.0 + 2.0**-24 * generator.choice([-1.0, 1.0], case.rows.shape)) for _ in range(8))]
+    python = np.abs([stepped(case.estimator, rows)[0][:, 0] - exact for rows in drives])
+    c = np.abs([library(rows)[0][:, 0] - exact for rows in drives])
+    assert np.median(c) <= 1.5 * np.median(python)
+    assert c.max() <= 8.0 * python.max()
