@@ -6,8 +6,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-TORCH ?= 2.13.0
+TORCH ?= $(shell sed -n 's/^torch==//p' constraints.txt)
 TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
+CONSTRAINTS ?= constraints.txt
+LOCKED := $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
 JOBS ?= 2
 SPLIT ?= quickstart
 SEEDS ?= range(3)
@@ -16,26 +18,27 @@ KILLS ?= 100
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden
+.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
 
 install: $(INSTALLED) ## set up .venv (GPU=1 for a CUDA build of torch)
 
+# Versions are those of constraints.txt; `make install CONSTRAINTS=` takes the newest ones instead.
 # The CPU build of torch where there is one: no CUDA download on a machine without a GPU.
-$(INSTALLED): pyproject.toml
+$(INSTALLED): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "vehest needs Python 3.11 or newer; set PYTHON=python3.11")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 ifeq ($(GPU),1)
-	$(BIN)/python -m pip install -q "torch>=2.6"
+	$(BIN)/python -m pip install -q $(LOCKED) "torch>=2.6"
 else
-	$(BIN)/python -m pip install -q "torch==$(TORCH)+cpu" 2>/dev/null \
-	  || $(BIN)/python -m pip install -q "torch>=2.6" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
+	$(BIN)/python -m pip install -q $(LOCKED) "torch==$(TORCH)+cpu" 2>/dev/null \
+	  || $(BIN)/python -m pip install -q $(LOCKED) "torch>=2.6" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
 	  || { echo "warning: no CPU build of torch found, installing the default one, which may bring CUDA along"; \
-	       $(BIN)/python -m pip install -q "torch>=2.6"; }
+	       $(BIN)/python -m pip install -q $(LOCKED) "torch>=2.6"; }
 endif
-	$(BIN)/python -m pip install -q -e ".[dev]"
+	$(BIN)/python -m pip install -q $(LOCKED) -e ".[dev]"
 	touch $@
 
 run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
@@ -54,7 +57,7 @@ test-export: $(INSTALLED) ## models in C under compilers, sanitizers, MISRA rule
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -rs -m "export and not slow" tests/export
 
 test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, workers and a node killed in the middle, and as SLURM jobs (10 minutes); installs Ray and submitit
-	$(BIN)/python -m pip install -q -e ".[cluster-tests]"
+	$(BIN)/python -m pip install -q $(LOCKED) -e ".[cluster-tests]"
 	$(BIN)/python -m pytest -rs -m "cluster and not slow" tests/cluster
 
 test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
@@ -170,7 +173,7 @@ bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose 
 	$(BIN)/python benchmarks/ekf.py
 
 bench-launchers: $(INSTALLED) ## what a task costs the local launcher and Ray, and from which length on a second node pays; installs Ray (10 minutes)
-	$(BIN)/python -m pip install -q -e ".[ray]"
+	$(BIN)/python -m pip install -q $(LOCKED) -e ".[ray]"
 	$(BIN)/python benchmarks/launchers.py
 
 replay_check: $(INSTALLED) ## models on the frames of a bus against themselves offline, on the real Ferrari's test range; needs VEHEST_DATA
@@ -193,6 +196,10 @@ bench-workflow: $(INSTALLED) ## a finished study run again, estimates of a minut
 
 bench-cnn: $(INSTALLED) ## training through the filter and twenty networks together, against plain PyTorch (minutes)
 	$(BIN)/python benchmarks/cnn_ukf.py
+
+lock: $(INSTALLED) ## write the installed versions to constraints.txt (after make install CONSTRAINTS=); raise versions of code whose numbers moved
+	$(BIN)/python -m pip install -q -e ".[dev,ray,slurm]"
+	$(BIN)/python -m pip freeze --exclude-editable | sed -E '/ @ |^(pip|setuptools|wheel|nvidia-.*|cuda-.*|triton)==/d; s/^(torch==[^+]*).*/\1/' > constraints.txt
 
 clean: ## remove what can be made again (not outputs/)
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

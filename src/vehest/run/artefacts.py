@@ -29,6 +29,7 @@ from vehest.data.text_files import read_json
 from vehest.run.locks import Lock, Waiting, held
 from vehest.version import __version__
 
+CHECKOUT = Path(__file__).resolve().parents[3]
 MANIFEST = "manifest.json"
 TIMINGS = "timings.csv"  # what a stage took; no part of its content, since it is never the same twice
 FORMAT = 1
@@ -290,6 +291,7 @@ def provenance(seconds: float) -> dict[str, Any]:
         "commit": commit(),
         "python": platform.python_version(),
         "libraries": library_versions(),
+        "constraints": constraints(),
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
     }
@@ -309,15 +311,21 @@ def library_versions() -> dict[str, str]:
 
 
 @cache
+def constraints() -> dict[str, str]:
+    """Name and digest of the checkout's file of locked versions; empty without a checkout."""
+    file = CHECKOUT / "constraints.txt"
+    return {file.name: sha256_of(file)} if file.is_file() else {}
+
+
+@cache
 def commit() -> str:
     """Commit of the checkout that vehest runs from, with a mark if it has changes; empty if it is no checkout."""
-    folder = Path(__file__).resolve().parents[3]
-    if not (folder / ".git").exists() or "site-packages" in folder.parts:
+    if not (CHECKOUT / ".git").exists() or "site-packages" in CHECKOUT.parts:
         return ""
     try:
         result = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=folder,
+            cwd=CHECKOUT,
             capture_output=True,
             text=True,
             timeout=10,
