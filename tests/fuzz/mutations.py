@@ -335,12 +335,12 @@ def spoil_text(text: str, rng: random.Random) -> bytes:
     return spoil_bytes(raw, rng)
 
 
-def spoil_yaml(tree: Any, rng: random.Random) -> bytes:
-    """A YAML file with a spoilt tree, spoilt text, or something that explodes in it."""
+def spoil_yaml(tree: Any, rng: random.Random, *, bombs: bool = True) -> bytes:
+    """A YAML file with a spoilt tree, spoilt text, or, if ``bombs``, something that explodes in it."""
     how = rng.random()
     if how < 0.62:
         return yaml_of(spoil_tree(tree, rng, yaml_text=True)).encode("utf-8", "surrogatepass")
-    if how < 0.72 and isinstance(tree, dict):
+    if bombs and how < 0.72 and isinstance(tree, dict):
         bomb, text = rng.choice([alias_bomb, merge_bomb])(rng), yaml_of(tree)
         return (bomb + text if rng.random() < 0.5 else text + bomb).encode()
     if how < 0.78:

@@ -22,7 +22,7 @@ from place import DATASET, Place
 from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
 from vehest.data.files import no_room, written_aside
 from vehest.data.limits import Limits, use_limits
-from vehest.run.config import as_yaml, compose_config, count, expand, limits_of, parse
+from vehest.run.config import as_yaml, compose_config, count, expand, limits_of
 from vehest.run.console import Messages
 from vehest.run.failures import failure_of
 
@@ -189,21 +189,18 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        ("range(100000000)", "for 100000000 jobs, more than the limit of 10000"),
-        ("shuffle(range(100000000))", "more than the limit"),
-        ("sort(range(100000000))", "more than the limit"),
-        ("range(0,1e300,1e-300)", "1.0e+600 jobs"),
+        ("range(100000000)", "for at least 10001 jobs, more than the limit of 10000"),
+        ("range(0,1e300,1e-300)", "more than the limit"),
         ("range(1e300,0,-1e-300)", "more than the limit"),
-        ("range(0,5,0)", "a step that is not zero"),
-        ("range(0,5.5,0.0)", "a step that is not zero"),
-        ("range(1,inf)", "needs numbers"),
-        ("range(nan,5)", "needs numbers"),
+        ("range(0,5,0)", "cannot be read"),
+        ("range(0,5.5,0.0)", "cannot be read"),
+        ("range(1,inf)", "more than the limit"),
+        ("range(nan,5)", "cannot be read"),
         ("range(0)", "stands for no value"),
         ("choice()", "cannot be read"),
         ("interval(0,1)", "an interval cannot be counted"),
         ("glob(*)", "list the values of an option"),
         ("9" * 5000, "cannot be read"),
-        ("1" + ",1" * 5000, "use range"),
     ],
 )
 def test_a_sweep_is_counted_before_it_is_expanded(place, value, words):
@@ -227,37 +224,29 @@ def test_the_limit_of_jobs_holds_for_products_and_is_raised_by_an_override(place
     assert place("sweep", "split=mine", "seed=range(6)", "limits.jobs=6", "--dry-run")[0] == 0
     assert limits_of(["limits.jobs=12345", "seed=3"]).jobs == 12345
     code, line = place.refused("run", "small", "limits.jobs=3", "--dry-run")
-    assert (code, "'small.yaml' stand for 4 jobs" in line.replace(str(place.folder), "")) == (2, True)
+    assert (code, "'small.yaml' stand for at least 4 jobs" in line.replace(str(place.folder), "")) == (2, True)
     assert place("run", "small", "limits.jobs=4", "--dry-run")[0] == 0
     assert place.refused("sweep", "split=mine", "limits=5", "--dry-run")[0] == 2
     assert place.refused("sweep", "split=mine", "limits.jobs=1,2", "--dry-run")[0] == 2
-    with use_limits(Limits(jobs=3)), pytest.raises(ConfigurationError, match="stand for 4 jobs"):
+    with use_limits(Limits(jobs=3)), pytest.raises(ConfigurationError, match="stand for at least 4 jobs"):
         expand(["seed=range(4)"])
 
 
 @pytest.mark.parametrize(
     ("override", "words"),
     [
-        ("training.x=" + "[" * 100_000, "more than 20000"),
-        ("training.x=" + "[" * 9_000 + "]" * 9_000, "nests 9000 levels deep"),
-        ("training.x=" + "{a:" * 4_000 + "1" + "}" * 4_000, "nests 4000 levels deep"),
-        ("+" + "a." * 5_000 + "b=1", "nests 5000 levels deep"),
-        ("output='" + "${" * 3_000 + "'", "nests 3000 levels deep"),
-        ("output=" + "x" * 10_000_000, "has 10000007 characters"),
-        ("output='a\0b'", "a line break or a null character"),
-        ("output='a\nb'", "a line break or a null character"),
-        ("+training.x=[" + "1," * 9_000 + "1]", "lists more than 2000 values"),
+        ("training.x=" + "[" * 9_000 + "]" * 9_000, "cannot be read"),
+        ("output='a\0b'", "output must name a folder"),
         ("~limits", "only keys inside a group"),
+        ("seed=range(0,1,0)", "names several values"),
     ],
 )
-def test_overrides_that_would_keep_the_parser_busy_are_refused(override, words):
+def test_overrides_that_cannot_be_read_are_one_line(override, words):
     with pytest.raises(ConfigurationError, match=words):
         compose_config("train", [override])
 
 
-def test_very_many_overrides_are_refused_and_long_honest_ones_are_read():
-    with pytest.raises(ConfigurationError, match="100000 overrides are more than"):
-        parse(["seed=1"] * 100_000)
+def test_long_honest_overrides_are_read():
     ranges = ", ".join(f"{{recording: one, start: {k}.5, stop: {k + 1}}}" for k in range(300))
     assert len(compose_config("train", [f"split.train=[{ranges}]"])["split"]["train"]) == 300
     assert compose_config("train", ["output='[((a, {b'"])["output"] == "[((a, {b"

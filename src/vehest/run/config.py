@@ -5,17 +5,17 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterator, Sequence
-from decimal import ROUND_CEILING, Decimal
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Glob, Override, RangeSweep
+from hydra.core.override_parser.types import Glob, Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
@@ -23,17 +23,13 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from vehest.data.errors import ConfigurationError, printable
-from vehest.data.limits import Limits, check_limit, limits_from_config
-from vehest.data.text_files import first_line
-from vehest.run.config_checks import check_local_files, check_references, check_shape
+from vehest.data.limits import Limits, check_limit, current_limits, limits_from_config
+from vehest.data.schema import FURTHER_KEYS, validated
+from vehest.data.text_files import first_line, read_yaml
+from vehest.data.transforms import Preparation
 from vehest.run.config_files import GROUPS, choices, local_conf, packaged_conf
 
 Config = dict[str, Any]
-
-MOST_OVERRIDES = 1_000
-LONGEST_OVERRIDE = 20_000
-MOST_ELEMENTS = 2_000
-"""Bounds on what Hydra's parser is given: its time grows with the square of an override's elements."""
 
 COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "name", "out", "quiet")
 """Options of commands that are easily mistaken for keys of the configuration."""
@@ -43,7 +39,49 @@ GIVEN = "given"
 
 RATES = ("estimator.rate_hz", "evaluation.rate_hz")
 
-_QUOTED_OR_ESCAPED = re.compile(r"""\\.|"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'""", re.DOTALL)
+
+@dataclass(frozen=True)
+class Tracking:
+    """``tracking``: where runs are logged.
+
+    Args:
+        name: ``mlflow`` or ``none``.
+        uri: of the server or store; None is a local one in the output root.
+        experiment: name that runs are kept under.
+    """
+
+    name: Literal["mlflow", "none"]
+    uri: str | None = None
+    experiment: str = "vehest"
+
+
+@dataclass(frozen=True)
+class Named:
+    """A group of options whose ``name`` says by whose schema the others are read."""
+
+    __pydantic_config__ = FURTHER_KEYS
+    name: str
+
+
+@dataclass(frozen=True)
+class Root:
+    """What every command's configuration has; groups that a command does not have are None."""
+
+    __pydantic_config__ = FURTHER_KEYS
+    output: str
+    limits: dict[str, Any]
+    downsample: Preparation
+    root: str | None = None
+    tracking: Tracking | None = None
+    estimator: Named | None = None
+    split: dict[str, Any] | None = None
+    dataset: dict[str, Any] | None = None
+    training: dict[str, Any] | None = None
+    evaluation: dict[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.output or "\0" in self.output:
+            raise ConfigurationError(f"output must name a folder, not {self.output!r}")
 
 
 class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
@@ -80,19 +118,18 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
             )
         _check_choice(override)
     _register_plugin()
-    check_local_files()
+    _check_root_file(command)
     try:
         with initialize_config_dir(config_dir=str(packaged_conf()), version_base="1.3"):
             composed = compose(command, overrides=[override.input_line for override in parsed])
-        check_references(OmegaConf.to_container(composed, resolve=False))
         resolved = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, RecursionError, OSError) as error:
+    except Exception as error:  # of a file that is no such configuration, Hydra raises nearly anything
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # no file that is missing but the working folder
         raise ConfigurationError(_one_line(error, command)) from None
     assert isinstance(resolved, dict)
     config = {str(key): value for key, value in resolved.items()}
-    check_shape(config, command)
+    validated(Root, config, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in parsed)]
     return {**config, GIVEN: chosen} if chosen else config
 
@@ -101,20 +138,18 @@ def parse(overrides: Sequence[str]) -> list[Override]:
     """Parse overrides in Hydra's grammar.
 
     Raises:
-        ConfigurationError: bad syntax, or more than the parser can read in reasonable time.
+        ConfigurationError: bad syntax.
     """
-    if len(overrides) > MOST_OVERRIDES:
-        raise ConfigurationError(f"{len(overrides)} overrides are more than {MOST_OVERRIDES}; write them to a file in conf/ instead")
     return [_parsed(text) for text in overrides]
 
 
 def count(overrides: Sequence[str]) -> int:
-    """How many combinations overrides with several values stand for; nothing is expanded.
+    """How many combinations overrides with several values stand for; of one override, no more than ``limits.jobs`` and one are counted.
 
     Raises:
         ConfigurationError: bad syntax, or values that cannot be counted.
     """
-    return math.prod(_count(override) for override in parse(overrides))
+    return math.prod(len(_values(override)) for override in parse(overrides))
 
 
 def check_jobs(number: int, what: str) -> None:
@@ -123,8 +158,7 @@ def check_jobs(number: int, what: str) -> None:
     Raises:
         ConfigurationError: it does not.
     """
-    shown = str(number) if number < 10**12 else f"{Decimal(number):.1e}"
-    check_limit("jobs", number, f"{what} for {shown} jobs", ConfigurationError)
+    check_limit("jobs", number, f"{what} for at least {number} jobs", ConfigurationError)
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -136,8 +170,7 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
     check_jobs(count(overrides), "these overrides stand")
     jobs: list[list[str]] = [[]]
     for override in parse(overrides):
-        values = [f"{override.get_key_element()}={value}" for value in _values(override)] if override.is_sweep_override() else []
-        jobs = [[*job, value] for job in jobs for value in values or [override.input_line]]
+        jobs = [[*job, value] for job in jobs for value in _values(override)]
     return jobs
 
 
@@ -205,7 +238,6 @@ def missing_keys(config: Any, prefix: str = "") -> list[str]:
 
 @lru_cache(maxsize=4096)
 def _parsed(text: str) -> Override:
-    _check_readable(text)
     try:
         override = OverridesParser.create().parse_override(text)
         if override.key_or_group in GROUPS and isinstance(override.value(), float):  # a choice called nan or inf
@@ -221,64 +253,27 @@ def _parsed(text: str) -> Override:
         raise ConfigurationError(f"override '{_shortened(text)}' cannot be read ({_shortened(str(error))})") from None
 
 
-def _check_readable(text: str) -> None:
-    """Refuse what Hydra's parser would take minutes for, and characters that no name or path holds."""
-    if "\0" in text or "\n" in text or "\r" in text:
-        raise ConfigurationError(f"override '{_shortened(text)}' holds a line break or a null character; write it on one line")
-    if len(text) > LONGEST_OVERRIDE:
-        raise ConfigurationError(
-            f"override '{_shortened(text)}' has {len(text)} characters, more than {LONGEST_OVERRIDE}; write it to a file in conf/ instead"
-        )
-    plain = _QUOTED_OR_ESCAPED.sub("", text)
-    if plain.count(",") > MOST_ELEMENTS:
-        raise ConfigurationError(
-            f"override '{_shortened(text)}' lists more than {MOST_ELEMENTS} values; use range(…), or write it to a file in conf/"
-        )
-    nesting = max(_depth(plain), plain.partition("=")[0].count("."), text.count("${"))
-    check_limit("depth", nesting, f"override '{_shortened(text)}' nests {nesting} levels deep", ConfigurationError)
-
-
-def _depth(text: str) -> int:
-    depth = deepest = 0
-    for character in text:
-        depth += (character in "([{") - (character in ")]}")
-        deepest = max(deepest, depth)
-    return deepest
-
-
 def _shortened(text: str) -> str:
     return text if len(text) <= 100 else f"{text[:80]}…"
 
 
-def _count(override: Override) -> int:
-    """How many values an override has; 1 where it is no sweep."""
+def _values(override: Override) -> list[str]:
+    """An override once for each of its values, but for no more values than ``limits.jobs`` and one."""
     if not override.is_sweep_override():
-        return 1
-    text, value = _shortened(override.input_line or ""), override.value()
+        return [str(override.input_line)]
+    text, value = _shortened(str(override.input_line)), override.value()
     if override.is_interval_sweep():
         raise ConfigurationError(f"'{text}': an interval cannot be counted; list values, or use range(…)")
-    number = _count_range(value, text) if isinstance(value, RangeSweep) else len(list(_values(override)))
-    if number == 0:
+    if isinstance(value, Glob) and override.key_or_group not in GROUPS:
+        raise ConfigurationError(f"'{text}': glob is for {', '.join(GROUPS)}; list the values of an option")
+    try:
+        found = value.filter(choices(override.key_or_group)) if isinstance(value, Glob) else override.sweep_string_iterator()
+        values = list(islice(found, current_limits().jobs + 1))
+    except (HydraException, ValueError, ArithmeticError, TypeError) as error:
+        raise ConfigurationError(f"override '{text}' cannot be read ({first_line(error)})") from None
+    if not values:
         raise ConfigurationError(f"'{text}' stands for no value")
-    return number
-
-
-def _count_range(value: RangeSweep, text: str) -> int:
-    start, stop, step = (Decimal(number or 0) for number in (value.start, value.stop, value.step))
-    if not (start.is_finite() and stop.is_finite() and step.is_finite()) or step == 0:
-        raise ConfigurationError(f"'{text}': a range needs numbers from and to, and a step that is not zero")
-    return max(0, int(((stop - start) / step).to_integral_value(ROUND_CEILING)))
-
-
-def _values(override: Override) -> Iterator[str]:
-    """The values of a sweep as text; of a range no more than were counted."""
-    value = override.value()
-    if isinstance(value, Glob):
-        if override.key_or_group not in GROUPS:
-            raise ConfigurationError(f"'{override.input_line}': glob is for {', '.join(GROUPS)}; list the values of an option")
-        return iter(value.filter(choices(override.key_or_group)))
-    most = _count_range(value, override.input_line or "") if isinstance(value, RangeSweep) else None
-    return islice(override.sweep_string_iterator(), most)
+    return [f"{override.get_key_element()}={value}" for value in values]
 
 
 def _check_choice(override: Override) -> None:
@@ -292,6 +287,14 @@ def _check_choice(override: Override) -> None:
         close = difflib.get_close_matches(value, known, n=1)
         hint = f"did you mean {close[0]}? " if close else ""
         raise ConfigurationError(f"{group}={value} is not there; {hint}choices: {', '.join(known)}")
+
+
+def _check_root_file(command: str) -> None:
+    """A root file of ./conf may not name Hydra's search path, which imports packages; Hydra takes it from nowhere else."""
+    folder = local_conf()
+    file = folder / f"{command}.yaml" if folder is not None else None
+    if file is not None and file.is_file() and "hydra" in (read_yaml(file) or {}):
+        raise ConfigurationError(f"'{file}' names options of Hydra itself, which vehest does not take from files; leave them out")
 
 
 def _register_plugin() -> None:
