@@ -471,7 +471,8 @@ def _roots(root: Path) -> Iterable[str]:
 def _groups(root: Path) -> Iterable[str]:
     for group in (*TABLED, *VERBATIM):
         yield f"### `conf/{group}/`"
-        for file in sorted((root / "conf" / group).glob("*.yaml")):
+        papers = root / "src" / "vehest_papers" / "conf"
+        for file in sorted([*(root / "conf" / group).glob("*.yaml"), *(papers / group).glob("*.yaml")], key=lambda own: own.name):
             yield f"#### `conf/{group}/{file.name}`" if group == "vehicle" else f"#### `{group}={file.stem}`"
             if group in VERBATIM:
                 yield _fenced(file)

@@ -50,11 +50,15 @@ def test_wheel_holds_configuration_pipelines_and_templates(installed):
         "pretrained/model.yaml",
         "pretrained/trust.yaml",
     } <= names
+    splits = {file.name for file in (ROOT / "src" / "vehest_papers" / "conf" / "split").glob("*.yaml")}
+    assert len(splits) > 20
+    assert splits == {file.name for file in (installed / "vehest_papers" / "conf" / "split").glob("*.yaml")}
     assert not any("tests" in name or name.endswith(".parquet") for name in names)
 
 
 def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_path):
     assert "ksnn" in _vehest(installed, tmp_path, "train", "--help").stdout
+    assert "name: leave_av21" in _vehest(installed, tmp_path, "config", "train", "split=leave_av21").stdout
     result = _vehest(installed, tmp_path, "config", "train", "--json")
     assert json.loads(result.stdout)["estimator"]["name"] == "ksnn"
     lap = "manoeuvre: {name: laps, course: handling, duration: "

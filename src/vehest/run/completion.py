@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import VehestError
 from vehest.data.text_files import read_yaml
-from vehest.run.config_files import GROUPS, choices, local_conf, packaged_conf, summary
+from vehest.run.config_files import GROUPS, choices, conf_folders, summary
 
 
 def complete_override(command: str, given: list[str], incomplete: str) -> list[tuple[str, str]]:
@@ -102,11 +101,10 @@ def _is_plain(value: Any) -> bool:
 
 
 def _yaml(name: str) -> dict[str, Any]:
-    for folder in (local_conf(), packaged_conf()):
-        file: Path | None = folder / name if folder else None
-        if file is not None and file.is_file():
+    for folder in conf_folders():
+        if (folder / name).is_file():
             try:
-                content = read_yaml(file)
+                content = read_yaml(folder / name)
             except VehestError:
                 return {}
             return content if isinstance(content, dict) else {}

@@ -12,6 +12,16 @@ def packaged_conf() -> Path:
     return _packaged("conf")
 
 
+def papers_conf() -> Path:
+    """The conf folder of the papers' studies: splits that one of them alone uses."""
+    return Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"
+
+
+def conf_folders() -> list[Path]:
+    """Where configuration files are looked for, the first one first: ./conf, the packaged folder, that of the papers' studies."""
+    return [folder for folder in (local_conf(), packaged_conf(), papers_conf()) if folder is not None]
+
+
 def packaged_pipelines() -> Path:
     """The pipelines folder that came with vehest."""
     return _packaged("pipelines")
@@ -26,16 +36,15 @@ def local_conf() -> Path | None:
 
 
 def choices(group: str) -> list[str]:
-    """Names that a group offers, from ./conf and the packaged folder together."""
-    folders = [folder for folder in (local_conf(), packaged_conf()) if folder is not None]
-    return sorted({file.stem for folder in folders for file in (folder / group).glob("*.yaml")})
+    """Names that a group offers, from all folders together."""
+    return sorted({file.stem for folder in conf_folders() for file in (folder / group).glob("*.yaml")})
 
 
 def summary(group: str, choice: str) -> str:
     """The first comment line of a choice's file, which says in a sentence what it is."""
-    for folder in (local_conf(), packaged_conf()):
-        file = folder / group / f"{choice}.yaml" if folder else None
-        if file and file.is_file():
+    for folder in conf_folders():
+        file = folder / group / f"{choice}.yaml"
+        if file.is_file():
             for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
                 if line.startswith("#") and "@package" not in line:
                     return line.lstrip("# ").rstrip()
@@ -46,9 +55,9 @@ def summary(group: str, choice: str) -> str:
 
 def is_simulated(dataset: str) -> bool:
     """Whether a data set's file says that it is simulated."""
-    for folder in (local_conf(), packaged_conf()):
-        file = folder / "dataset" / f"{dataset}.yaml" if folder else None
-        if file and file.is_file():
+    for folder in conf_folders():
+        file = folder / "dataset" / f"{dataset}.yaml"
+        if file.is_file():
             return "\nsource: simulated\n" in file.read_text(encoding="utf-8", errors="replace")
     return False
 

@@ -26,7 +26,7 @@ from vehest.data.files import file_name, remove_leftovers, written_aside
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
-from vehest.run.config_files import find_pipeline, local_conf, packaged_conf, packaged_pipelines
+from vehest.run.config_files import conf_folders, find_pipeline, packaged_pipelines
 from vehest.run.console import WARNING, Messages
 from vehest.run.launchers.options import LauncherOptions
 from vehest.run.publishing import Publication, publish_study
@@ -320,11 +320,9 @@ def _configuration(pipeline: str) -> list[tuple[str, Path]]:
     Raises:
         VehestError: the pipeline is not there or cannot be read.
     """
-    folders = {"conf": packaged_conf(), "local conf": local_conf(), "pipelines": packaged_pipelines()}
     files = [
-        (f"{name}/{file.relative_to(folder).as_posix()}", file)
-        for name, folder in folders.items()
-        if folder is not None
+        (f"{number}/{file.relative_to(folder).as_posix()}", file)
+        for number, folder in enumerate([*conf_folders(), packaged_pipelines()])
         for file in sorted(folder.rglob("*.yaml"))
     ]
     own = find_pipeline(pipeline) if pipeline else None
