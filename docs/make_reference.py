@@ -214,7 +214,7 @@ def _simulated_sensors() -> Iterable[str]:
     yield f"A race car of the sixties with good instruments, as in the Ferrari recording. {_mounting(PRESETS['race'].imu)}"
     yield _table(header, _sensor_rows(PRESETS["race"]))
     yield (
-        "Read off the recording by `read_off` of `vehest.simulation.sensors.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` "
+        "Read off the recording by `read_off` of `vehest_papers.proving_ground.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` "
         "and `steer` (median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of "
         "`yaw_rate`, `ax` and `ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is "
         "left below 0.5 Hz, of the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a "

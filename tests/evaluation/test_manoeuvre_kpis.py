@@ -7,8 +7,8 @@ import pytest
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.evaluation.manoeuvres import error_distribution, group_of, kpis, kpis_by_group, manoeuvres_of
 from vehest.evaluation.metrics import Scored, accuracy
+from vehest_papers.cnn_ukf.manoeuvres import error_distribution, group_of, kpis, kpis_by_group, manoeuvres_of
 
 
 def scored(errors_deg: list[float], ay: list[float]) -> Scored:

@@ -12,8 +12,8 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import segments_of
-from vehest.evaluation.manoeuvres import kpis
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_squared_errors
+from vehest_papers.cnn_ukf.manoeuvres import kpis
 
 
 def _estimate(times, vy, rate_hz, start):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from vehest.evaluation.observability import observability_along, observability_matrices
+from vehest_papers.kit.observability import observability_along, observability_matrices
 
 STEP = 0.1
 

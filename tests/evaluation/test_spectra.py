@@ -9,7 +9,7 @@ import pytest
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
-from vehest.evaluation.spectra import decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
+from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 
 RATE = 20.0
 

@@ -13,7 +13,7 @@ from scipy import stats
 from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored
-from vehest.studies.kit.statements import Change, Compared, Statement, counted, decided, outcomes
+from vehest_papers.kit.statements import Change, Compared, Statement, counted, decided, outcomes
 from vehest_papers.ksnn import claims, cost, paper, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
 from vehest_papers.ksnn.comparing import Errors, masked_segments

@@ -12,8 +12,8 @@ from trained_ksnn import ksnn_with_weights
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.luenberger import Luenberger, LuenbergerSettings
 from vehest.evaluation.metrics import Scored
-from vehest.evaluation.spectra import periodogram
 from vehest.report.document import Figure, Table
+from vehest_papers.kit.spectra import periodogram
 from vehest_papers.ksnn.activation import activation
 from vehest_papers.ksnn.residuals import Panel, Residuals, exceeding, residuals
 from vehest_papers.ksnn.subjects import Trained

@@ -22,7 +22,6 @@ from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score
 from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
 from vehest_papers.learned_ukf.additions import (
@@ -40,6 +39,7 @@ from vehest_papers.learned_ukf.errors import Errors
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, squares_of, swapped, weighted
 from vehest_papers.learned_ukf.lengths import lengths
 from vehest_papers.learned_ukf.oracle import TRAINING, train_on
+from vehest_papers.learned_ukf.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
 from vehest_papers.learned_ukf.trials import trials_table

@@ -18,7 +18,6 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.data.transforms import MountingCorrection
 from vehest.simulation.plant.motion import WHEELS, Motion
-from vehest.simulation.sensors.noise_reading import noise_density, read_off
 from vehest.simulation.sensors.recording import (
     PRESETS,
     Mounting,
@@ -35,6 +34,7 @@ from vehest.simulation.sensors.recording import (
     specific_force,
     switched_off,
 )
+from vehest_papers.proving_ground.noise_reading import noise_density, read_off
 
 G = 9.81
 SENSORS = [entry.name for entry in fields(SensorLevels) if isinstance(getattr(SensorLevels(), entry.name), SensorLevel)]

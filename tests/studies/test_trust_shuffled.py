@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vehest.studies.trust_shuffled import LEARNT, Scores, in_words, over_parts, share_if_shuffled, shuffled_in_words, together
+from vehest_papers.trust.shuffled import LEARNT, Scores, in_words, over_parts, share_if_shuffled, shuffled_in_words, together
 
 
 def scores(manoeuvres: int, alike: float, seed: int, samples: int = 40) -> Scores:

@@ -10,7 +10,7 @@ from measured_drive import CHANNELS, RATE, measured_drive
 
 from vehest.data.errors import DataError
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
-from vehest.trust.oracle import Oracle, learn_oracle, likelihood_ratio_delay, motion_of
+from vehest_papers.trust.oracle import Oracle, learn_oracle, likelihood_ratio_delay, motion_of
 
 COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])

@@ -10,9 +10,9 @@ from torch import Tensor
 from dugoff_drive import FRONT, dugoff_track
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
-from vehest.evaluation.observability import observability_along
 from vehest.filters.unscented_scan import TorchModel
 from vehest.vehicle.dugoff import LoadedCar
+from vehest_papers.kit.observability import observability_along
 
 BOTH = pytest.mark.parametrize("tyres", ["plain", "smooth"])
 LOAD, SPEED = torch.tensor(9000.0, dtype=torch.float64), torch.tensor(25.0, dtype=torch.float64)

@@ -22,7 +22,7 @@ from types import ModuleType
 from vehest.data.errors import ConfigurationError
 
 ENTRY_POINTS = "vehest.studies"
-OWN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer", "trust")
+OWN = ("drive", "folds", "own_car", "reference_minutes", "sweep", "transfer")
 
 
 @cache

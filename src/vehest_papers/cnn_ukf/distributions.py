@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.evaluation.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.reading import median_and_range
+from vehest_papers.cnn_ukf.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
 from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, line_of
+from vehest_papers.kit.reading import median_and_range
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
 

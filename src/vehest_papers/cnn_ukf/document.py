@@ -15,8 +15,6 @@ from vehest.report.document import REPORT, Block, Column, Document, Table, as_co
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
-from vehest.studies.kit.reading import spans_in_words, words_of_kinds
-from vehest.studies.kit.statements import decided
 from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, search, tables, traces
 from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
@@ -37,6 +35,8 @@ from vehest_papers.cnn_ukf.subjects import (
     kpi_table,
     runs_of,
 )
+from vehest_papers.kit.reading import spans_in_words, words_of_kinds
+from vehest_papers.kit.statements import decided
 
 FULL, BEFORE, FREE, ABLATION, STANDARD, LIMITED = "full", "before", "free", "ablation", "standard", "limited"
 RENAMED = {

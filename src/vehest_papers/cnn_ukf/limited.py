@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from vehest.data.errors import DataError
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
-from vehest.evaluation.manoeuvres import manoeuvres_of
 from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
 from vehest_papers.cnn_ukf.measures import Comparison
 from vehest_papers.cnn_ukf.networks import Outputs, outputs_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.evaluation.manoeuvres import group_of, is_nonlinear, sideslip_error
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.significance import CONFIDENCE
-from vehest.studies.kit.statements import Change, Measured, short
+from vehest_papers.cnn_ukf.manoeuvres import group_of, is_nonlinear, sideslip_error
 from vehest_papers.cnn_ukf.subjects import Manoeuvres, Run, Runs
+from vehest_papers.kit.statements import Change, Measured, short
 
 N_RESAMPLES = 4000
 MSE, MSE_NL, ME, ME_NL = "mse", "mse_nonlinear", "max_error", "max_error_nonlinear"

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
-from vehest.evaluation.observability import observability_along
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim
 from vehest.vehicle.dugoff import DugoffTrack
+from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)
 ANGLES = (0.0, 0.1, 1.0, 3.0)  # deg, of the front wheels

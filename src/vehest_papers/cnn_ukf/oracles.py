@@ -5,10 +5,10 @@ from __future__ import annotations
 from vehest.estimators.base import FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.model_files import load_model
-from vehest.evaluation.manoeuvres import manoeuvres_of
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
 from vehest_papers.cnn_ukf.networks import with_perfect_distrust
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
 

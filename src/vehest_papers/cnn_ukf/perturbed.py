@@ -18,12 +18,12 @@ from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS
 from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
 from vehest.estimators.model_files import load_model
-from vehest.evaluation.manoeuvres import manoeuvres_of
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
 from vehest.training.context import FitContext
 from vehest.training.search import staged_optuna_search
 from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs, chosen, filter_of, line_of
 

@@ -17,11 +17,11 @@ from vehest.data.transforms import LowPass, RemoveOutliers
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.network_ukf import NetworkUkf
-from vehest.evaluation.manoeuvres import Kpis, kpis, manoeuvres_of, sideslip_error
 from vehest.evaluation.metrics import Scored, score_all
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import Kpis, kpis, manoeuvres_of, sideslip_error
 
 TEST = "test"
 CUTOFF_HZ = 5.0

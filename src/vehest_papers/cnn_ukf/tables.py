@@ -17,11 +17,11 @@ from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.reading import median_and_range, metric_values
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.claims import OutputsOf
 from vehest_papers.cnn_ukf.measures import Comparison
 from vehest_papers.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, balanced, chosen, filter_of
+from vehest_papers.kit.reading import median_and_range, metric_values
 
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 SAME = 0.01  # difference up to which given tyres and levels are those that were found

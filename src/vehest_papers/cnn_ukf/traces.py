@@ -12,12 +12,12 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
 from vehest.estimators.filtering.network_ukf import Word
-from vehest.evaluation.manoeuvres import group_of, sideslip_error
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import group_of, sideslip_error
 from vehest_papers.cnn_ukf.networks import words_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 

@@ -17,8 +17,8 @@ from vehest.estimators.model_files import load_model
 from vehest.estimators.rational_ekf import RationalFilter
 from vehest.report.style import REFERENCE, Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.reading import recordings_of
 from vehest_papers.heavy_ekf import paper
+from vehest_papers.kit.reading import recordings_of
 
 LINES = {
     paper.LINT: Line("#0b4f9c", "dashed", "s"),

@@ -13,12 +13,12 @@ from vehest.constants import FloatArray
 from vehest.data.derived import SpeedFromWheels
 from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import RationalFilter
-from vehest.evaluation.observability import Observability, observability_along
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure, paper_style
 from vehest_papers.heavy_ekf.laps import POINTS
 from vehest_papers.heavy_ekf.subjects import LINES, Filter
+from vehest_papers.kit.observability import Observability, observability_along
 
 WINDOW_SECONDS = 1.0
 SIZES = (0.02, 0.1, 0.1, 0.3)

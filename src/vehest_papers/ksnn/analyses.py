@@ -9,7 +9,7 @@ import numpy as np
 from vehest.data.recording import Recording
 from vehest.report.document import Block
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
-from vehest.studies.kit.reading import recordings_of, words_of_kinds
+from vehest_papers.kit.reading import recordings_of, words_of_kinds
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.activation import activation
 from vehest_papers.ksnn.candidates import chosen

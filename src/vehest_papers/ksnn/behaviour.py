@@ -20,10 +20,10 @@ from vehest.estimators.model_files import load_model
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored, pieces_of, score
-from vehest.evaluation.spectra import mean_bias
 from vehest.studies.artefacts import EvaluatedModel
-from vehest.studies.kit.reading import recordings_of
 from vehest.training.members import prepare
+from vehest_papers.kit.reading import recordings_of
+from vehest_papers.kit.spectra import mean_bias
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Errors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme, segments_on

@@ -10,7 +10,7 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.studies import artefacts
-from vehest.studies.kit.reading import metric_values
+from vehest_papers.kit.reading import metric_values
 from vehest_papers.ksnn import paper
 
 METRICS = ("rmse_vy", "fvu", "r2", "rmse_sideslip")

@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed, listed
-from vehest.studies.kit.statements import Compared, Outcome, outcomes
+from vehest_papers.kit.statements import Compared, Outcome, outcomes
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.schemes import Scheme
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 from vehest.report.style import fixed
 from vehest.studies.kit.claims import Claim
-from vehest.studies.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
+from vehest_papers.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Errors
 from vehest_papers.ksnn.schemes import THIRD, Scheme, segments_on

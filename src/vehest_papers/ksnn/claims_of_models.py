@@ -13,13 +13,13 @@ from scipy import signal
 from vehest.constants import FloatArray
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
-from vehest.evaluation.spectra import SEGMENT_SECONDS, THIRD_OCTAVE
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.kit.claims import Claim
-from vehest.studies.kit.reading import median_and_range
-from vehest.studies.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
+from vehest_papers.kit.reading import median_and_range
+from vehest_papers.kit.spectra import SEGMENT_SECONDS, THIRD_OCTAVE
+from vehest_papers.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.comparing import N_RESAMPLES
 from vehest_papers.ksnn.linear_system import LocalModels

@@ -14,7 +14,7 @@ from vehest.data.recording import Recording
 from vehest.evaluation.blocks import Segments, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest.report.style import fixed
-from vehest.studies.kit.statements import Change, Measured
+from vehest_papers.kit.statements import Change, Measured
 
 N_RESAMPLES = 2000
 METRICS = ("fvu", "rmse_vy", "rmse_sideslip")

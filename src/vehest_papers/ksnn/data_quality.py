@@ -11,9 +11,9 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.evaluation.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure, paper_style
+from vehest_papers.kit.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_frequencies
 
 NOISE_COLOUR = "#555555"

@@ -12,9 +12,9 @@ from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document,
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
-from vehest.studies.kit.reading import spans_in_words, words_of_kinds
-from vehest.studies.kit.statements import Statement, decided
 from vehest.studies.kit.warnings import warnings_of
+from vehest_papers.kit.reading import spans_in_words, words_of_kinds
+from vehest_papers.kit.statements import Statement, decided
 from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_table, headline
 from vehest_papers.ksnn.curve import Curve, curve_figure, curve_of, curve_table

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from vehest.evaluation.metrics import Scored
-from vehest.evaluation.spectra import SEGMENT_SECONDS, Periodogram, decibels, periodogram
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure, paper_style
+from vehest_papers.kit.spectra import SEGMENT_SECONDS, Periodogram, decibels, periodogram
 from vehest_papers.ksnn.subjects import plain_frequencies
 
 READ_AT_HZ = (0.1, 1.0)

@@ -11,9 +11,9 @@ import pandas as pd
 
 from vehest.evaluation.blocks import Segments, read_segments
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.reading import words_of_kinds
 from vehest.studies.kit.runs import by_name
-from vehest.studies.kit.statements import Change, Measured
+from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.statements import Change, Measured
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
 from vehest_papers.ksnn.comparing import Errors

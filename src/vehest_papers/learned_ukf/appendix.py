@@ -12,14 +12,14 @@ from vehest.data.store import read_recording
 from vehest.report.document import Block, Column, Table, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.order import differences, order_in_words, pairs_table
-from vehest.studies.kit.reading import recordings_of, spans_in_words, words_of_kinds
+from vehest_papers.kit.reading import recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
 from vehest_papers.learned_ukf.ablations import SCRATCH
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Errors
 from vehest_papers.learned_ukf.filtering import loaded
+from vehest_papers.learned_ukf.order import differences, order_in_words, pairs_table
 from vehest_papers.learned_ukf.trials import step_size, trials_table
 
 

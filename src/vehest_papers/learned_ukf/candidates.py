@@ -24,7 +24,7 @@ from vehest.evaluation.metrics import (
 )
 from vehest.evaluation.significance import sequence_labels
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.reading import metric_values
+from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.errors import Errors
 

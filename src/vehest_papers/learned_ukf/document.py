@@ -13,7 +13,7 @@ from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.kit.claims import Claim, claims_table
-from vehest.studies.kit.reading import words_of_kinds
+from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.learned_ukf import ablations, claims, coverage, friction, paper, prediction, tables, traces
 from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCRATCH
 from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes

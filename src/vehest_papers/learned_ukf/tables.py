@@ -12,7 +12,7 @@ from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.reading import median_and_range
+from vehest_papers.kit.reading import median_and_range
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
 from vehest_papers.learned_ukf.errors import Errors, in_words

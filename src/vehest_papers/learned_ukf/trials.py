@@ -11,7 +11,7 @@ from vehest.data.splits import VALIDATION
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.reading import metric_values
+from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf.candidates import candidate_of
 
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vehest.data.recording import Recording
-from vehest.report import recording_figures as figures
-from vehest.simulation.sensors.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground import noise
+from vehest_papers.proving_ground import recording_figures as figures
 from vehest_papers.proving_ground.handling import ANGLE_EDGES, AY_EDGES
+from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile
 from vehest_papers.proving_ground.vehicles import SHORTEST_TRACE, TRACE_SECONDS, Stretch, VehiclePage
 

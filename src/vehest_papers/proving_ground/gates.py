@@ -16,10 +16,10 @@ import pandas as pd
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.estimators.static_map import StaticMap, StaticMapSettings
-from vehest.evaluation.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import StoredDataset
+from vehest_papers.kit.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest_papers.ksnn.data_quality import PUBLISHED, PUBLISHED_BIAS, Statistics, spectra_of, statistics
 from vehest_papers.proving_ground.papers import PROFILES
 from vehest_papers.proving_ground.tally import MOVING

@@ -9,8 +9,8 @@ import pandas as pd
 from scipy import signal
 
 from vehest.data.recording import Recording
-from vehest.report.recording_figures import Spectrum
-from vehest.simulation.sensors.noise_reading import NOISE_ABOVE, WELCH_SECONDS, read_off
+from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE, WELCH_SECONDS, read_off
+from vehest_papers.proving_ground.recording_figures import Spectrum
 
 SHOWN = {
     "vx": "vx [m/s/√Hz]",

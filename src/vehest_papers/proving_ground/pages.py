@@ -8,10 +8,10 @@ import pandas as pd
 
 from vehest.report.document import Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import fixed, significant
-from vehest.simulation.sensors.noise_reading import NOISE_ABOVE
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import drawing, gates, noise
 from vehest_papers.proving_ground.index import index_document
+from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile, profile_of
 from vehest_papers.proving_ground.tables import COLUMNS, QUANTITIES, accidents, flagged_table, how_to_get, row_of
 from vehest_papers.proving_ground.tally import MOVING, Tally

@@ -3,7 +3,7 @@
 What shakes the body above 10 Hz is counted as noise: engine, road and sensors cannot be told apart in a recording.
 Read the Ferrari recording again with::
 
-    from vehest.simulation.sensors.noise_reading import read_off
+    from vehest_papers.proving_ground.noise_reading import read_off
     print(read_off(recording.channels, recording.rate_hz))
 """
 

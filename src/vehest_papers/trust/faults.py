@@ -20,7 +20,7 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
 from vehest.trust.guard import Guard, learn_limits
 from vehest.trust.health import HealthModel, health_rows, learn_health
-from vehest.trust.oracle import HORIZON_SECONDS, Oracle, learn_oracle, motion_of
+from vehest_papers.trust.oracle import HORIZON_SECONDS, Oracle, learn_oracle, motion_of
 
 WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current")
 """Channels that faults are tried in, of those that a car has."""

@@ -25,10 +25,10 @@ from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
-from vehest.studies.trust_faults import FaultTrials, elsewhere, health_of, trials_of
-from vehest.studies.trust_shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 from vehest.trust.bands import ELSEWHERE, LEVELS
 from vehest.trust.faults import parse_condition
+from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
+from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 
 TAKES = "parts"
 SHOWS_FAILED = True
