@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
 import os
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError, is_printable, printable
+from vehest.data.errors import ConfigurationError, printable
 from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
 from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
+from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
 
 if TYPE_CHECKING:
@@ -40,10 +37,7 @@ data_app = typer.Typer(no_args_is_help=True, help="Look at data sets, recordings
 app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
-EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 LONGEST_LINE = 4_000
-MOST_ATTEMPTS = 5  # at an answer
-MOST_COLUMNS = 40  # of a table that are listed
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
 
@@ -144,7 +138,7 @@ def _overrides(command: str) -> Any:
 @app.callback(invoke_without_command=True)
 def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False) -> None:
     if version:
-        _echo(f"vehest {__version__}")
+        echo(f"vehest {__version__}")
         raise typer.Exit
 
 
@@ -170,62 +164,15 @@ def new_car(
     conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.run.new_car import Vehicle
-    from vehest.run.new_car_outcome import begin, conclude, in_words, settle
+    from vehest.run.new_car_outcome import begin, conclude, found_in_words, in_words, settle
+    from vehest.run.new_car_questions import ask, key_and_answer
 
-    given = dict(_key_and_answer(text) for text in answer or [])
+    given = dict(key_and_answer(text) for text in answer or [])
     examined = begin(name, files, force=force)
-    if not as_json:
-        for file in files:
-            _echo(f"read {file}")
-        for proposal in examined.proposals.channels:
-            _echo(f"{'?' if proposal.asked else ' '} {proposal.in_words}")
-        if examined.proposals.left_right:
-            _echo(f"  left and right: {examined.proposals.left_right}")
-        if examined.proposals.unused:
-            _echo(f"  no channel: {_counted(list(examined.proposals.unused))}")
-    draft, left = settle(examined, Vehicle(wheelbase, mass, steering_ratio), None if yes or as_json else _asked, given)
+    emit(False, None, [] if as_json else found_in_words(examined, files))
+    draft, left = settle(examined, Vehicle(wheelbase, mass, steering_ratio), None if yes or as_json else ask, given)
     outcome = conclude(draft, left, force=force, dry_run=dry_run)
-    if as_json:
-        _echo(_json({**outcome.as_plain(), "dry_run": dry_run}), keep="\n")
-        return
-    for line in in_words(outcome):
-        _echo(line)
-    for written in outcome.files:
-        _echo(f"{'would write' if dry_run else 'wrote'} {written.file}: {written.purpose}")
-    _echo("next:")
-    for command in outcome.next_commands():
-        _echo(f"  {command}")
-
-
-def _key_and_answer(text: str) -> tuple[str, str]:
-    key, equals, answer = text.rpartition("=")
-    if not equals or not key:
-        raise ConfigurationError(f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no")
-    return key, answer
-
-
-def _asked(question: Any) -> str:
-    """An answer from the terminal; Enter takes what is proposed, and what is no answer is asked again."""
-    from vehest.run.new_car_questions import check_answer
-
-    for line in question.evidence:
-        _echo(f"    {line}")
-    if question.candidates:
-        _echo(f"    other answers: {', '.join(question.candidates)}")
-    text = printable(f"? {question.text} ({question.hint})" if question.hint else f"? {question.text}")
-    for _attempt in range(MOST_ATTEMPTS):
-        try:
-            answer = str(typer.prompt(text, default=question.proposed, show_default=bool(question.proposed))).strip()
-        except typer.Abort:
-            if sys.stdin is not None and sys.stdin.isatty():
-                raise
-            raise ConfigurationError("nobody answers here; add --yes to take what is proposed, or --answer KEY=ANSWER") from None
-        try:
-            check_answer(question, answer)
-            return answer
-        except ConfigurationError as error:
-            _echo(f"    {error}")
-    raise ConfigurationError(f"'{question.key}' got no answer")
+    emit(as_json, {**outcome.as_plain(), "dry_run": dry_run}, in_words(outcome, dry_run))
 
 
 @app.command(epilog=_offered("dataset"))
@@ -251,7 +198,7 @@ def ingest(
         if download:
             download_files(config, runner)
         made = runner.ingest(config)
-    _emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
+    emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
 
 
 @app.command()
@@ -278,8 +225,8 @@ def simulate(
         artefact = runner.ingest(config)
     outcome = outcome_of(artefact).as_plain()
     if not as_json:
-        outcome |= {name: _counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
-    _emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
+        outcome |= {name: counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
+    emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
 
 
 @app.command(epilog=_offered("dataset"))
@@ -300,7 +247,7 @@ def downsample(
     rate = positive_rate(config["rate_hz"], "rate_hz")
     with open_runner(config, RunOptions(force, dry_run, quiet), frozenset({"downsample"})) as runner:
         artefact = runner.downsample(runner.ingest(config), rate, config["downsample"])
-    _emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
+    emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
 
 
 @app.command(epilog=_offered("split", "estimator", "training", "tracking"))
@@ -318,7 +265,7 @@ def train(
     from vehest.run.run_cache import RunOptions
     from vehest.run.single import train_one
 
-    _emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
+    emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"))
@@ -346,7 +293,7 @@ def evaluate(
     from vehest.run.run_cache import RunOptions
     from vehest.run.single import evaluate_one
 
-    _emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), _note))
+    emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
 
 
 @app.command()
@@ -385,56 +332,9 @@ def estimate(
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
-    from vehest.data.limits import limits_from_config, use_limits
-    from vehest.estimators.model_files import load_model
-    from vehest.run.calibrate import trust_of
-    from vehest.run.estimate import (
-        PRETRAINED,
-        SUFFIXES,
-        estimate_recording,
-        find_model,
-        finding_in_words,
-        findings_for,
-        preparation_of,
-        pretrained_note,
-        read_table,
-        summary_of,
-        verdict_of,
-        write_estimate_table,
-    )
+    from vehest.run.estimate import estimate_file
 
-    words = [word for word in (model, recording, *(overrides or [])) if word is not None]
-    n_names = 2 if len(words) > 1 and _is_file_name(words[1]) else 1
-    name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
-    if n_names == 1 and file.is_dir():
-        raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
-    if out.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
-    config = _compose("estimate", overrides)
-    folder = find_model(name, Path(config["output"]), _note)
-    fitted = load_model(folder)
-    downsample = config["downsample"] if _names("downsample", overrides) else preparation_of(folder)
-    if out.is_dir():
-        raise ConfigurationError(f"'{out}' is a folder; name a file")
-    if out.exists() and file.exists() and out.samefile(file):
-        raise ConfigurationError(f"'{out}' is the recording itself; name another file")
-    trust = trust_of(folder, Path(config["output"]))
-    with use_limits(limits_from_config(config["limits"])):
-        drive = read_table(file, overrides)
-        findings = findings_for(drive, fitted, config["dataset"].get("accept") or ())
-        if strict and findings:
-            raise DataError(f"'{file}': {finding_in_words(findings[0])}")
-        result = estimate_recording(fitted, drive, downsample, trust)
-    for finding in findings:
-        typer.echo(f"warning: {finding_in_words(finding)}", err=True)
-    write_estimate_table(result, out)
-    note = {"note": pretrained_note()} if name == PRETRAINED else {}
-    said = {"verdict": verdict_of(result, drive, trust), "findings": [finding_in_words(finding) for finding in findings]}
-    _emit(as_json, {"out": str(out), "model": str(folder) if not note else PRETRAINED, **summary_of(result), **said, **note})
-
-
-def _note(text: str) -> None:
-    typer.echo(f"note: {text}", err=True)
+    emit(as_json, estimate_file([word for word in (model, recording, *(overrides or [])) if word is not None], out, strict=strict))
 
 
 @app.command()
@@ -491,8 +391,8 @@ def replay(
     words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
     stop = StopSignals()
     with stop.installed(), stop.deferred():
-        outcome = replay_log(words, overrides or [], stop.requested, _note)
-    _emit(as_json, outcome)
+        outcome = replay_log(words, overrides or [], stop.requested, note)
+    emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)
 
@@ -532,21 +432,16 @@ def export(
 
     config = _compose("estimate", [])
     output = Path(config["output"])
-    folder = find_model(model, output, _note)
+    folder = find_model(model, output, note)
     fitted = load_model(folder)
     if onnx:
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
-        _emit(as_json, {"out": str(out), "model": str(folder)})
+        emit(as_json, {"out": str(out), "model": str(folder)})
         return
     found = export_model(fitted, trust_of(folder, output), out, precision, bus_rate, elsewhere=elsewhere)
-    _emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
-
-
-def _is_file_name(word: str) -> bool:
-    """Whether a word is no override; a file that is there may have an ``=`` in its name."""
-    return ("=" not in word and not word.startswith("~")) or Path(word).is_file()
+    emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
 
 
 @app.command()
@@ -573,51 +468,10 @@ def compare(
     v = 0 and a static map, fitted on the other half of the drive, stand beside them. Where all estimates are there they are scored, with
     95 % intervals over blocks of the drive; nothing is called best that is not below all others by more than chance.
     """
-    from vehest.data.limits import limits_from_config, use_limits
-    from vehest.estimators.model_files import load_model, read_description
-    from vehest.run.calibrate import trust_of
-    from vehest.run.compare_files import compare_estimates, read_estimate_table
-    from vehest.run.estimate import estimate_recording, find_model, preparation_of, read_table
+    from vehest.run.compare_files import compare_files
 
-    files = [Path(word) for word in words or [] if _is_file_name(word)]
-    overrides = [word for word in words or [] if not _is_file_name(word)]
-    config = _compose("estimate", overrides)
-    with use_limits(limits_from_config(config["limits"])):
-        drive = read_table(recording, overrides, references=True)
-        estimates = {file.stem: read_estimate_table(file, drive) for file in files}
-        if len(estimates) < len(files):
-            raise ConfigurationError("two estimates have the same file name; rename one, since it names the row")
-        for name in models or []:
-            folder = find_model(name, Path(config["output"]), _note)
-            fitted, trust = load_model(folder), trust_of(folder, Path(config["output"]))
-            about = read_description(folder).about
-            if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
-                typer.echo(f"warning: '{name}' learnt on this recording: its row is no test", err=True)
-            estimates[name] = estimate_recording(fitted, drive.without_references(), preparation_of(folder), trust)
-        found = compare_estimates(drive, estimates)
-    if as_json:
-        _echo(
-            _json({"start": found.start, "stop": found.stop, "rate_hz": found.rate_hz, "rows": found.rows, "verdict": found.verdict}),
-            keep="\n",
-        )
-        return
-    header = ("estimate", "RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0, static map", "RMSE(v) [m/s]", "FVU")
-    _table([*header], [_compared_row(row) for row in found.rows])
-    _echo(f"scored from {found.start:.6g} to {found.stop:.6g} s at {found.rate_hz:g} Hz")
-    _echo(found.verdict)
-
-
-def _compared_row(row: Mapping[str, Any]) -> list[str]:
-    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
-    return [
-        str(row["estimate"]),
-        f"{row['rmse_sideslip']:.3f}",
-        f"{low:.3f} … {high:.3f}" if math.isfinite(low) else "–",
-        str(row["against_best"]),
-        f"{row['beats_zero']}, {row['beats_static_map']}",
-        f"{row['rmse_vy']:.3f}",
-        f"{row['fvu']:.3f}",
-    ]
+    found = compare_files(recording, words or [], models or [])
+    emit(as_json, asdict(found), found.in_words())
 
 
 @app.command()
@@ -702,14 +556,11 @@ def report(
 
 def _check_published(words: list[str], as_json: bool) -> None:
     """Say of published studies whether they are those of today; exit code 3 unless all are."""
+    from vehest.run.config_files import is_file_name
     from vehest.run.published import check_published
 
-    verdicts = check_published([word for word in words if _is_file_name(word)], [word for word in words if not _is_file_name(word)])
-    if as_json:
-        _echo(_json([asdict(verdict) for verdict in verdicts]), keep="\n")
-    else:
-        for verdict in verdicts:
-            _echo(verdict.in_words())
+    verdicts = check_published([word for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)])
+    emit(as_json, [asdict(verdict) for verdict in verdicts], [verdict.in_words() for verdict in verdicts])
     if any(verdict.state != "up to date" for verdict in verdicts):
         raise typer.Exit(3)
 
@@ -759,7 +610,7 @@ def show_config(
     from vehest.run.config import GIVEN, as_yaml
 
     config = {key: value for key, value in _compose(command, overrides or []).items() if key != GIVEN}
-    _echo(_json(config) if as_json else as_yaml(config).rstrip(), keep="\n")
+    echo(as_json_text(config) if as_json else as_yaml(config).rstrip(), keep="\n")
 
 
 @app.command()
@@ -774,42 +625,23 @@ def prune(
     That is what other code has made than today's, what is damaged or half-written, and what was made from something that is gone. Models
     and recordings of today's code stay, whatever their settings, and so does everything that vehest has not made.
     """
-    from vehest.run.prune import remove_found, unnamed
+    from vehest.run.prune import remove_found, size_in_words, unnamed
 
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
     found = unnamed(Path(str(config["output"])))
     total = sum(one.size for one in found)
-    if not as_json:
-        if found:
-            rows = [[str(one.path), _size(one.size), _age(one.age), one.reason] for one in found]
-            _table(["no present key names", "size", "age", "since"], rows)
-        _echo(f"{len(found)} to remove, {_size(total)}" if found else "nothing to remove")
+    shown = [TerminalTable("", ("no present key names", "size", "age", "since"), [one.in_words() for one in found])] if found else []
+    emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {size_in_words(total)}" if found else "nothing to remove"])
     removed: list[str] = []
     if found and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("there is no terminal to ask at; add --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
             remove_found(found, lambda one: removed.append(str(one.path)))
-    if as_json:
-        listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
-        _echo(_json({"found": listed, "bytes": total, "removed": removed}), keep="\n")
-    elif removed:
-        _echo(f"{len(removed)} removed")
-
-
-def _size(size: int) -> str:
-    """Bytes as people read them."""
-    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
-
-
-def _age(seconds: float) -> str:
-    """A time span as people read it."""
-    for length, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{seconds:.0f} s"
+    listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
+    emit(as_json, {"found": listed, "bytes": total, "removed": removed}, [f"{len(removed)} removed"] if removed else [])
 
 
 @app.command()
@@ -818,12 +650,7 @@ def doctor(as_json: AsJson = False) -> None:
     from vehest.run.doctor import examine
 
     items = examine()
-    if as_json:
-        _echo(_json([item.__dict__ for item in items]), keep="\n")
-    else:
-        for item in items:
-            mark = {"ok": "ok     ", "warning": "warning", "error": "error  "}[item.level]
-            _echo(f"{mark} {item.name}: {item.message}")
+    emit(as_json, [asdict(item) for item in items], [f"{item.level:<7} {item.name}: {item.message}" for item in items])
     if any(item.level == "error" for item in items):
         raise typer.Exit(4)
 
@@ -831,19 +658,10 @@ def doctor(as_json: AsJson = False) -> None:
 @data_app.command("list")
 def data_list(as_json: AsJson = False) -> None:
     """List the data sets that conf/dataset offers, with their licences and what to cite."""
-    from vehest.run.inspect_data import dataset_rows
+    from vehest.run.inspect_data import dataset_rows, datasets_in_words
 
     rows = dataset_rows()
-    if as_json:
-        _echo(_json(rows), keep="\n")
-    else:
-        shown = ("dataset", "kind", "source", "here", "title")
-        _table(["data set", *shown[1:]], [[row[key] for key in shown] for row in rows])
-        _echo("")
-        _echo("licences and citations")
-        for row in rows:
-            _echo(f"{row['dataset']}: {row['licence']}")
-            _echo(f"  cite: {row['citation']}")
+    emit(as_json, rows, datasets_in_words(rows))
 
 
 @data_app.command("channels")
@@ -851,10 +669,8 @@ def data_channels(as_json: AsJson = False) -> None:
     """List the channels that vehest knows, with units and signs."""
     from vehest.data.channels import CHANNELS
 
-    if as_json:
-        _echo(_json({name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}), keep="\n")
-    else:
-        _table(["channel", "unit", "meaning"], [[c.name, c.unit, c.meaning] for c in CHANNELS.values()])
+    table = TerminalTable("", ("channel", "unit", "meaning"), [[c.name, c.unit, c.meaning] for c in CHANNELS.values()])
+    emit(as_json, {name: {"unit": c.unit, "meaning": c.meaning} for name, c in CHANNELS.items()}, [table])
 
 
 @data_app.command("show")
@@ -864,28 +680,10 @@ def data_show(
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
-    from vehest.run.inspect_data import describe
+    from vehest.run.inspect_data import describe, recordings_in_words
 
     shown = describe(source, overrides or [])
-    if as_json:
-        _echo(_json(shown), keep="\n")
-        return
-    for recording in shown["recordings"]:
-        _echo(
-            f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
-            f"{_stretch(recording['start'], recording['end'])}, {recording['samples']} samples"
-        )
-        for line in recording["origin"]:
-            _echo(f"  {line}")
-        rows = [[c["name"], c["unit"], *(f"{c[key]:.4g}" for key in ("min", "mean", "max", "std"))] for c in recording["channels"]]
-        _table(["channel", "unit", "min", "mean", "max", "std"], rows)
-
-
-def _stretch(start: float, end: float) -> str:
-    """When a recording begins and ends [s]; of unix time the date, and seconds from it on."""
-    if not EARLIEST_UNIX < start < LATEST_UNIX:
-        return f"{start:.6g} s to {end:.6g} s"
-    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
+    emit(as_json, shown, recordings_in_words(shown))
 
 
 @data_app.command("check")
@@ -895,17 +693,10 @@ def data_check(
     as_json: AsJson = False,
 ) -> None:
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
-    from vehest.run.inspect_data import check
+    from vehest.run.inspect_data import check, finding_row_in_words
 
     findings = check(source, overrides or [])
-    if as_json:
-        _echo(_json(findings), keep="\n")
-    else:
-        for row in findings:
-            channel = f" {row['channel']}:" if row["channel"] else ""
-            _echo(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
-        if not findings:
-            _echo("nothing found")
+    emit(as_json, findings, [finding_row_in_words(row) for row in findings] or ["nothing found"])
     if any(row["level"] == "error" for row in findings):
         raise typer.Exit(3)
 
@@ -918,23 +709,9 @@ def data_usable(
 ) -> None:
     """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
     from vehest.run.inspect_data import examine_usability
-    from vehest.run.usable import HEADER, borrowed_cars, remedies, table_row
 
     found = examine_usability(source, overrides or [])
-    if as_json:
-        _echo(_json(found.as_plain()), keep="\n")
-        return
-    _table([*HEADER], [table_row(row) for row in found.rows])
-    _echo("")
-    for line in remedies(found.rows):
-        _echo(line)
-    if found.unscored:
-        _echo(f"every estimate is scored by {' and '.join(missing.channel for missing in found.unscored)}")
-    if found.columns:
-        names = ", ".join(found.columns[:MOST_COLUMNS]) + (", …" if len(found.columns) > MOST_COLUMNS else "")
-        _echo(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
-    if cars := borrowed_cars(found.rows):
-        _echo(cars)
+    emit(as_json, found.as_plain(), found.in_words())
 
 
 @data_app.command("align")
@@ -969,17 +746,7 @@ def data_align(
     Prints what was found with its uncertainty, and the transforms that would correct it. Applies nothing.
     """
     from vehest.alignment.settings import AlignmentSettings
-    from vehest.run.align import (
-        PARAMETER_HEADER,
-        RESIDUAL_HEADER,
-        align_recording,
-        as_plain,
-        override_of,
-        parameter_rows,
-        refuse_other_files,
-        residual_rows,
-        write_alignment,
-    )
+    from vehest.run.align import align_recording, as_plain, in_words, refuse_other_files, write_alignment
 
     asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed)
@@ -988,34 +755,22 @@ def data_align(
     found = align_recording(source, overrides or [], recording, settings)
     if out is not None:
         write_alignment(found, out)
-    if as_json:
-        _echo(_json({**as_plain(found), "out": None if out is None else str(out)}), keep="\n")
-        return
-    _echo(f"{found.recording_id}: {found.kind}, {found.duration:.6g} s at {found.rate_hz:g} Hz; nothing is applied")
-    _table([*PARAMETER_HEADER], parameter_rows(found))
-    if found.residuals:
-        _echo("")
-        _table([*RESIDUAL_HEADER], residual_rows(found))
-    for note in found.notes:
-        _echo(f"note: {note}")
-    _echo(f"to correct it: '{override_of(found)}'")
-    if out is not None:
-        _echo(f"written: {out}")
+    emit(as_json, {**as_plain(found), "out": None if out is None else str(out)}, in_words(found, out))
 
 
 def main() -> None:
     """Entry point: every expected failure is one line and an exit code."""
     from vehest.run.signals import DryRunStop, Stopped
 
-    _open_streams()
+    open_streams()
     try:
         code = app(prog_name="vehest", standalone_mode=False)
     except _USAGE_ERROR as error:
         _fail_usage(error)
     except DryRunStop:
         code = 0
-    except (_OutputClosed, BrokenPipeError):
-        _silence(sys.stdout)
+    except (OutputClosed, BrokenPipeError):
+        silence(sys.stdout)
         sys.exit(141)
     except Stopped as stopped:
         _fail(f"stopped by {stopped}; what was finished is kept, the same command goes on", stopped.exit_code)
@@ -1030,26 +785,6 @@ def main() -> None:
 
 _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 """What Typer raises for options, arguments and commands that it does not know; newer ones carry their own copy of Click."""
-
-
-class _OutputClosed(Exception):
-    """Nobody reads standard output any more."""
-
-
-def _open_streams() -> None:
-    """Give streams that were closed at the start a null device, and let every stream show any character, as an escape if need be."""
-    for name in ("stdin", "stdout", "stderr"):
-        stream = getattr(sys, name)
-        if stream is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115 (as long as the process lives)
-        elif name != "stdin" and isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-
-
-def _silence(stream: Any) -> None:
-    """Let what a broken stream still holds go nowhere, so that leaving does not complain about it."""
-    with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
-        os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def _fail_usage(error: Any) -> None:
@@ -1081,33 +816,9 @@ def _fail(message: str, exit_code: int) -> NoReturn:
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
-        _silence(sys.stdout)
-    _complain(f"error: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + '…'}")
+        silence(sys.stdout)
+    complain(f"error: {line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] + '…'}")
     sys.exit(exit_code)
-
-
-def _complain(text: str) -> None:
-    """Print on standard error, if anybody reads it."""
-    try:
-        typer.echo(text, err=True)
-    except OSError:
-        _silence(sys.stderr)
-
-
-def _echo(text: str, keep: str = "") -> None:
-    """Print a line on standard output, control characters as escapes except for those to ``keep``; the one way there.
-
-    Raises:
-        MissingError: its disk is full.
-        _OutputClosed: nobody reads it any more.
-    """
-    try:
-        typer.echo(printable(text, keep))
-    except BrokenPipeError:
-        raise _OutputClosed from None
-    except OSError as error:
-        _silence(sys.stdout)
-        raise MissingError(f"cannot write to standard output ({error.strerror})") from error
 
 
 def _print_ran(ran: Ran, as_json: bool, *, sweep: bool = False) -> None:
@@ -1117,22 +828,11 @@ def _print_ran(ran: Ran, as_json: bool, *, sweep: bool = False) -> None:
         JobsFailedError: some jobs failed.
     """
     page, summary = ran.folder / ran.summary.page, ran.summary
-    if as_json:
-        own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
-        if not sweep:
-            own = {"report": str(page), "published": str(ran.published) if ran.published else None}
-        _echo(_json({**own, **json.loads(summary.figures)}), keep="\n")
-    else:
-        for table in summary.tables:
-            if table.title:
-                _echo("")
-                _echo(table.title)
-            _table([*table.header], [[*row] for row in table.rows])
-        if summary.note:
-            _echo(summary.note, keep="\n")
-        _echo(f"report: {page}")
-        if ran.published:
-            _echo(f"published: {ran.published}")
+    own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
+    if not sweep:
+        own = {"report": str(page), "published": str(ran.published) if ran.published else None}
+    shown: list[str | TerminalTable] = [*summary.tables, *(summary.note.split("\n") if summary.note else []), f"report: {page}"]
+    emit(as_json, {**own, **json.loads(summary.figures)}, [*shown, *([f"published: {ran.published}"] if ran.published else [])])
     if ran.failed is not None:
         raise ran.failed
 
@@ -1141,58 +841,6 @@ def _compose(command: str, overrides: list[str]) -> Config:
     from vehest.run.config import compose_config
 
     return compose_config(command, overrides)
-
-
-def _names(group: str, overrides: list[str] | None) -> bool:
-    """Whether any override is about a group."""
-    return any(override.lstrip("+~").startswith((f"{group}.", f"{group}=")) for override in overrides or [])
-
-
-def _emit(as_json: bool, outcome: dict[str, Any]) -> None:
-    """Print an outcome: one JSON object, or a line a figure."""
-    if as_json:
-        _echo(_json(outcome), keep="\n")
-        return
-    for key, value in outcome.items():
-        _echo(f"{key}: {value if not isinstance(value, float) else f'{value:.6g}'}")
-
-
-def _counted(names: list[str]) -> str:
-    """How many there are, and the first of them."""
-    some = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
-    return f"{len(names)} ({some})" if names else "0"
-
-
-def _json(outcome: Any) -> str:
-    """An outcome as JSON; what is not a finite number becomes null, a character that is not to be shown its escape in JSON."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(inner) for key, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
-    text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
-    return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)
-
-
-def _table(header: list[str], rows: list[list[str]]) -> None:
-    """Print a table on standard output, as wide as it needs to be where there is no terminal."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in header:
-        table.add_column(Text(printable(name)))
-    for row in rows:
-        table.add_row(*(Text(printable(cell)) for cell in row))
-    with console.capture() as captured:
-        console.print(table)
-    _echo(captured.get().removesuffix("\n"), keep="\n\x1b")  # cells hold no escapes any more, styles do
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from vehest.data.recording import Recording
 from vehest.run.config import Config
 from vehest.run.config_files import choices
 from vehest.run.inspect_data import config_of
+from vehest.run.printing import TerminalTable
 from vehest.sources.base import open_source, read_single
 
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "alignment.svg")
@@ -76,6 +77,16 @@ def residual_rows(alignment: Alignment) -> list[list[str]]:
         [residual.channel, *(_three_digits(size) for size in (residual.rms_before, residual.rms_after, residual.rms_rest)), residual.unit]
         for residual in alignment.residuals
     ]
+
+
+def in_words(alignment: Alignment, out: Path | None) -> list[str | TerminalTable]:
+    """An alignment for a terminal; ``out`` is where it was written."""
+    first = f"{alignment.recording_id}: {alignment.kind}, {alignment.duration:.6g} s at {alignment.rate_hz:g} Hz; nothing is applied"
+    lines: list[str | TerminalTable] = [first, TerminalTable("", PARAMETER_HEADER, parameter_rows(alignment))]
+    if alignment.residuals:
+        lines += ["", TerminalTable("", RESIDUAL_HEADER, residual_rows(alignment))]
+    lines += [*(f"note: {note}" for note in alignment.notes), f"to correct it: '{override_of(alignment)}'"]
+    return lines if out is None else [*lines, f"written: {out}"]
 
 
 def override_of(alignment: Alignment) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,14 +15,21 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
+from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_estimate
+from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.static_map import StaticMap, StaticMapSettings
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score
 from vehest.evaluation.ranking import Name, Ranking, rank
+from vehest.run.calibrate import trust_of
+from vehest.run.config import compose_config
+from vehest.run.config_files import is_file_name
 from vehest.run.downsample import transforms_of
+from vehest.run.estimate import estimate_recording, find_model, preparation_of, read_table
+from vehest.run.printing import TerminalTable, complain, note
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
 from vehest.sources.unit_spellings import plain_unit
@@ -53,6 +61,64 @@ class ComparedFiles:
     start: float
     stop: float
     rate_hz: float
+
+    def in_words(self) -> list[str | TerminalTable]:
+        """For a terminal."""
+        header = (
+            "estimate",
+            "RMSE(β) [deg]",
+            "95 % interval [deg]",
+            "to the lowest [deg]",
+            "beats v = 0, static map",
+            "RMSE(v) [m/s]",
+            "FVU",
+        )
+        scored = f"scored from {self.start:.6g} to {self.stop:.6g} s at {self.rate_hz:g} Hz"
+        return [TerminalTable("", (*header, "FVU"), [_cells(row) for row in self.rows]), scored, self.verdict]
+
+
+def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
+    """Score estimates made elsewhere, and models, on one recording.
+
+    Args:
+        recording: file with its reference.
+        words: tables of estimates and overrides of conf/estimate.yaml.
+        models: to run on it; one that learnt on it gets a warning.
+
+    Raises:
+        ConfigurationError: two estimates have the same name.
+        MissingError: a file or model is not there.
+        DataError: a file cannot be used.
+    """
+    files = [Path(word) for word in words if is_file_name(word)]
+    overrides = [word for word in words if not is_file_name(word)]
+    config = compose_config("estimate", overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        drive = read_table(recording, overrides, references=True)
+        estimates = {file.stem: read_estimate_table(file, drive) for file in files}
+        if len(estimates) < len(files):
+            raise ConfigurationError("two estimates have the same file name; rename one, since it names the row")
+        for name in models:
+            folder = find_model(name, Path(config["output"]), note)
+            model, trust = load_model(folder), trust_of(folder, Path(config["output"]))
+            about = read_description(folder).about
+            if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
+                complain(f"warning: '{name}' learnt on this recording: its row is no test")
+            estimates[name] = estimate_recording(model, drive.without_references(), preparation_of(folder), trust)
+        return compare_estimates(drive, estimates)
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    return [
+        str(row["estimate"]),
+        f"{row['rmse_sideslip']:.3f}",
+        f"{low:.3f} … {high:.3f}" if math.isfinite(low) else "–",
+        str(row["against_best"]),
+        f"{row['beats_zero']}, {row['beats_static_map']}",
+        f"{row['rmse_vy']:.3f}",
+        f"{row['fvu']:.3f}",
+    ]
 
 
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:

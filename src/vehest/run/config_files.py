@@ -62,6 +62,11 @@ def is_simulated(dataset: str) -> bool:
     return False
 
 
+def is_file_name(word: str) -> bool:
+    """Whether a word is no override; a file that is there may have an ``=`` in its name."""
+    return ("=" not in word and not word.startswith("~")) or Path(word).is_file()
+
+
 def find_pipeline(name: str) -> Path | None:
     """A pipeline by path or by name: as given, then ./pipelines, then the packaged ones."""
     given = Path(name)

@@ -22,10 +22,13 @@ from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, read_description
+from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
-from vehest.run.config import compose_config
+from vehest.run.calibrate import trust_of
+from vehest.run.config import compose_config, key_of
+from vehest.run.config_files import is_file_name
 from vehest.run.downsample import transforms_of
+from vehest.run.printing import complain, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
@@ -83,6 +86,52 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
         others = f"{', '.join(folder.name for folder in found[1:4])}{f' and {len(found) - 4} more' if len(found) > 4 else ''}"
         say(f"'{name}' is taken for {found[0].name}, the newest; it could also be {others}")
     return found[0]
+
+
+def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> dict[str, Any]:
+    """Run a model on a recording and write the estimate.
+
+    Args:
+        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
+        out: table to write.
+        strict: whether what speaks against a channel is an error; else it is printed as a warning.
+
+    Returns:
+        Figures of the estimate and a verdict.
+
+    Raises:
+        ConfigurationError: words or the file to write make no sense.
+        MissingError: there is no such model or recording.
+        DataError: the recording cannot be used.
+    """
+    n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
+    name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
+    if n_names == 1 and file.is_dir():
+        raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
+    if out.suffix.lower() not in SUFFIXES:
+        raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
+    config = compose_config("estimate", overrides)
+    folder = find_model(name, Path(config["output"]), note)
+    model = load_model(folder)
+    own_preparation = any(key_of(override).split(".")[0] == "downsample" for override in overrides)
+    downsample = config["downsample"] if own_preparation else preparation_of(folder)
+    if out.is_dir():
+        raise ConfigurationError(f"'{out}' is a folder; name a file")
+    if out.exists() and file.exists() and out.samefile(file):
+        raise ConfigurationError(f"'{out}' is the recording itself; name another file")
+    trust = trust_of(folder, Path(config["output"]))
+    with use_limits(limits_from_config(config["limits"])):
+        drive = read_table(file, overrides)
+        findings = findings_for(drive, model, config["dataset"].get("accept") or ())
+        if strict and findings:
+            raise DataError(f"'{file}': {finding_in_words(findings[0])}")
+        result = estimate_recording(model, drive, downsample, trust)
+    for finding in findings:
+        complain(f"warning: {finding_in_words(finding)}")
+    write_estimate_table(result, out)
+    remark = {"note": pretrained_note()} if name == PRETRAINED else {}
+    said = {"verdict": verdict_of(result, drive, trust), "findings": [finding_in_words(finding) for finding in findings]}
+    return {"out": str(out), "model": str(folder) if not remark else PRETRAINED, **summary_of(result), **said, **remark}
 
 
 def model_artefact(folder: Path) -> Artefact:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,13 @@ from vehest.run.artefacts import find
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.ingest import plan_ingest, recording_file
-from vehest.run.usable import Missing, Usability, all_usabilities, unscored
+from vehest.run.printing import TerminalTable
+from vehest.run.usable import HEADER, Missing, Usability, all_usabilities, borrowed_cars, remedies, table_row, unscored
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.unused import unused_columns
+
+EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
+MOST_COLUMNS = 40  # of a table that are listed
 
 
 def dataset_rows() -> list[dict[str, str]]:
@@ -45,6 +50,39 @@ def dataset_rows() -> list[dict[str, str]]:
             }
         )
     return rows
+
+
+def datasets_in_words(rows: Sequence[Mapping[str, str]]) -> list[str | TerminalTable]:
+    """Data sets for a terminal, with their licences and what to cite."""
+    shown = ("dataset", "kind", "source", "here", "title")
+    table = TerminalTable("", ("data set", *shown[1:]), [[row[key] for key in shown] for row in rows])
+    cited = [line for row in rows for line in (f"{row['dataset']}: {row['licence']}", f"  cite: {row['citation']}")]
+    return [table, "", "licences and citations", *cited]
+
+
+def recordings_in_words(described: Mapping[str, Any]) -> Iterator[str | TerminalTable]:
+    """What `describe` found, for a terminal."""
+    for recording in described["recordings"]:
+        yield (
+            f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
+            f"{_stretch(recording['start'], recording['end'])}, {recording['samples']} samples"
+        )
+        yield from (f"  {line}" for line in recording["origin"])
+        rows = [[c["name"], c["unit"], *(f"{c[key]:.4g}" for key in ("min", "mean", "max", "std"))] for c in recording["channels"]]
+        yield TerminalTable("", ("channel", "unit", "min", "mean", "max", "std"), rows)
+
+
+def _stretch(start: float, end: float) -> str:
+    """When a recording begins and ends [s]; of unix time the date, and seconds from it on."""
+    if not EARLIEST_UNIX < start < LATEST_UNIX:
+        return f"{start:.6g} s to {end:.6g} s"
+    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
+
+
+def finding_row_in_words(row: Mapping[str, str]) -> str:
+    """A row of `check` as a line."""
+    channel = f" {row['channel']}:" if row["channel"] else ""
+    return f"{row['level']:<7} {row['recording']}:{channel} {row['message']}"
 
 
 def describe(source: str, overrides: Sequence[str]) -> dict[str, Any]:
@@ -98,6 +136,19 @@ class Examined:
             "unused_columns": list(self.columns),
             "estimators": [row.as_plain() for row in self.rows],
         }
+
+    def in_words(self) -> list[str | TerminalTable]:
+        """For a terminal."""
+        lines: list[str | TerminalTable] = [TerminalTable("", HEADER, [table_row(row) for row in self.rows]), "", *remedies(self.rows)]
+        if self.unscored:
+            lines.append(f"every estimate is scored by {' and '.join(missing.channel for missing in self.unscored)}")
+        if self.columns:
+            names = ", ".join(self.columns[:MOST_COLUMNS]) + (", …" if len(self.columns) > MOST_COLUMNS else "")
+            lines.append(
+                f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset"
+            )
+        borrowed = borrowed_cars(self.rows)
+        return [*lines, borrowed] if borrowed else lines
 
 
 def examine_usability(source: str, overrides: Sequence[str]) -> Examined:

@@ -18,6 +18,7 @@ from vehest.run.new_car import Draft, Examined, Vehicle, draft, examine
 from vehest.run.new_car_files import Written, dataset_text, refuse_existing, write_all
 from vehest.run.new_car_pipeline import Plan, pipeline_text, plan_of
 from vehest.run.new_car_questions import RATE, TIME, VEHICLE, Question, answered, number, questions_of, vehicle_questions
+from vehest.run.printing import counted
 from vehest.run.usable import SCORED
 
 SHARES = {"train": "50 %", "validation": "20 %", "tests": "30 %"}
@@ -253,7 +254,19 @@ def _dataset_file(made: Draft, left: Sequence[Question]) -> str:
     return dataset_text(made.dataset, comments, head, tail)
 
 
-def in_words(outcome: Outcome) -> list[str]:
+def found_in_words(examined: Examined, files: Sequence[Path]) -> list[str]:
+    """What the logs hold, a line each."""
+    found = examined.proposals
+    lines = [f"read {file}" for file in files]
+    lines += [f"{'?' if proposal.asked else ' '} {proposal.in_words}" for proposal in found.channels]
+    if found.left_right:
+        lines.append(f"  left and right: {found.left_right}")
+    if found.unused:
+        lines.append(f"  no channel: {counted(list(found.unused))}")
+    return lines
+
+
+def in_words(outcome: Outcome, dry_run: bool) -> list[str]:
     """What is said at the end, a line each."""
     own = outcome.draft
     lines = []
@@ -284,4 +297,5 @@ def in_words(outcome: Outcome) -> list[str]:
         lines.append(f"{own.seconds:.0f} s in all, of which a fifth is tested, can hardly rank estimators; record some minutes more")
     if outcome.plan is not None:
         lines += [f"left out: {name}: lacks {what}" for name, what in outcome.plan.lacking.items()]
-    return lines
+    lines += [f"{'would write' if dry_run else 'wrote'} {written.file}: {written.purpose}" for written in outcome.files]
+    return [*lines, "next:", *(f"  {command}" for command in outcome.next_commands())]

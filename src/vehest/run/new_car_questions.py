@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import typer
+
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
 from vehest.data.channels import CHANNELS, channel
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.units import factor_to_si
 from vehest.run.new_car import Examined, Vehicle
+from vehest.run.printing import echo
 
 LEFT_RIGHT, RATE, RADIUS, TIME = "left_right", "rate", "radius", "time"
 VEHICLE = {
@@ -20,6 +24,7 @@ VEHICLE = {
     "steering_ratio": "steering ratio, of the steering wheel's angle to the road wheels'",
 }
 LEAVE_OUT = "-"
+MOST_ATTEMPTS = 5  # at an answer
 
 
 @dataclass(frozen=True)
@@ -150,6 +155,44 @@ def answered(proposals: Proposals, question: Question, answer: str) -> Proposals
     if question.key == RADIUS:
         return replace(proposals, wheel_radius=number(answer, "the radius"))
     return _redeclared(proposals, question.key, answer)
+
+
+def key_and_answer(text: str) -> tuple[str, str]:
+    """An answer beforehand, as ``--answer`` takes it.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    key, equals, answer = text.rpartition("=")
+    if not equals or not key:
+        raise ConfigurationError(f"--answer '{text}' must be KEY=ANSWER, for example --answer left_right=no")
+    return key, answer
+
+
+def ask(question: Question) -> str:
+    """An answer from the terminal; Enter takes what is proposed, and what is no answer is asked again.
+
+    Raises:
+        ConfigurationError: nobody answers.
+    """
+    for line in question.evidence:
+        echo(f"    {line}")
+    if question.candidates:
+        echo(f"    other answers: {', '.join(question.candidates)}")
+    text = printable(f"? {question.text} ({question.hint})" if question.hint else f"? {question.text}")
+    for _attempt in range(MOST_ATTEMPTS):
+        try:
+            answer = str(typer.prompt(text, default=question.proposed, show_default=bool(question.proposed))).strip()
+        except typer.Abort:
+            if sys.stdin is not None and sys.stdin.isatty():
+                raise
+            raise ConfigurationError("nobody answers here; add --yes to take what is proposed, or --answer KEY=ANSWER") from None
+        try:
+            check_answer(question, answer)
+            return answer
+        except ConfigurationError as error:
+            echo(f"    {error}")
+    raise ConfigurationError(f"'{question.key}' got no answer")
 
 
 def check_answer(question: Question, answer: str) -> None:

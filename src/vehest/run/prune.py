@@ -49,6 +49,22 @@ class Found:
     size: int
     age: float
 
+    def in_words(self) -> list[str]:
+        """Path, size, age and reason, for a terminal."""
+        return [str(self.path), size_in_words(self.size), _age_in_words(self.age), self.reason]
+
+
+def size_in_words(size: int) -> str:
+    """Bytes as people read them."""
+    return f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
+def _age_in_words(seconds: float) -> str:
+    for length, unit in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
 
 def unnamed(output: Path) -> list[Found]:
     """What in an output root no present key names, stage by stage.

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from vehest.run.printing import TerminalTable
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -23,21 +25,6 @@ BOARD_HEADER = (
     "beats v = 0, static map",
     "FVU",
 )
-
-
-@dataclass(frozen=True)
-class TerminalTable:
-    """A table in a terminal.
-
-    Args:
-        title: line above it; none if empty.
-        header: over the columns.
-        rows: of cells.
-    """
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
