@@ -78,7 +78,7 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
 def plain(estimator: Any, training: Any, batch: Any) -> Any:
     """The loss as one would write it down: layers of torch, then a filter that loops over samples."""
     from vehest.estimators.cnn_ukf import START
-    from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
+    from vehest.estimators.network_ukf import LEAST_VARIANCE
 
     parameters = dict(estimator.network.named_parameters())
     hidden = batch.inputs

@@ -17,7 +17,7 @@ from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.estimators.filtering.network_ukf import Word
+from vehest.estimators.network_ukf import Word
 from vehest.estimators.registry import estimator_class
 
 SPIKE, JUMP = 6.0, 8.0  # s

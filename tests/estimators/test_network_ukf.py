@@ -16,9 +16,9 @@ from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
 from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
 from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter, error_over
 from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
 from vehest.training.context import FitContext

@@ -17,7 +17,7 @@ from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import Estimator, FitData
-from vehest.estimators.filtering.network_ukf import NetworkUkf
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.export.method import FAMILIES, method_source

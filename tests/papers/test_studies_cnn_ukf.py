@@ -23,8 +23,8 @@ from vehest.data.store import write_estimate, write_recording
 from vehest.data.transforms import transform_from_config
 from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf
-from vehest.estimators.filtering.network_ukf import Word
 from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.network_ukf import Word
 from vehest.estimators.networks.sample_network import INPUTS
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class

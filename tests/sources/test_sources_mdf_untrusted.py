@@ -23,10 +23,10 @@ from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.mdf.blocks import BlockFile
 from vehest.sources.mdf.conversions import same
-from vehest.sources.mdf.data_blocks import Piece, records_of
+from vehest.sources.mdf.data_blocks import records_of
 from vehest.sources.mdf.files import read_measurement
 from vehest.sources.mdf.formulas import FormulaError, parse_formula
-from vehest.sources.mdf.layout import DataGroup, Field, Group
+from vehest.sources.mdf.layout import DataGroup, Field, Group, Piece
 from vehest.sources.mdf.values import raw_values
 
 asammdf = pytest.importorskip("asammdf", reason="the measurements of these tests are written by asammdf")

@@ -16,7 +16,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
 from vehest.estimators.networks.sample_network import SampleNetwork, believed, learnt_samples
 from vehest.estimators.phase_records import record_of_phases
 from vehest.estimators.references import reference_sideslip

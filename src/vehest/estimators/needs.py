@@ -12,8 +12,8 @@ from typing import Any
 from vehest.estimators import learned_ukf, rational_ekf
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import SEARCHED, DugoffUkf
-from vehest.estimators.filtering.network_ukf import NetworkUkf
 from vehest.estimators.kalman import KalmanFilter
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.velocity_recurrent import REFERENCES, RecurrentVelocityEstimator
 
 USUAL = ("vy_ref",)

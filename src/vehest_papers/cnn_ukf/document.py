@@ -9,8 +9,8 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.estimators.dugoff_ukf import DugoffUkf
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
 from vehest.estimators.model_files import load_model
+from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts

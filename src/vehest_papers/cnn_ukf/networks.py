@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
 from vehest.estimators.model_files import load_model
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
 from vehest.evaluation.metrics import Scored
 from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear, sideslip_error
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run

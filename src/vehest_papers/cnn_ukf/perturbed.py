@@ -16,8 +16,8 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE
 from vehest.estimators.model_files import load_model
+from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
 from vehest.training.context import FitContext

@@ -16,7 +16,7 @@ from vehest.data.store import read_recording
 from vehest.data.transforms import LowPass, RemoveOutliers
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import DugoffUkf
-from vehest.estimators.filtering.network_ukf import NetworkUkf
+from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.metrics import Scored, score_all
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.estimators.filtering.network_ukf import Word
+from vehest.estimators.network_ukf import Word
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style

@@ -10,8 +10,8 @@ from vehest.constants import GRAVITY
 from vehest.estimators.cnn_ukf import CnnUkf
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.ensemble_ukf import LEAST_SPREAD, MOST_SIZE, EnsembleUkf
-from vehest.estimators.filtering.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.filtering.track_filter import KAPPA, UNKNOWN
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.export.method import MethodTemplate
 from vehest.export.methods.kalman import gate_values
 from vehest.export.methods.sample_networks import network_values

@@ -4,42 +4,19 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.data.limits import check_limit, check_unpacked
 from vehest.sources.mdf.blocks import BlockFile
-
-if TYPE_CHECKING:
-    from vehest.sources.mdf.layout import Group
+from vehest.sources.mdf.layout import Group, Piece
 
 Bytes = NDArray[np.uint8]
 
 CHUNK = 4 * 2**20
 MOST_AT_ONCE = 64 * 2**20  # of a transposed block or of one record; the standard says blocks of 4 MiB
 MOST_DEFLATED = 1040  # times: no deflated byte stands for more
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One data block.
-
-    Args:
-        address: of its bytes.
-        packed: how many there are in the file.
-        unpacked: how many they stand for.
-        is_deflated: whether they are compressed.
-        columns: of the matrix that was transposed before; 0 where none was.
-    """
-
-    address: int
-    packed: int
-    unpacked: int
-    is_deflated: bool = False
-    columns: int = 0
 
 
 def records_of(file: BlockFile, pieces: Sequence[Piece], group: Group, wanted: int | None) -> Iterator[Bytes]:

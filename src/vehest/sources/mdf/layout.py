@@ -7,9 +7,27 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from vehest.constants import FloatArray
-from vehest.sources.mdf.data_blocks import Piece
 
 Conversion = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One data block.
+
+    Args:
+        address: of its bytes.
+        packed: how many there are in the file.
+        unpacked: how many they stand for.
+        is_deflated: whether they are compressed.
+        columns: of the matrix that was transposed before; 0 where none was.
+    """
+
+    address: int
+    packed: int
+    unpacked: int
+    is_deflated: bool = False
+    columns: int = 0
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import numpy as np
 
 from vehest.sources.mdf import conversions
 from vehest.sources.mdf.blocks import BlockFile, Trail, shown
-from vehest.sources.mdf.data_blocks import Piece
-from vehest.sources.mdf.layout import ChannelPlace, Contents, Conversion, DataGroup, Field, Group
+from vehest.sources.mdf.layout import ChannelPlace, Contents, Conversion, DataGroup, Field, Group, Piece
 
 _CHANNEL = "<5IH32s128s4H24x"  # next, conversion, source, dependency, comment; type, name, description; first bit, bits, coding, flag
 _CHANNEL_BYTES = 218

@@ -13,8 +13,7 @@ import numpy as np
 
 from vehest.sources.mdf import conversions
 from vehest.sources.mdf.blocks import BlockFile, Trail, shown
-from vehest.sources.mdf.data_blocks import Piece
-from vehest.sources.mdf.layout import ChannelPlace, Contents, Conversion, DataGroup, Field, Group
+from vehest.sources.mdf.layout import ChannelPlace, Contents, Conversion, DataGroup, Field, Group, Piece
 
 _HEAD_BYTES = 24
 _COUNTS_OPEN, _LAST_BLOCK_OPEN = 0x01, 0x04  # flags of a file that was not closed
