@@ -21,8 +21,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.artefacts import read_artefact
-from vehest.training.context import FitContext
-from vehest.training.nothing import NoTraining
+from vehest.training.context import FitContext, NoTraining
 from vehest.training.supervised import SupervisedSettings
 
 pytestmark = pytest.mark.apart

@@ -14,7 +14,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class
-from vehest.training.nothing import NoTraining
+from vehest.training.context import NoTraining
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_dynamics
 

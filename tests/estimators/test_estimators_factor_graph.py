@@ -20,7 +20,7 @@ from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel, kalman_filter, smooth
 from vehest.run.config import compose_config
-from vehest.training.nothing import NoTraining
+from vehest.training.context import NoTraining
 
 GAPS = {"ay": slice(40, 60), "yaw_rate": slice(50, 70)}
 

@@ -18,7 +18,7 @@ from vehest.estimators.kalman import KalmanFilter, KalmanSettings
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_levels import high_passed_level
 from vehest.run.config import compose_config
-from vehest.training.nothing import NoTraining
+from vehest.training.context import NoTraining
 from vehest.vehicle.parameters import FERRARI_250LM
 
 GIVEN = {"noise": {**NOISE, "steer_factor": 1.0}}

@@ -16,8 +16,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
-from vehest.training.context import FitContext
-from vehest.training.nothing import NoTraining
+from vehest.training.context import FitContext, NoTraining
 
 
 class RecursiveEstimator(Estimator):

@@ -1,4 +1,4 @@
-"""What a fit needs to know about the world around it."""
+"""Surroundings of a fit: checkpoints, stopping, progress; and the settings of one that learns nothing."""
 
 from __future__ import annotations
 
@@ -47,3 +47,8 @@ class FitContext:
     checkpoint_folders: Sequence[Path] = ()
     should_stop: Callable[[], bool] = field(default=_never)
     on_progress: Callable[[Progress], None] = field(default=_silent)
+
+
+@dataclass(frozen=True)
+class NoTraining:
+    """Nothing to set: what the estimator needs is given, or read off the data as it is."""

@@ -8,8 +8,7 @@ from typing import Literal
 from vehest.data.errors import ConfigurationError
 from vehest.training.noise_tuning import NoiseTuningSettings
 
-LEAST_PROCESS_YAW_RATE = 1e-5
-"""Lower limit of the search for the yaw rate's process noise [rad/s]."""
+LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 
-MOST_WINDOWS = 1024
-"""Windows that are evaluated at once where no gradient is wanted: each is laid out by itself in memory."""
+MOST_WINDOWS = 1024  # evaluated at once where no gradient is wanted: each is laid out by itself in memory
 
 
 class WindowNetwork(Protocol):

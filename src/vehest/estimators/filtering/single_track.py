@@ -17,7 +17,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, EstimatorSettings, Stepper, required
 from vehest.filters.gaussian import Gaussian
-from vehest.training.nothing import NoTraining
+from vehest.training.context import NoTraining
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
 
