@@ -24,7 +24,8 @@ from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, stops_of
-from vehest.trust.health_kernel import N_FEATURES, N_FORMS, N_LEVELS, Layout, health_kernel, memory_sizes
+from vehest.trust.health_kernel import N_FORMS, N_LEVELS, Layout, Model, State, health_kernel
+from vehest.trust.named_arrays import allocated, views
 from vehest.trust.relations import (
     FEATURES,
     RATE,
@@ -131,13 +132,6 @@ def reason_channel(code: float) -> str:
     return _NAMES.get(round(code) % 10_000 // 100, "")
 
 
-class PackedHealth(NamedTuple):
-    """A model as the kernel reads it."""
-
-    numbers: FloatArray
-    sizes: NDArray[np.int64]
-
-
 class Health(NamedTuple):
     """What was found in rows.
 
@@ -217,7 +211,7 @@ class HealthModel:
         rows = [max(round(seconds * self.rate_hz), 1) for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
         memories = (len(ENERGY_SECONDS), len(RATIO_SECONDS), len(RELATION_SECONDS))
-        return Layout(len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows)
+        return Layout._make([len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows, len(self.statistics)])
 
     @property
     def statistics(self) -> list[Statistic]:
@@ -246,78 +240,60 @@ class HealthModel:
 
     def start(self) -> FloatArray:
         """State before the first row."""
-        sizes = memory_sizes(self.layout)
-        state, energy = np.zeros(sum(sizes)), sum(sizes[:9])
-        state[energy : energy + sizes[9]] = 1.0
-        return state
+        memory = allocated(State, self.layout)
+        views(State, memory, self.layout)[0].energy[:] = 1.0
+        return memory
 
-    def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> PackedHealth:
-        """Tables of the kernel.
+    def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> FloatArray:
+        """The kernel's `Model` in one array.
 
         Args:
             forgets: whether the likelihood ratios do; if not, they are sums over all rows.
             behind_front_end: whether rows come through the filter from a faster bus.
         """
-        own_limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
+        limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
         layout, statistics, names = self.layout, self.statistics, list(self.channels)
-        C, coefficients = layout.channels, np.array(self.coefficients)
-        instant, average, rates = np.zeros((C, N_FEATURES)), np.zeros((layout.relations, N_FEATURES)), np.zeros(layout.relations)
-        for row, relation in enumerate(self.relations):
-            for feature, value in relation.terms.items():
-                if feature == RATE:
-                    rates[row] = value
-                    continue
-                average[row, FEATURES.index(feature)] = value
-                if relation.instant:
-                    instant[names.index(relation.target), FEATURES.index(feature)] = value
-        step = 1.0 / self.rate_hz
+        tables, step, coefficients = allocated(Model, layout), 1.0 / self.rate_hz, np.array(self.coefficients)
+        model, _ = views(Model, tables, layout)
 
-        def forgetting(seconds: Sequence[float]) -> FloatArray:
+        def forgetting(*seconds: float) -> FloatArray:
             return 1.0 - np.exp(-step / np.array(seconds))
 
-        limits = np.array(own_limits or (math.inf,) * len(statistics))
-        numbers = [
-            self.constant,
-            coefficients.transpose(0, 2, 1),
-            self.precision,
-            self.deviation,
-            instant,
-            average,
-            rates,
-            self.usual,
-            np.maximum(self.largest, 1e-12),
-            self.speeds,
-            self.levels,
-            (np.eye(C) - coefficients.sum(0)).T,
-            *self._step_filter(),
-            self.healthy or np.zeros((N_FORMS, C)),
-            self.heaviest or np.full((N_FORMS, C), math.inf),
-            forgetting(ENERGY_SECONDS),
-            forgetting(RATIO_SECONDS) if forgets else np.zeros(layout.ratios),
-            forgetting(RELATION_SECONDS),
-            limits,
-            1.0 / limits,
-            [PRIORITY[statistic.kind] for statistic in statistics],
-            [*self.standstill, step, *self.spin, *forgetting([SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS])],
-            np.array(self.stops or ((-ENDLESS, ENDLESS),) * C).T,
-        ]
-        sizes = [
-            *layout,
-            len(statistics),
-            *kernel.places(layout),
-            *(int(self.precision[i][i] > 0.0) for i in range(C)),
-            *(int(CHANNELS[name].rests) for name in names),
-            *(round(gap * self.rate_hz) for gap in self.longest_gap),
-            *(int(name.startswith("wheel_speed") and bool(instant[i].any())) for i, name in enumerate(names)),
-            *(NUMBERS[name] for name in names),
-            *(names.index(relation.target) for relation in self.relations),
-            *(statistic.kind for statistic in statistics),
-            *(names.index(statistic.channel) for statistic in statistics),
-            *(names.index(statistic.partner) if statistic.partner else -1 for statistic in statistics),
-            *(relation.involves(name, speed_channel(names)) for relation in self.relations for name in names),
-            *(names.index(relation.partner) for relation in self.relations),
-        ]
-        return PackedHealth(np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in numbers]), np.array(sizes, np.int64))
+        settings = [*self.standstill, step, *self.spin, *forgetting(SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS)]
+        for place, value in zip((*model.layout, *model.settings), (*layout, *settings), strict=True):
+            place[...] = value
+        for row, relation in enumerate(self.relations):
+            model.target[row], model.versus[row] = names.index(relation.target), names.index(relation.partner)
+            model.involved[row] = [relation.involves(name, speed_channel(names)) for name in names]
+            for feature, value in relation.terms.items():
+                if feature == RATE:
+                    model.rate_gain[row] = value
+                    continue
+                model.average[row, FEATURES.index(feature)] = value
+                if relation.instant:
+                    model.instant[model.target[row], FEATURES.index(feature)] = value
+        model.lags[:] = coefficients.transpose(0, 2, 1)
+        model.largest[:] = np.maximum(self.largest, 1e-12)
+        model.settled_gain[:] = (np.eye(layout.channels) - coefficients.sum(0)).T
+        model.steps[:], model.step_power[:] = self._step_filter()
+        model.healthy[:], model.heaviest[:] = self.healthy or 0.0, self.heaviest or math.inf
+        model.forget_energy[:], model.forget_average[:] = forgetting(*ENERGY_SECONDS), forgetting(*RELATION_SECONDS)
+        model.forget_ratio[:] = forgetting(*RATIO_SECONDS) if forgets else 0.0
+        model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
+        model.limits.every[:] = limits or math.inf
+        model.inverse.every[:] = 1.0 / model.limits.every
+        model.modelled[:] = np.diag(self.precision) > 0.0
+        for i, name in enumerate(names):
+            model.rests[i], model.code[i] = CHANNELS[name].rests, NUMBERS[name]
+            model.wheel[i] = name.startswith("wheel_speed") and model.instant[i].any()
+            model.gap_limit[i] = round(self.longest_gap[i] * self.rate_hz)
+        for name in ("constant", "precision", "deviation", "usual", "speeds", "levels"):
+            getattr(model, name)[:] = getattr(self, name)
+        for k, statistic in enumerate(statistics):
+            model.kind[k], model.priority[k] = statistic.kind, PRIORITY[statistic.kind]
+            model.accused[k] = names.index(statistic.channel)
+            model.partner[k] = names.index(statistic.partner) if statistic.partner else -1
+        return tables
 
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
         """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the latest first, and their power, (C, C)."""
@@ -326,7 +302,7 @@ class HealthModel:
         return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum("jqm,qr,jrn->mn", left, precision, left)
 
 
-def health_rows(packed: PackedHealth, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
+def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
     """Judge rows one after another; one at a time or all at once, to the same bits.
 
     Args:
@@ -336,7 +312,7 @@ def health_rows(packed: PackedHealth, rows: FloatArray, measured: NDArray[np.boo
         state: of `HealthModel.start`, changed in place.
     """
     out = np.empty((3, len(rows)))
-    health_kernel(rows, measured, packed.numbers, packed.sizes, state, out, _NO_STATISTICS)
+    health_kernel(rows, measured, packed, state, out, _NO_STATISTICS)
     return Health(out[0], out[1], out[2])
 
 
@@ -436,15 +412,15 @@ def _longest_gap(parts: Sequence[FloatArray], rate_hz: float) -> float:
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
     """With the offset, scale and delay that the likelihood ratios find over all of training, and `HEAVIEST` times their mean weight."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
-    layout, sizes = model.layout, memory_sizes(model.layout)
-    begin, total = sum(sizes[:10]), np.zeros((layout.channels, 2 * N_FORMS))
+    total, weight = np.zeros((2, len(model.channels), N_FORMS))
     for recording in recordings:
-        state, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
-        health_rows(packed, rows, np.isfinite(rows), state)
-        sums = state[begin : begin + sizes[10]].reshape(layout.channels, layout.ratios, -1)
-        total += sums[:, 0, : 2 * N_FORMS]
-    found = total[:, 0::2] / np.maximum(total[:, 1::2], 1e-300)
-    heaviest = HEAVIEST * total[:, 1::2] / sum(len(recording) for recording in recordings)
+        memory, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
+        health_rows(packed, rows, np.isfinite(rows), memory)
+        state, _ = views(State, memory, model.layout)
+        total += state.ratio_sum[:, 0]
+        weight += state.ratio_weight[:, 0]
+    found = total / np.maximum(weight, 1e-300)
+    heaviest = HEAVIEST * weight / sum(len(recording) for recording in recordings)
     return replace(model, healthy=_plain(found.T), heaviest=_plain(heaviest.T))
 
 
@@ -457,7 +433,7 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
         for begin in range(0, len(samples), length):
             part = samples[begin : begin + length]
             statistics = np.empty((len(part), n_statistics))
-            health_kernel(part, np.isfinite(part), *packed, state, np.empty((3, len(part))), statistics)
+            health_kernel(part, np.isfinite(part), packed, state, np.empty((3, len(part))), statistics)
             found.append(statistics.max(0))
     return np.array(found)
 
