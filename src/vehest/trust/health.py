@@ -282,6 +282,10 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
     levels[:, [names.index(name) for name in usable]] = noise.factors
     largest = {name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in joined.items()}
     turning = joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
+
+    def still_at(name: str) -> float:
+        return min(STILL[name], 0.1 * largest.get(name, np.inf))
+
     found = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
@@ -290,7 +294,7 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         usual=tuple(float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0 for name in names),
         largest=tuple(largest.values()),
         longest_gap=tuple(max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz for name in names),
-        standstill=(least_speed, *(min(top, 0.1 * largest.get(name, np.inf)) for name, top in STILL.items())),
+        standstill=(least_speed, still_at("yaw_rate"), still_at("ay")),
         spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
         speeds=tuple(noise.speeds.tolist()),
         levels=_plain(levels),
