@@ -3,25 +3,8 @@
     samples + Fault -> FaultedChannel -> samples with the fault
 
 All random numbers come from the fault's seed. Sizes are round numbers of engineering judgement, from faults that a driver would not notice
-to those of no car, and were set before the error of any estimator under them was looked at.
-
-| kind | effect on the channel while the fault lasts | meaning of a severity, or of a given size |
-| `bias` | a constant is added | the constant [unit] |
-| `drift` | a ramp is added that starts at 0 | its slope [unit/s] |
-| `scale` | multiplied by 1 + size | the size |
-| `frozen` | stays at its last value | for which share of the duration, from its start on |
-| `dropout` | 0 | for which share, in pieces of 0.2 s |
-| `spikes` | a constant is added to, or taken from, 2 % of the samples, one at a time | the constant [unit] |
-| `noise` | white Gaussian noise is added | its standard deviation [unit] |
-| `delay` | comes late | how late [s], at least one sample |
-| `saturation` | clipped | at which share of the largest size that it would have had meanwhile |
-| `sign` | of the wrong sign | for which share of the duration, from its start on |
-| `unit` | in another unit, `UNIT_FACTORS` | the factor |
-| `nan` | NaN | for which share, in pieces of 0.2 s |
-| `inf` | infinite, of either sign | for which share of the samples, at least one |
-| `huge` | finite and beyond physics, of either sign, in 5 % of the samples | how many times its physical range |
-| `held` | sampled and held | for how long [s], at least two samples |
-| `lost_wheel` | drops out (NaN), spins up or locks within 0.2 s | by which factor the speed changes |
+to those of no car, and were set before the error of any estimator under them was looked at;
+docs/trust.md, "Kinds and sizes", is the table of all of them.
 """
 
 from __future__ import annotations
@@ -71,17 +54,17 @@ TIMES_OFFSET: dict[str, float] = {"bias": 1.0, "drift": 0.1, "spikes": 10.0, "no
 """Kind whose size goes by the channel's offsets -> multiple of them; a drift reaches the offset in 10 s."""
 
 SIZES: dict[str, Sizes] = {
-    "scale": (0.05, 0.2, 0.5),
-    "frozen": (0.1, 0.5, 1.0),
-    "dropout": (0.1, 0.5, 1.0),
-    "delay": (0.05, 0.2, 0.5),
-    "saturation": (0.8, 0.5, 0.2),
-    "sign": (0.1, 0.5, 1.0),
-    "nan": (0.1, 0.5, 1.0),
-    "inf": (0.01, 0.1, 1.0),
-    "huge": (10.0, 1e4, 1e200),
-    "held": (0.1, 0.25, 0.5),
-    "lost_wheel": (math.nan, 1.5, 0.0),
+    "scale": (0.05, 0.2, 0.5),  # factor less 1
+    "frozen": (0.1, 0.5, 1.0),  # share of the duration, from its start on
+    "dropout": (0.1, 0.5, 1.0),  # share of the samples, in pieces
+    "delay": (0.05, 0.2, 0.5),  # s, at least one sample
+    "saturation": (0.8, 0.5, 0.2),  # share of the channel's largest size
+    "sign": (0.1, 0.5, 1.0),  # share of the duration, from its start on
+    "nan": (0.1, 0.5, 1.0),  # share of the samples, in pieces
+    "inf": (0.01, 0.1, 1.0),  # share of the samples, at least one
+    "huge": (10.0, 1e4, 1e200),  # times the channel's physical range
+    "held": (0.1, 0.25, 0.5),  # s, at least two samples
+    "lost_wheel": (math.nan, 1.5, 0.0),  # factor of the speed; NaN: drops out
 }
 """Kind -> mild, medium and severe size, for every channel."""
 

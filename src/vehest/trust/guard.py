@@ -5,8 +5,6 @@
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has stood still for longer than it ever did
 where the estimator learnt counts as not measured. Channels that a method can do without become NaN then; the others hold the last value
 that was accepted, for half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels are back.
-
-The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
 """
 
 from __future__ import annotations

@@ -6,8 +6,6 @@
   needs, these states go back to what they were fitted to, every second until nothing is suspected any more.
 - The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
   least as far as sideslip did in training. These factors were set before their effect was looked at.
-
-The recursions are compiled and take one row or all of a recording, so that online and batch agree to the last bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Clips, bridges and restarts: an estimate stays finite and within the bound by the car's speed; a diverged estimator starts anew.
-
-The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
-"""
+"""Clips, bridges and restarts: an estimate stays finite and within the bound by the car's speed; a diverged estimator starts anew."""
 
 from __future__ import annotations
 
