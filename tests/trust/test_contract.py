@@ -57,7 +57,7 @@ def test_a_drive_without_faults_is_estimated_as_without_the_contract(name):
     estimator = ready(name)
     drive = drive_for(estimator)
     plain = estimator.estimate([drive])[0]
-    guarded = estimate_guarded(estimator, columns(estimator, drive), drive).estimate
+    guarded = estimate_guarded(estimator, columns(estimator, drive), drive)
     np.testing.assert_allclose(guarded["vy"], plain["vy"], rtol=0.0, atol=1e-12)
 
 
@@ -69,7 +69,7 @@ def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_o
     samples = hostile_columns(estimator, drive, seed)
     batch = estimate_guarded(estimator, samples, drive)
     one_by_one = online(estimator, samples)
-    np.testing.assert_allclose(batch.estimate["vy"], one_by_one, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(batch["vy"], one_by_one, rtol=0.0, atol=1e-9)
     after = estimator.warm_up_steps + estimator.horizon_steps
     assert np.isfinite(one_by_one[after:]).all()
     assert "vx" not in drive or np.abs(one_by_one[after:]).max() <= max(np.abs(drive["vx"]).max(), 1.0)

@@ -28,7 +28,7 @@ def test_batch_equals_online_under_a_severe_fault(name, kind):
     channel = next(channel for channel in ("yaw_rate", "vx") if applies(kind, channel))
     fault = Fault(kind, channel, "severe", 0.4 * drive.duration, 0.2 * drive.duration)
     samples = inject({own: drive[own] for own in estimator.channels}, drive.rate_hz, fault)
-    batch = estimate_guarded(estimator, samples, drive).estimate["vy"]
+    batch = estimate_guarded(estimator, samples, drive)["vy"]
     stepper = GuardedStepper(estimator)
     online = [stepper.step({own: values[k] for own, values in samples.items()})["vy"] for k in range(len(drive))]
     online = np.concatenate([np.full(estimator.horizon_steps, np.nan), online])[: len(drive)]

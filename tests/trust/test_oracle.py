@@ -10,7 +10,7 @@ from measured_drive import CHANNELS, RATE, measured_drive
 
 from vehest.data.errors import DataError
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
-from vehest_papers.trust.oracle import Oracle, learn_oracle, likelihood_ratio_delay, motion_of
+from vehest_papers.trust.oracle import Oracle, filtered, learn_oracle, levels_at, likelihood_ratio_delay, motion_of
 
 COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
@@ -45,7 +45,7 @@ def test_a_signature_moves_innovations_by_what_the_filter_makes_of_it() -> None:
     healthy, signature = planted(300, seed=5), np.zeros((300, 2))
     signature[100:, 1] = np.linspace(0.0, 5.0, 200)
     moved = model.innovations(healthy + signature) - model.innovations(healthy)
-    np.testing.assert_allclose(moved[model.order :], model.filtered(signature)[model.order :], atol=1e-9)
+    np.testing.assert_allclose(moved[model.order :], filtered(model, signature)[model.order :], atol=1e-9)
 
 
 def test_too_few_samples_are_refused() -> None:
@@ -57,7 +57,7 @@ def test_noise_that_grows_with_the_speed_is_found() -> None:
     generator = np.random.default_rng(0)
     speed = generator.uniform(10.0, 50.0, 50_000)
     levels = learn_noise_levels((speed / 30.0 * generator.standard_normal(50_000))[:, None], np.ones((1, 1)), speed, 5)
-    np.testing.assert_allclose(levels.at(np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
+    np.testing.assert_allclose(levels_at(levels, np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
 
 
 def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form() -> None:

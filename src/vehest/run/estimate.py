@@ -33,7 +33,7 @@ from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict
-from vehest.trust.record import Trust, is_elsewhere
+from vehest.trust.record import Trust, is_other_vehicle
 from vehest.trust.verdict import reason_in_words
 
 SUFFIXES = (".parquet", ".csv")
@@ -208,7 +208,7 @@ def estimate_recording(model: Estimator, recording: Recording, downsample: dict[
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
     needed = prepared_recording(model, recording, downsample)
-    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_elsewhere(trust, recording)).estimate
+    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_other_vehicle(trust, recording))
     return require_estimate(model, recording, estimate)
 
 

@@ -26,7 +26,7 @@ from vehest.run.evaluate import COLUMNS, METRICS, EvaluateJob, measured_range, t
 from vehest.run.faults import FaultSettings
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, inject, is_fault
-from vehest.trust.record import is_elsewhere, read_trust
+from vehest.trust.record import is_other_vehicle, read_trust
 
 VERSION = "1"
 
@@ -125,8 +125,8 @@ class _Ranges:
     def _estimated(self, recording: Recording, fault: Fault, state: Mapping[str, float] | None) -> Estimate:
         """The estimate of a recording one of whose channels is faulty, under the contract that holds online."""
         samples = inject(recording.channels, recording.rate_hz, fault)
-        elsewhere = self.elsewhere or is_elsewhere(self.trust, recording)
-        return estimate_guarded(self.estimator, samples, recording, self.trust, state, elsewhere=elsewhere).estimate
+        elsewhere = self.elsewhere or is_other_vehicle(self.trust, recording)
+        return estimate_guarded(self.estimator, samples, recording, self.trust, state, elsewhere=elsewhere)
 
     def _scored(self, estimates: Sequence[Estimate]) -> list[Scored]:
         return score_all(estimates.__getitem__, self.spans, self.reference, self.protocol)

@@ -1,4 +1,4 @@
-"""Vector autoregression: what the next sample of several channels is expected to be, and by how much it differs.
+"""Vector autoregression: predicts the next sample of several channels; its errors are the innovations.
 
     y_k = c + A₁ y_{k-1} + … + A_p y_{k-p} + ε_k,  ε ~ N(0, S)
 
@@ -25,17 +25,11 @@ ROWS_A_NUMBER = 4  # samples that each coefficient needs at least
 
 @dataclass(frozen=True, eq=False)
 class Autoregression:
-    """A fitted model.
+    """A fitted vector autoregression."""
 
-    Args:
-        constant: c, (C,).
-        coefficients: A₁ to A_p, (p, C, C).
-        covariance: S, (C, C).
-    """
-
-    constant: FloatArray
-    coefficients: FloatArray
-    covariance: FloatArray
+    constant: FloatArray  # c, (C,)
+    coefficients: FloatArray  # A₁ to A_p, (p, C, C)
+    covariance: FloatArray  # S, (C, C)
 
     @property
     def order(self) -> int:
@@ -51,27 +45,12 @@ class Autoregression:
                 found[self.order :] -= samples[self.order - lag : len(samples) - lag] @ coefficient.T
         return found
 
-    def filtered(self, signature: FloatArray) -> FloatArray:
-        """How a signature that is added to the samples shows in the innovations, (T, C): the same filter without the constant.
-
-        Args:
-            signature: faulty less healthy samples, (T, C); zero before its first row.
-        """
-        found = np.array(signature, dtype=np.float64)
-        for lag, coefficient in enumerate(self.coefficients, start=1):
-            found[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T
-        return found
-
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows and keep the one with the least BIC.
-
-    Args:
-        pieces: uninterrupted stretches, (T, C) each; rows that hold NaN are left out, with those that they are needed for.
-        max_order: highest p.
+    """Fit orders 1 to ``max_order`` to the same rows of uninterrupted stretches, (T, C) each, and keep the one with the least BIC.
 
     Raises:
-        DataError: there are too few samples.
+        DataError: there are too few samples without NaN.
     """
     n_channels = pieces[0].shape[1]
     regressors, targets = _rows(pieces, max_order)
@@ -126,30 +105,14 @@ def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) ->
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevels:
-    """How large innovations are at a speed, in their standard deviations over all of training.
+    """How large innovations are at a speed, in their standard deviations over all of training."""
 
-    Args:
-        speeds: (L,), rising.
-        factors: (L, C); between the speeds by straight lines, constant outside.
-    """
-
-    speeds: FloatArray
-    factors: FloatArray
-
-    def at(self, speed: FloatArray) -> FloatArray:
-        """Factors at |speed|, (T, C)."""
-        return np.stack([np.interp(np.abs(speed), self.speeds, column) for column in self.factors.T], axis=1)
+    speeds: FloatArray  # (L,), rising
+    factors: FloatArray  # (L, C); between the speeds by straight lines, constant outside
 
 
 def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int) -> NoiseLevels:
-    """Root mean squares, outliers cut off, in as many bins of speed with equal numbers of samples.
-
-    Args:
-        innovations: (T, C); rows with NaN do not count.
-        covariance: of the innovations, (C, C).
-        speed: at the same samples, (T,).
-        n_levels: number of bins.
-    """
+    """Root mean squares of innovations (T, C), outliers cut off, in bins of speed (T,) with equal numbers of samples."""
     known = np.isfinite(innovations).all(1) & np.isfinite(speed)
     own, speed = innovations[known] / np.sqrt(np.diag(covariance)), np.abs(speed[known])
     bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)

@@ -1,10 +1,12 @@
-"""Calibrated bands: how far an estimate of v and β may be off, at stated levels, for any family.
+"""Calibrated half widths of v and β at stated levels, for any family of estimators.
+
+    training ranges -> scale s, domain; validation ranges -> factors q; Bands (trust.yaml) -> band_rows -> half widths
 
     half width at level p = q_p · s(x) · w(x)
 
-s is a local scale that training ranges give: s² is a combination, with weights that are not negative, of what the estimator reads at the
+s is a local scale that training ranges give: s² is a combination, with weights that are not negative, of the estimator's inputs at the
 instant and of its estimate; of a filter s² = a (P + floor²) with its own variance P. q_p is the level's quantile of |error|/(s w) on
-validation ranges, each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens where training has not been.
+validation ranges, each turn or manoeuvre counting once (split conformal, blocked). w ≥ 1 widens outside the training's domain.
 
 The rule of w was fixed before any of its effects was looked at: with m the 99.9th percentile of |f| in training, w is the largest of
 1 + max(0, |f| - m)/m over the features f, times 2 on a car or tyre other than those calibrated on.
@@ -19,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,14 +41,14 @@ TURN_YAW_RATE = 0.05  # rad/s
 LEAST_BLOCK_SECONDS = 2.0
 
 DOMAIN_QUANTILE = 0.999
-ELSEWHERE = 2.0  # by which a band is wider on another car or tyre
-LOWEST_SPEED = 1.0  # m/s, below which an error of v says no more of β
+OTHER_VEHICLE = 2.0  # by which a band is wider on another car or tyre
+LOWEST_SPEED = 1.0  # m/s, below which β is not resolved
 LEAST_SCALE = 0.1  # of the root mean square error in training: the scale's floor
 FITS = 20  # of the scale, each with the weights that the last one gives
 
 COLUMNS = ("vx", "ax", "ay", "yaw_rate", "steer")
 TERMS = ("variance", "one", "vx", "ax", "ay", "yaw_rate_vx", "steer_vx", "vy")
-"""What s² is made of: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over vx². ``variance`` is P."""
+"""Terms of s²: P, 1, vx², ax², ay², (r vx)², (δ vx)², v̂², of those that are there; for β each over vx². ``variance`` is P."""
 
 _FIRST_FEATURE = TERMS.index("vx")  # from which on terms have a domain
 _HEAD = 5  # numbers before the weights in a `PackedBands`
@@ -56,21 +58,13 @@ Blocks = Literal["range", "turn"]
 
 @dataclass(frozen=True)
 class Quantity:
-    """The band of one quantity.
+    """The band of one quantity."""
 
-    Args:
-        weights: term -> its weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]; the others have none.
-        floor: s is never below [m/s, or rad].
-        factors: q of each level.
-        beyond: of each level, whether there are too few blocks for it (`pooled_quantile`).
-        effective_blocks: how many equal blocks the squared scores are spread over (Kish 1965).
-    """
-
-    weights: dict[str, float]
-    floor: float
-    factors: tuple[float, ...]
-    beyond: tuple[bool, ...]
-    effective_blocks: float
+    weights: dict[str, float]  # term -> weight in s² [m²/s² for v and rad² m²/s² for β, per square of the term's unit]
+    floor: float  # s is never below [m/s, or rad]
+    factors: tuple[float, ...]  # q of each level
+    beyond: tuple[bool, ...]  # of each level, whether there are too few blocks for it (`pooled_quantile`)
+    effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.weights if name not in TERMS]
@@ -90,112 +84,65 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Bands:
-    """Half widths of v and β of one model.
+    """Half widths of v and β of one model."""
 
-    Args:
-        vehicles: that were driven where it was calibrated.
-        datasets: whose recordings these are.
-        scaled_on: ranges that gave scale and domain.
-        calibrated_on: ranges that gave the factors.
-        blocks: what a block is: a ``range``, or a stretch from ``turn`` to turn.
-        n_blocks: how many there are.
-        seconds: that were calibrated on [s].
-        channels: that the model reads, the columns of its rows.
-        horizon_steps: sampling intervals that its estimate lies ahead of the sample.
-        largest: term -> the 99.9th percentile of its size in training.
-        vy: the band of v.
-        sideslip: the band of β.
-    """
-
-    vehicles: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scaled_on: tuple[str, ...]
-    calibrated_on: tuple[str, ...]
-    blocks: Blocks
-    n_blocks: int
-    seconds: float
-    channels: tuple[str, ...]
-    horizon_steps: int
-    largest: dict[str, float]
-    vy: Quantity
-    sideslip: Quantity
+    vehicles: tuple[str, ...]  # that were driven where it was calibrated
+    datasets: tuple[str, ...]  # whose recordings these are
+    scaled_on: tuple[str, ...]  # ranges that gave scale and domain
+    calibrated_on: tuple[str, ...]  # ranges that gave the factors
+    blocks: Blocks  # what a block is: a ``range``, or a stretch from ``turn`` to turn
+    n_blocks: int  # how many there are
+    seconds: float  # that were calibrated on [s]
+    channels: tuple[str, ...]  # that the model reads, the columns of its rows
+    horizon_steps: int  # sampling intervals that its estimate lies ahead of the sample
+    largest: dict[str, float]  # term -> the 99.9th percentile of its size in training
+    vy: Quantity  # the band of v
+    sideslip: Quantity  # the band of β
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.largest if name not in TERMS]
         if unknown or min(self.largest.values(), default=0.0) < 0:
             raise DataError(f"largest must name sizes of: {', '.join(TERMS)}")
 
-    def packed(self, level: float = SHOWN_LEVEL, *, elsewhere: bool = False) -> PackedBands:
-        """What `band_rows` takes.
-
-        Args:
-            level: one of `LEVELS`.
-            elsewhere: whether the car or its tyres are others than those calibrated on.
-
-        Raises:
-            DataError: there is no such level.
-        """
-        if level not in LEVELS:
-            raise DataError(f"bands have no level {level}, only {', '.join(map(str, LEVELS))}")
-        which, wider = LEVELS.index(level), ELSEWHERE if elsewhere else 1.0
+    def packed(self, *, elsewhere: bool = False) -> PackedBands:
+        """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
+        which, wider = LEVELS.index(SHOWN_LEVEL), OTHER_VEHICLE if elsewhere else 1.0
         head = [self.vy.factors[which] * wider, self.sideslip.factors[which] * wider, self.vy.floor**2, self.sideslip.floor**2]
         weights = [own.weights.get(name, 0.0) for own in (self.vy, self.sideslip) for name in TERMS]
         numbers = np.array([*head, LOWEST_SPEED, *weights, *(self.largest.get(name, 0.0) for name in TERMS)])
         return PackedBands(_columns(self.channels), numbers)
 
     def half_widths(self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False) -> FloatArray:
-        """Half widths of all levels.
+        """Half widths of all levels, (T, 2, L): v [m/s] and β [rad]; NaN where there is no estimate. Arguments as of `band_rows`.
 
-        Args:
-            rows: what the model reads, (T, C), in the order of ``channels``; NaN was not measured and counts as the training's largest.
-            vy: estimate that was made of it, (T,) [m/s].
-            variance: of its error as the method gives it, (T,) [m²/s²]; NaN where it gives none.
-            elsewhere: as in `packed`.
-
-        Returns:
-            (T, 2, L): v [m/s] and β [rad]; NaN where there is no estimate.
+        NaN in ``rows`` was not measured and counts as the training's largest.
         """
         terms = terms_of(rows, vy, variance, _columns(self.channels))
         largest = np.array([self.largest.get(name, 0.0) for name in TERMS])
         terms = np.where(np.isfinite(terms), terms, largest)
-        wider = _widening(terms, largest) * (ELSEWHERE if elsewhere else 1.0)
-        speed = (
-            np.maximum(np.abs(rows[:, self.channels.index("vx")]), LOWEST_SPEED) if "vx" in self.channels else np.full(len(rows), np.nan)
-        )
-        scales = [_scale(terms, self.vy), _scale(terms / speed[:, None], self.sideslip)]
-        half = np.stack(
-            [(scale * wider)[:, None] * np.array(own.factors) for scale, own in zip(scales, (self.vy, self.sideslip), strict=True)], 1
-        )
+        wider = _widening(terms, largest) * (OTHER_VEHICLE if elsewhere else 1.0)
+        speed = np.abs(rows[:, self.channels.index("vx")]) if "vx" in self.channels else np.full(len(rows), np.nan)
+        in_sideslip = terms / np.maximum(speed, LOWEST_SPEED)[:, None]
+        scales = np.stack([_scale(terms, self.vy), _scale(in_sideslip, self.sideslip)], 1)
+        half = (scales * wider[:, None])[:, :, None] * np.array([self.vy.factors, self.sideslip.factors])
         half[:, 1] = np.where(half[:, 1] < math.pi, half[:, 1], math.pi)  # without a speed, too
         half[~np.isfinite(vy)] = np.nan
-        return np.asarray(half)
+        return half
 
 
-@dataclass(frozen=True, eq=False)
-class PackedBands:
-    """A level's band as `band_rows` takes it.
+class PackedBands(NamedTuple):
+    """A level's band as `band_rows` takes it."""
 
-    Args:
-        columns: where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,).
-        numbers: factors and squared floors of v and β, lowest speed, weights of `TERMS` for v and for β, their largest sizes, (29,).
-    """
-
-    columns: NDArray[np.int64]
-    numbers: FloatArray
+    columns: NDArray[np.int64]  # where `COLUMNS` stand among the model's channels, -1 where it does not read one, (5,)
+    numbers: FloatArray  # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their largest sizes, (29,)
 
 
 def half_widths_of_rows(
     rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64], numbers: FloatArray, bands: FloatArray
 ) -> None:
-    """Half widths of one level, sample by sample, as `Bands.half_widths` says.
+    """``bands`` of one level, (T, 2), v [m/s] and β [rad], of inputs (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
 
-    Args:
-        rows: what the model reads, (T, C).
-        vy: estimate, (T,) [m/s].
-        variance: of its error, (T,) [m²/s²]; NaN where the method gives none.
-        columns: of `PackedBands`.
-        numbers: of `PackedBands`.
-        bands: output, (T, 2): v [m/s] and β [rad].
+    ``columns`` and ``numbers`` are of `PackedBands`; the same numbers as `Bands.half_widths`, sample by sample.
     """
     n_terms = (len(numbers) - _HEAD) // 3
     terms = np.empty(n_terms)
@@ -232,20 +179,14 @@ band_rows = entry(nogil=True)(half_widths_of_rows)
 
 
 def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
-    """An estimate with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad].
-
-    Args:
-        estimate: of ``measured``, on its clock.
-        measured: what the model has seen.
-        bands: of the model.
-        elsewhere: whether the car or its tyres are others than those calibrated on.
+    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad].
 
     Raises:
         DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
     """
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     found, packed = np.empty((len(vy), 2)), bands.packed(elsewhere=elsewhere)
-    band_rows(rows, vy, variance, packed.columns, packed.numbers, found)
+    band_rows(rows, vy, variance, *packed, found)
     own = {"band_vy": found[:, 0].copy(), "band_sideslip": found[:, 1].copy()}
     return replace(estimate, channels={**estimate.channels, **own})
 
@@ -255,7 +196,7 @@ def band_inputs(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them.
 
-    A row is the last sample that the estimate was made of, so that what runs online sees the same.
+    A row is the last sample that the estimate was made of, so that online they are the same.
 
     Raises:
         DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
@@ -300,25 +241,15 @@ def _scale(terms: FloatArray, own: Quantity) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A range with its estimate, as bands are learnt from it; arrays of T samples.
+    """A range with its estimate, as bands are learnt from it; arrays of T samples."""
 
-    Args:
-        rows: what the model reads, (T, C).
-        vy: estimate, (T,) [m/s].
-        variance: of its error, (T,) [m²/s²], NaN where there is none.
-        error_vy: v̂ - v, (T,) [m/s]; NaN where either is not known, or nothing is to be learnt from.
-        error_sideslip: β̂ - β, (T,) [rad]; likewise.
-        yaw_rate: measured, (T,) [rad/s]; None if it was not.
-        rate_hz: of the samples [Hz].
-    """
-
-    rows: FloatArray
-    vy: FloatArray
-    variance: FloatArray
-    error_vy: FloatArray
-    error_sideslip: FloatArray
-    yaw_rate: FloatArray | None
-    rate_hz: float
+    rows: FloatArray  # inputs of the model, (T, C)
+    vy: FloatArray  # estimate, (T,) [m/s]
+    variance: FloatArray  # of its error, (T,) [m²/s²], NaN where there is none
+    error_vy: FloatArray  # v̂ - v, (T,) [m/s]; NaN where either is not known, or nothing is to be learnt from
+    error_sideslip: FloatArray  # β̂ - β, (T,) [rad]; likewise
+    yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
+    rate_hz: float  # of the samples [Hz]
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -328,7 +259,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Origin:
-    """Where bands come from and whose they are; see `Bands`."""
+    """Origin of bands; see `Bands`."""
 
     vehicles: tuple[str, ...]
     datasets: tuple[str, ...]
@@ -339,12 +270,7 @@ class Origin:
 
 
 def calibrated(training: Sequence[Piece], validation: Sequence[Piece], origin: Origin) -> Bands:
-    """Bands of a model: scale and domain from training ranges, factors from validation ranges.
-
-    Args:
-        training: ranges that the model learnt from, or would have.
-        validation: ranges that it has not learnt from.
-        origin: what they are.
+    """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
 
     Raises:
         DataError: there is no sample whose error is known, in one of the two.
@@ -363,15 +289,10 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], origin: O
     labels, kind = block_labels([piece.yaw_rate for piece in validation], [len(piece.vy) for piece in validation], validation[0].rate_hz)
     blocks = np.concatenate(labels)[np.concatenate([piece.known for piece in validation])]
     bands = Bands(
-        vehicles=origin.vehicles,
-        datasets=origin.datasets,
-        scaled_on=origin.scaled_on,
-        calibrated_on=origin.calibrated_on,
+        **vars(origin),
         blocks=kind,
         n_blocks=len(np.unique(blocks)),
         seconds=len(blocks) / validation[0].rate_hz,
-        channels=origin.channels,
-        horizon_steps=origin.horizon_steps,
         largest={name: float(size) for name, size in zip(TERMS, largest, strict=True) if size > 0 and name != "one"},
         vy=vy,
         sideslip=sideslip,
@@ -420,12 +341,8 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
     Iterated least squares, each sample weighted by 1/s⁴ of the last fit: the quasi-likelihood of squares whose standard deviation is
     proportional to their mean, as that of Gaussian errors is (McCullagh & Nelder 1989, Section 9.2).
 
-    Args:
-        terms: f, (N, J).
-        errors: (N,).
-
     Returns:
-        c, (J,), and the floor of s.
+        c, (J,), of terms f, (N, J), and errors (N,); and the floor of s.
     """
     squares, targets = np.square(terms), np.square(errors)
     mean = float(targets.mean())
@@ -447,17 +364,13 @@ def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float)
     """The level's quantile of scores pooled over K blocks, each of the same weight, with 1/(n + 1) of the weight at infinity.
 
     n is how many independent scores there are as to the level: N/(1 + (m - 1) ρ) of N scores in blocks of m on average, ρ the intraclass
-    correlation of "below the quantile". If blocks say all (ρ = 1) n is K, and a further block, exchangeable with these, has on average at
-    least the level of its scores below (Lee, Barber & Willett 2023). If they say nothing n is N, as in split conformal prediction. In
-    between the level is met on average, nearly: what is left of the guarantee would otherwise make bands of few blocks far too wide.
-
-    Args:
-        scores: (N,), none negative.
-        blocks: which block each belongs to, (N,).
-        level: between 0 and 1.
+    correlation of "below the quantile". If scores of a block agree (ρ = 1) n is K, and a further block, exchangeable with these, has on
+    average at least the level of its scores below (Lee, Barber & Willett 2023). If they are independent n is N, as in split conformal
+    prediction. In between the level is met on average, nearly: the rest of the guarantee would make bands of few blocks far too wide.
 
     Returns:
-        The quantile; and whether n is too small for the level, where by rule it is the largest score times 1 + 1/n.
+        The quantile of scores (N,), none negative, in blocks (N,); and whether n is too small for the level, where by rule it is the
+        largest score times 1 + 1/n.
 
     Source: Dunn, Wasserman & Ramdas 2023 (pooling); Kish, Survey Sampling, 1965, Section 5.4 (design effect).
     """
@@ -477,14 +390,9 @@ def pooled_quantile(scores: FloatArray, blocks: NDArray[np.int64], level: float)
 
 
 def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> float:
-    """How alike values of one group are, one-way analysis of variance: 0 where a group says nothing, 1 where it says all.
+    """Intraclass correlation of values (N,) in groups (N,), by one-way analysis of variance: 1 where a group's values are equal.
 
-    Args:
-        values: (N,).
-        labels: group of each, (N,).
-
-    Returns:
-        NaN where there are fewer than two groups, or no group has two.
+    NaN where there are fewer than two groups, or no group has two.
 
     Source: Donner, A review of inference procedures for the intraclass correlation coefficient in the one-way random effects model,
     International Statistical Review 54 (1), 1986, for groups of unlike sizes.
@@ -504,10 +412,7 @@ def intraclass_correlation(values: FloatArray, labels: NDArray[np.int64]) -> flo
 def block_labels(yaw_rates: Sequence[FloatArray | None], lengths: Sequence[int], rate_hz: float) -> tuple[list[NDArray[np.int64]], Blocks]:
     """Block that each sample of some ranges belongs to, counted through: a range each if there are 10, else from turn to turn.
 
-    Args:
-        yaw_rates: of each range [rad/s]; without it a range is one block.
-        lengths: samples of each range.
-        rate_hz: of the samples [Hz].
+    A range without yaw rate [rad/s] is one block.
     """
     found, count = [], 0
     kind: Blocks = "range" if len(lengths) >= LEAST_PIECES else "turn"

@@ -1,16 +1,14 @@
-"""The contract of every estimator that runs along with a drive, whatever its family.
+"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`estimate_guarded`), by the same compiled recursions.
 
-What is received goes through `vehest.trust.guard`, what is estimated through `vehest.trust.watch`:
+    received rows -> guard -> health -> estimator -> watch -> verdict, bands -> estimate
 
 1. Values that are not finite, beyond physics, jumping or standing still count as not measured, and so do samples that are missing.
 2. Gaps up to 0.5 s are bridged; after longer ones the estimator starts anew.
 3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
 4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
    the fault is over (`vehest.trust.verdict`).
-5. The estimate stays within what the last believed speed allows. One that does not for 0.3 s, is not finite or raises starts anew, and
-   takes states that adapt, such as tyres, back to what they were fitted to.
-
-`GuardedStepper` holds it online, `estimate_guarded` for a recording: both by the same compiled recursions, so that they agree.
+5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, is not finite or raises starts anew,
+   with adapting states, such as tyres, at their fitted values.
 """
 
 from __future__ import annotations
@@ -18,11 +16,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -31,36 +27,22 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, Stepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
+from vehest.trust.health import Health
 from vehest.trust.monitor import Monitor
 from vehest.trust.record import Trust
-from vehest.trust.verdict import Verdict, starts_anew
+from vehest.trust.verdict import starts_anew
 from vehest.trust.watch import Watch, Watched
 
 FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
-"""What an estimator may end in on samples that mean nothing to it; it then starts anew."""
+"""Failures of an estimator on senseless samples; it then starts anew."""
 
 MOTION = ("vx", "yaw_rate", "ay")
 RATE_INTERVALS, RATE_TOLERANCE = 20, 0.2
-"""After how many intervals, and from what share on, a clock is said not to be the estimator's."""
-
-
-@dataclass(frozen=True, eq=False)
-class Guarded:
-    """An estimate that kept the contract, and what it took.
-
-    Args:
-        estimate: on the recording's clock.
-        cleaned: what the estimator saw of each row.
-        marks: of `vehest.trust.watch` for each row, (T,).
-    """
-
-    estimate: Estimate
-    cleaned: Cleaned
-    marks: NDArray[np.int8]
+"""Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
 
 
 def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
-    """The limits that were learnt with an estimator, or those of any car."""
+    """The limits learnt with an estimator, or those of any car."""
     own = trust.guard if trust is not None else None
     return own or usual_limits(estimator.channels, estimator.settings.rate_hz)
 
@@ -73,19 +55,19 @@ def estimate_guarded(
     initial_state: Mapping[str, float] | None = None,
     *,
     elsewhere: bool = False,
-) -> Guarded:
+) -> Estimate:
     """Estimate a recording under the contract.
 
     Args:
         estimator: fitted.
         samples: channels that it reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
-        recording: whose clock, name and vehicle it is; its own samples do not count.
+        recording: its clock, name and vehicle are used, its samples are not.
         trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        initial_state: that a protocol hands over at the first sample.
+        initial_state: of a protocol, at the first sample.
         elsewhere: whether the car or its tyres are others than those that were calibrated on.
 
     Returns:
-        Its estimate has ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
+        ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
 
     Raises:
         DataError: a channel is missing.
@@ -105,7 +87,7 @@ def estimate_guarded(
 
 
 class _Run:
-    """A recording's way through an estimator, piece by piece between its starts."""
+    """Estimates a recording piece by piece between the estimator's starts."""
 
     def __init__(
         self, estimator: Estimator, recording: Recording, cleaned: Cleaned, watch: Watch, initial_state: Mapping[str, float] | None
@@ -161,7 +143,7 @@ class _Run:
         return done, watched.lost
 
     def _raw(self, start: int, end: int) -> FloatArray:
-        """What the estimator says after each row of a piece that it begins anew, (T,)."""
+        """The estimator's v after each row of a piece that it begins anew, (T,)."""
         extra = self.horizon  # rows after the last, whose values no estimate at their time depends on
         rows = np.concatenate([self.cleaned.rows[start:end], np.repeat(self.cleaned.rows[end - 1 : end], extra, axis=0)])
         channels = dict(zip(self.estimator.channels, rows.T, strict=True))
@@ -205,8 +187,8 @@ class _Run:
             self.variance[k] = found.get("vy_variance", math.nan)
         return raw
 
-    def outcome(self, monitor: Monitor, verdict: Verdict) -> Guarded:
-        """The estimate on the recording's clock: what was said after row k holds ``horizon`` samples later, health at once."""
+    def outcome(self, monitor: Monitor, verdict: Health) -> Estimate:
+        """The estimate on the recording's clock: that after row k holds ``horizon`` samples later, its health at once."""
         vx = np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])
         vx = np.where(np.isnan(vx), held(vx), vx)
         bands = monitor.after(verdict, Watched(self.out, self.marks, len(self.out), lost=False), self.cleaned, vx, self.variance)
@@ -223,20 +205,17 @@ class _Run:
         r = self.recording
         clock = (self.estimator.settings.rate_hz, r.start_time)
         covariance = (self.covariance, self.covariance_of) if self.covariance is not None and self.horizon == 0 else (None, ())
-        estimate = Estimate(r.id, self.estimator.name, *clock, channels, mode, *covariance)
-        return Guarded(estimate, self.cleaned, self.marks)
+        return Estimate(r.id, self.estimator.name, *clock, channels, mode, *covariance)
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
-    """Believed `MOTION` of each row, (T, 3); NaN what is not known. What is bridged counts as known."""
-    columns = []
-    for name in MOTION:
+    """Accepted `MOTION` of each row, (T, 3), bridged values included; NaN if unknown."""
+    motion = np.full((len(cleaned.rows), len(MOTION)), np.nan)
+    for column, name in enumerate(MOTION):
         if name in channels:
             at = channels.index(name)
-            columns.append(np.where(cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan))
-        else:
-            columns.append(np.full(len(cleaned.rows), np.nan))
-    return np.stack(columns, axis=1)
+            motion[:, column] = np.where(cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan)
+    return motion
 
 
 def held(values: FloatArray) -> FloatArray:
@@ -294,11 +273,11 @@ class GuardedStepper(Stepper):
         return self._front.delay if self._front is not None else 0.0
 
     def step(self, sample: Mapping[str, Any] | None, time: float | None = None) -> dict[str, float]:
-        """Take what was received at one instant.
+        """Take the sample received at one instant.
 
         Args:
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
-            time: of the sample [s], where it is known: samples that are repeated are passed over, those that are missing bridged.
+            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged.
 
         Returns:
             ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
@@ -341,14 +320,14 @@ class GuardedStepper(Stepper):
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
-        said = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
+        found = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
         if self._monitor.has_bands:
-            said["band_vy"], said["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
-        said["health"], said["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
-        return said
+            found["band_vy"], found["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
+        found["health"], found["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])
+        return found
 
     def _estimated(self, cleaned: Cleaned) -> tuple[float, float, float, bool]:
-        """What the estimator says of a row: v, its own vx, the variance of v's error, and whether it failed."""
+        """The estimator on a row: v, its own vx, the variance of v's error, and whether it failed."""
         flow = cleaned.flow[0]
         self._others = {}
         if flow == WAIT:
@@ -365,37 +344,32 @@ class GuardedStepper(Stepper):
 
 
 class _Clock:
-    """Times of samples: which are repeated, how many are missing, and whether their rate is the one that was said."""
+    """Times of samples: finds repeated and missing ones, and warns once of another rate."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._rate = rate_hz
-        self._last = math.nan
+        self._rate, self._last = rate_hz, math.nan
         self._gaps: list[float] = []
-        self._said = False
 
     def skipped(self, time: float) -> int:
         """Samples that are missing before this one; -1 if it is a repeated one."""
+        gap = time - self._last
         if math.isnan(self._last):
             self._last = time
             return 0
-        gap = time - self._last
-        if gap <= 0.5 / self._rate and gap > -1.0:
-            self._note(gap)
+        self._note(gap)
+        if -1.0 < gap <= 0.5 / self._rate:
             return -1
         self._last = time
-        self._note(gap)
         return max(round(gap * self._rate) - 1, 0) if math.isfinite(gap) and gap > 0 else 0
 
     def _note(self, gap: float) -> None:
-        if self._said or len(self._gaps) > RATE_INTERVALS:
+        if len(self._gaps) == RATE_INTERVALS:
             return
         self._gaps.append(gap)
-        if len(self._gaps) == RATE_INTERVALS:
-            middle = float(np.median(self._gaps))
-            if middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
-                self._said = True
-                found = f"{1.0 / middle:.3g}"
-                warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
+        middle = float(np.median(self._gaps))
+        if len(self._gaps) == RATE_INTERVALS and middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
+            found = f"{1.0 / middle:.3g}"
+            warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
 
 
 def _number(value: Any) -> float:

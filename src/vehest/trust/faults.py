@@ -1,26 +1,10 @@
-"""Faults of sensors, injected into the channels of any recording: 16 kinds at three severities.
+"""Injects faults of sensors, wiring or decoding into a channel of a recording: 16 kinds at three severities.
 
-What a channel would have held goes in, what a broken sensor, its wiring or its decoding makes of it comes out. Everything that is drawn
-comes from the fault's seed. Sizes are round numbers of engineering judgement, from what a driver would not notice to what no car does, and
-were set before the error of any estimator under them was looked at.
+    samples + Fault -> FaultedChannel -> samples with the fault
 
-| kind | what becomes of the channel while the fault lasts | a severity, or a size of one's own, says |
-| `bias` | a constant is added | the constant [unit] |
-| `drift` | a ramp is added that starts at 0 | its slope [unit/s] |
-| `scale` | multiplied by 1 + size | the size |
-| `frozen` | stays at its last value | for which share of the duration, from its start on |
-| `dropout` | 0 | for which share, in pieces of 0.2 s |
-| `spikes` | a constant is added to, or taken from, 2 % of the samples, one at a time | the constant [unit] |
-| `noise` | white Gaussian noise is added | its standard deviation [unit] |
-| `delay` | comes late | how late [s], at least one sample |
-| `saturation` | clipped | at which share of the largest size that it would have had meanwhile |
-| `sign` | of the wrong sign | for which share of the duration, from its start on |
-| `unit` | in another unit, `UNIT_FACTORS` | the factor |
-| `nan` | NaN | for which share, in pieces of 0.2 s |
-| `inf` | infinite, of either sign | for which share of the samples, at least one |
-| `huge` | finite and beyond physics, of either sign, in 5 % of the samples | how many times its physical range |
-| `held` | sampled and held | for how long [s], at least two samples |
-| `lost_wheel` | drops out (NaN), spins up or locks within 0.2 s | by which factor the speed changes |
+All random numbers come from the fault's seed. Sizes are round numbers of engineering judgement, from faults that a driver would not notice
+to those of no car, and were set before the error of any estimator under them was looked at;
+docs/trust.md, "Kinds and sizes", is the table of all of them.
 """
 
 from __future__ import annotations
@@ -45,22 +29,18 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 Sizes = tuple[float, float, float]
 
 DEGREE = math.pi / 180.0
-PIECE_SECONDS = 0.2  # of what is lost in pieces
+PIECE_SECONDS = 0.2  # of losses in pieces
 LOSS_SECONDS = 0.2  # until a wheel is locked or spins
 SPIKE_SHARE, HUGE_SHARE = 0.02, 0.05  # of the samples
 STEERING_RATIO = 15.0  # handwheel per road wheel, of a usual passenger car
 
 OFFSETS: dict[str, Sizes] = {
     "vx": (0.5, 2.0, 5.0),
-    "yaw_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
-    "roll_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
-    "pitch_rate": (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE),
+    **dict.fromkeys(("yaw_rate", "roll_rate", "pitch_rate"), (0.7 * DEGREE, 3.0 * DEGREE, 10.0 * DEGREE)),
     "ax": (0.3, 1.0, 3.0),
     "ay": (0.3, 1.0, 3.0),
-    "steer": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
+    **dict.fromkeys(("steer", "roll", "pitch"), (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE)),
     "handwheel": (0.5 * DEGREE * STEERING_RATIO, 2.0 * DEGREE * STEERING_RATIO, 6.0 * DEGREE * STEERING_RATIO),
-    "roll": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
-    "pitch": (0.5 * DEGREE, 2.0 * DEGREE, 6.0 * DEGREE),
 }
 """Channel -> mild, medium and severe offset [unit of the channel]."""
 
@@ -74,17 +54,17 @@ TIMES_OFFSET: dict[str, float] = {"bias": 1.0, "drift": 0.1, "spikes": 10.0, "no
 """Kind whose size goes by the channel's offsets -> multiple of them; a drift reaches the offset in 10 s."""
 
 SIZES: dict[str, Sizes] = {
-    "scale": (0.05, 0.2, 0.5),
-    "frozen": (0.1, 0.5, 1.0),
-    "dropout": (0.1, 0.5, 1.0),
-    "delay": (0.05, 0.2, 0.5),
-    "saturation": (0.8, 0.5, 0.2),
-    "sign": (0.1, 0.5, 1.0),
-    "nan": (0.1, 0.5, 1.0),
-    "inf": (0.01, 0.1, 1.0),
-    "huge": (10.0, 1e4, 1e200),
-    "held": (0.1, 0.25, 0.5),
-    "lost_wheel": (math.nan, 1.5, 0.0),
+    "scale": (0.05, 0.2, 0.5),  # factor less 1
+    "frozen": (0.1, 0.5, 1.0),  # share of the duration, from its start on
+    "dropout": (0.1, 0.5, 1.0),  # share of the samples, in pieces
+    "delay": (0.05, 0.2, 0.5),  # s, at least one sample
+    "saturation": (0.8, 0.5, 0.2),  # share of the channel's largest size
+    "sign": (0.1, 0.5, 1.0),  # share of the duration, from its start on
+    "nan": (0.1, 0.5, 1.0),  # share of the samples, in pieces
+    "inf": (0.01, 0.1, 1.0),  # share of the samples, at least one
+    "huge": (10.0, 1e4, 1e200),  # times the channel's physical range
+    "held": (0.1, 0.25, 0.5),  # s, at least two samples
+    "lost_wheel": (math.nan, 1.5, 0.0),  # factor of the speed; NaN: drops out
 }
 """Kind -> mild, medium and severe size, for every channel."""
 
@@ -101,53 +81,25 @@ converted once too often, degrees; kPa, bar, and bar converted once too often.""
 WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
 """The same of wheels and motor: turns a second, turns a minute converted once too often, turns a minute."""
 
-KINDS = (
-    "bias",
-    "drift",
-    "scale",
-    "frozen",
-    "dropout",
-    "spikes",
-    "noise",
-    "delay",
-    "saturation",
-    "sign",
-    "unit",
-    "nan",
-    "inf",
-    "huge",
-    "held",
-    "lost_wheel",
-)
-
 SHARES = ("frozen", "dropout", "sign", "nan", "inf", "saturation")
 POSITIVE = ("noise", "delay", "huge", "held")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong with one channel, and when.
-
-    Args:
-        kind: one of `KINDS`.
-        channel: that it befalls; never a reference.
-        severity: which of the sizes in this module.
-        onset: time of its start after the first sample [s].
-        duration: how long it lasts [s]; ``inf``: to the end.
-        seed: of everything that is drawn.
-        size: instead of the severity's, in what the kind's sizes are in; its sign is kept, that of a severity is drawn.
+    """A fault of one channel: kind, size and time.
 
     Raises:
         ConfigurationError: an unknown kind, channel or severity, a kind that makes no sense for the channel, or a number that makes none.
     """
 
-    kind: str
-    channel: str
-    severity: Severity = "medium"
-    onset: float = 0.0
-    duration: float = math.inf
-    seed: int = 0
-    size: float | None = None
+    kind: str  # one of `KINDS`
+    channel: str  # that it befalls; never a reference
+    severity: Severity = "medium"  # which of the sizes in this module
+    onset: float = 0.0  # time of its start after the first sample [s]
+    duration: float = math.inf  # how long it lasts [s]; ``inf``: to the end
+    seed: int = 0  # of everything that is drawn
+    size: float | None = None  # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
 
     def __post_init__(self) -> None:
         _check_choice("kind", self.kind, KINDS)
@@ -169,7 +121,7 @@ class Fault:
 
     @property
     def condition(self) -> str:
-        """``bias:ay:mild``; a size of one's own stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``."""
+        """``bias:ay:mild``; a given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``."""
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
 
@@ -200,10 +152,9 @@ def is_fault(condition: str) -> bool:
 
 
 def applies(kind: str, channel: str) -> bool:
-    """Whether a kind of fault makes sense for a channel.
+    """Whether a kind of fault makes sense for a channel: none for a reference, a wrong sign for channels that have one by convention.
 
-    None does for a reference; a wrong sign for what has one by convention, not for speeds and pressures; a wrong unit for what is written
-    in several; a lost wheel for wheel speeds, and for the forward velocity, which a single wheel may stand for.
+    A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward velocity, which one wheel may measure.
     """
     own = CHANNELS[channel]
     if own.is_reference:
@@ -218,7 +169,7 @@ def applies(kind: str, channel: str) -> bool:
 
 
 def size_of(kind: str, channel: str, severity: Severity) -> float:
-    """Size of a fault, in what the module's table says; of wheels and motor, sizes that are offsets are shares of the largest speed."""
+    """Size of a fault, as in the module's table; offsets of wheels and motor are shares of the largest speed."""
     own, at = CHANNELS[channel], SEVERITIES.index(severity)
     if kind in SIZES:
         return SIZES[kind][at]
@@ -230,15 +181,7 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
 
 
 def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
-    """The same samples with a fault in one channel.
-
-    Args:
-        samples: channel -> (T,), SI units; stays as it is.
-        rate_hz: of the samples [Hz].
-        fault: what goes wrong.
-
-    Returns:
-        Channel -> (T,); the faulted one may hold NaN and infinite values, all others are those that were given.
+    """Samples, channel -> (T,) [SI], with a fault in one channel, which may hold NaN and infinite values then.
 
     Raises:
         ConfigurationError: there is no such channel.
@@ -248,7 +191,7 @@ def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> d
     values = np.array(samples[fault.channel], dtype=np.float64)
     first, end = window(fault, len(values), rate_hz)
     if first < end:
-        values[first:end] = _EFFECTS[fault.kind](_Struck(fault, values.copy(), first, end, rate_hz))
+        values[first:end] = EFFECTS[fault.kind](FaultedChannel(fault, values.copy(), first, end, rate_hz))
     return {**samples, fault.channel: values}
 
 
@@ -259,8 +202,8 @@ def window(fault: Fault, n_samples: int, rate_hz: float) -> tuple[int, int]:
     return first, end
 
 
-class _Struck:
-    """A channel while its fault lasts, and what is drawn for it."""
+class FaultedChannel:
+    """A channel while its fault lasts, with the random draws of the fault."""
 
     def __init__(self, fault: Fault, values: FloatArray, first: int, end: int, rate_hz: float) -> None:
         self.values, self.first, self.end, self.rate_hz = values, first, end, rate_hz
@@ -282,7 +225,7 @@ class _Struck:
         return self.random.choice([-1.0, 1.0], len(self.inside))
 
     def share(self) -> NDArray[np.bool_]:
-        """The first samples, as many as the size says."""
+        """The first samples, a share of the size."""
         return np.arange(len(self.inside)) < max(round(self.size * len(self.inside)), 1)
 
     def singles(self, share: float) -> NDArray[np.bool_]:
@@ -300,31 +243,31 @@ class _Struck:
         return drawn
 
     def earlier(self, samples: int) -> FloatArray:
-        """What the channel was so many samples before; its first value before there was one."""
+        """The channel so many samples before; its first value before that."""
         return self.values[np.maximum(np.arange(self.first, self.end) - samples, 0)]
 
 
-def _frozen(at: _Struck) -> FloatArray:
+def _frozen(at: FaultedChannel) -> FloatArray:
     return np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)
 
 
-def _held(at: _Struck) -> FloatArray:
+def _held(at: FaultedChannel) -> FloatArray:
     samples = max(round(at.size * at.rate_hz), 2)
     return at.inside[np.arange(len(at.inside)) // samples * samples]
 
 
-def _saturation(at: _Struck) -> FloatArray:
+def _saturation(at: FaultedChannel) -> FloatArray:
     limit = at.size * _reach(at.inside)
     return np.clip(at.inside, -limit, limit)
 
 
-def _lost_wheel(at: _Struck) -> FloatArray:
+def _lost_wheel(at: FaultedChannel) -> FloatArray:
     if math.isnan(at.size):
         return np.full_like(at.inside, np.nan)
     return at.inside * (1.0 + (at.size - 1.0) * np.minimum(at.seconds / LOSS_SECONDS, 1.0))
 
 
-_EFFECTS: dict[str, Callable[[_Struck], FloatArray]] = {
+EFFECTS: dict[str, Callable[[FaultedChannel], FloatArray]] = {
     "bias": lambda at: at.inside + at.size,
     "drift": lambda at: at.inside + at.size * at.seconds,
     "scale": lambda at: at.inside * (1.0 + at.size),
@@ -342,6 +285,7 @@ _EFFECTS: dict[str, Callable[[_Struck], FloatArray]] = {
     "held": _held,
     "lost_wheel": _lost_wheel,
 }
+KINDS = tuple(EFFECTS)
 
 
 def _turns(channel: str) -> bool:

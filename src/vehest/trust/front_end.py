@@ -21,15 +21,11 @@ SLACK = 1e-9
 
 
 def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
-    """What channels at the model's rate would look like behind the filter, had they come from a bus `USUAL_RATIO` times as fast.
+    """Channels (T, C) at the model's rate as the filter would pass them from a bus `USUAL_RATIO` times as fast; NaN is bridged.
 
     They are brought to that rate without phase, then filtered causally and thinned out again; the filter starts as in a steady signal.
     What lay above the model's Nyquist frequency is gone in them, and white noise of the density below it takes its place, since some of it
     comes through the filter.
-
-    Args:
-        samples: (T, C); straight lines bridge NaN.
-        rate_hz: of the model [Hz].
     """
     at = np.arange(len(samples))
     known = [np.isfinite(column) for column in samples.T]
@@ -47,23 +43,15 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 
 class FrontEnd:
-    """Believed samples of a bus through a causal low-pass, of which as many are passed on as the estimator's rate asks for.
+    """Accepted samples of a bus through a causal low-pass, of which as many are passed on as the estimator's rate asks for.
 
-    A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. What is not measured holds its last value in the
-    filter, and is passed on as not measured. After longer gaps the filter starts from the first sample that is back.
+    A Butterworth filter of fourth order, cut off at 0.4 of the estimator's rate. A channel that is not measured holds its last
+    value in the filter, and is passed on as not measured. After longer gaps the filter starts from the first sample that is back.
 
-    Args:
-        channels: in the order of the columns.
-        skippable: those that the estimator can do without.
-        limits: of the guard, learnt at the estimator's rate.
-        bus_rate_hz: rate of the samples [Hz].
-        rate_hz: of the estimator [Hz].
+    ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order of the columns.
 
     Raises:
         ConfigurationError: the bus is slower than the estimator.
-
-    Attributes:
-        delay: of slow signals through the filter [s].
     """
 
     def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
@@ -113,12 +101,9 @@ class FrontEnd:
 
 @entry(nogil=True)
 def filter_row(row, sections, state):  # type: ignore[no-untyped-def]
-    """Second-order sections, direct form II transposed, in place; a channel whose state is NaN starts as if its value had always stood.
+    """Second-order sections (S, 6), direct form II transposed, on values (C,), in place; NaN stays.
 
-    Args:
-        row: (C,), replaced by its filtered values; NaN stays.
-        sections: (S, 6), as SciPy has them.
-        state: (S, C, 2).
+    A channel whose ``state``, (S, C, 2), is NaN starts as if its value had always stood.
     """
     for c in range(row.shape[0]):
         x = row[c]

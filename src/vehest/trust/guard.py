@@ -1,10 +1,10 @@
-"""What is believed of a measured sample before an estimator sees it.
+"""Rejects implausible samples before an estimator sees them.
+
+    rows -> Guard -> rows, measured, flow (use, wait, restart)
 
 A value that is not finite, that no car reaches, that jumps further than a car can, or that has stood still for longer than it ever did
 where the estimator learnt counts as not measured. Channels that a method can do without become NaN then; the others hold the last value
-that was believed, for half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels are back.
-
-The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
+that was accepted, for half a second at most. Longer gaps end what the estimator knows: it starts anew when the channels are back.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from vehest.data.recording import Recording
 from vehest.estimators.kernels.compiling import entry
 
 BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
-PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is believed
+PERSISTS_SECONDS = 0.1  # a jump whose new level stands for this long is accepted
 MARGIN = 3.0  # beyond what was seen in training
-LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training says nothing by standing still
+LONGEST_RUN = 5.0  # s; a channel that stands still for longer in training may do so
 LEAST_RUN = 0.3  # s
 STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
 NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
@@ -37,53 +37,40 @@ FASTEST = {"m/s²": 200.0, "rad/s": 15.0, "rad": 15.0, "m/s": 25.0}
 """Unit -> change a second that some road car reaches, the sensors' noise left aside."""
 
 NOISE = {"m/s²": 6.0, "rad/s": 0.5, "rad": 0.1, "m/s": 2.0}
-"""Unit -> what the sensors' noise may add to a change, where nothing was learnt about it."""
+"""Unit -> change by the sensors' noise, where none was learnt."""
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
-"""Starts of names whose ranges and changes differ too much between cars; what they may do has to be learnt."""
+"""Starts of names whose ranges and changes differ too much between cars; their limits have to be learnt."""
 
 STEERING = ("steer", "handwheel")
-"""Channels with stops: at its lock, a steering that stands still says nothing."""
+"""Channels with stops: at its lock, a steering may stand still."""
 
 ENDLESS = 1e300  # stops of channels that have none
 
 STANDSTILL_SPEED, STANDSTILL_YAW_RATE = 0.5, 0.05  # m/s, rad/s: below both, nothing is expected to move
 
 USE, WAIT, RESTART = 0, 1, 2
-"""What an estimator does with a row: use it; nothing, for too much is missing; start anew with it."""
+"""Action of an estimator on a row: use it; wait, since too much is missing; start anew with it."""
 
 
 @dataclass(frozen=True)
 class ChannelLimits:
-    """What is believed of one channel.
+    """Limits of plausible values of one channel."""
 
-    Args:
-        low, high: smallest and largest value [unit of the channel].
-        jump: largest change from one sample to the next [unit].
-        run: longest time that it may stand still while the car moves [s]; 0 if any.
-        stops: between which alone it is expected to move [unit].
-    """
-
-    low: float
-    high: float
-    jump: Annotated[float, "a positive number"]
-    run: float = 0.0
-    stops: tuple[float, float] = (-ENDLESS, ENDLESS)
+    low: float  # smallest value [unit of the channel]
+    high: float  # largest value [unit]
+    jump: Annotated[float, "a positive number"]  # largest change from one sample to the next [unit]
+    run: float = 0.0  # longest time that it may stand still while the car moves [s]; 0 if any
+    stops: tuple[float, float] = (-ENDLESS, ENDLESS)  # between which alone it is expected to move [unit]
 
 
 @dataclass(frozen=True)
 class GuardLimits:
-    """What is believed of each channel, and of the estimate.
+    """Limits of plausible values of each channel, and of the estimate."""
 
-    Args:
-        channels: name -> limits.
-        top_speed: that the car reaches [m/s].
-        largest_tan_sideslip: largest |v| over max(u, 1 m/s) that is believed of an estimate; 1 is a sideslip of 45°.
-    """
-
-    channels: Mapping[str, ChannelLimits] = field(default_factory=dict)
-    top_speed: float = 140.0
-    largest_tan_sideslip: float = 1.0
+    channels: Mapping[str, ChannelLimits] = field(default_factory=dict)  # name -> limits
+    top_speed: float = 140.0  # that the car reaches [m/s]
+    largest_tan_sideslip: float = 1.0  # largest |v| over max(u, 1 m/s) of a plausible estimate; 1 is a sideslip of 45°
 
 
 def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
@@ -92,20 +79,17 @@ def usual_limits(channels: Sequence[str], rate_hz: float) -> GuardLimits:
 
 
 def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> GuardLimits:
-    """Limits from what the channels do in training.
+    """Limits from drives at the estimator's rate, with references where they have them.
 
-    A range is what any car reaches or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for
-    twice its longest run while the car moved.
-
-    Args:
-        recordings: at the estimator's rate, with references where they have them.
-        channels: that the estimator reads.
-        rate_hz: of the estimator [Hz].
+    A range is that of any car or, if that is more, `MARGIN` times the largest value; a jump likewise; a channel may stand still for twice
+    its longest run while the car moved.
     """
     found = {}
     for name in channels:
         usual = _usual(name, rate_hz)
-        own = [recording[name] for recording in recordings if name in recording]
+        having = [recording for recording in recordings if name in recording]
+        own = [recording[name] for recording in having]
+        stops = stops_of(own, name)
         size = max((float(np.nanmax(np.abs(part), initial=0.0)) for part in own), default=0.0)
         jump = max((float(np.nanmax(np.abs(np.diff(part)), initial=0.0)) for part in own if len(part) > 1), default=0.0)
         table = CHANNELS[name]
@@ -113,8 +97,8 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
             jump=max(_fastest(name, rate_hz), MARGIN * jump),
-            run=_run_limit([recording for recording in recordings if name in recording], name, stops_of(own, name)),
-            stops=stops_of(own, name),
+            run=_run_limit(having, name, stops),
+            stops=stops,
         )
     speeds = [np.abs(recording[name]) for recording in recordings for name in ("vx", "vx_ref") if name in recording]
     top = max((float(np.nanmax(part, initial=0.0)) for part in speeds), default=0.0)
@@ -138,36 +122,34 @@ def _fastest(name: str, rate_hz: float) -> float:
 
 
 def _tan_sideslip(recording: Recording) -> float:
-    if "vy_ref" not in recording:
-        return 0.0
     name = "vx_ref" if "vx_ref" in recording else "vx"
-    if name not in recording:
+    if not ("vy_ref" in recording and name in recording):
         return 0.0
     return float(np.nanmax(np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0), initial=0.0))
 
 
 def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
-    """Twice the longest time that a channel stood still between its stops while the car moved [s]; 0 if that says nothing."""
+    """Twice the longest time that a channel stood still between its stops while the car moved [s]; 0 if it has no limit."""
     if CHANNELS[name].rests or not recordings:
         return 0.0
     longest = 0.0
     for recording in recordings:
         samples = recording[name]
         same = np.concatenate([[False], samples[1:] == samples[:-1]]) & _moves(recording) & (samples > stops[0]) & (samples < stops[1])
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(np.int8), [0]])))
-        if len(edges):
-            longest = max(longest, float((edges[1::2] - edges[::2]).max()) / recording.rate_hz)
+        longest = max(longest, longest_run(same) / recording.rate_hz)
     return 0.0 if longest > LONGEST_RUN else max(2.0 * longest, LEAST_RUN)
+
+
+def longest_run(flags: NDArray[np.bool_]) -> int:
+    """Longest run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
     """Where a steering is at its lock, (lower, upper): where it stayed for three samples in training, within a tenth of its extremes.
 
-    Resampling rings at a stop, so that the extreme itself may lie beyond it.
-
-    Args:
-        parts: samples of the channel, (T,) each.
-        name: of the channel; others than `STEERING` have no stops.
+    Resampling rings at a stop, so that the extreme itself may lie beyond it. Channels other than `STEERING` have no stops.
     """
     stops = [-ENDLESS, ENDLESS]
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
@@ -188,39 +170,27 @@ def _stayed(values: FloatArray, tolerance: float) -> FloatArray:
 
 def _moves(recording: Recording) -> NDArray[np.bool_]:
     """Samples at which the car moves, as far as speed and yaw rate tell."""
-    moving = np.zeros(len(recording), np.bool_)
     if "vx" not in recording:
-        return ~moving
-    moving |= ~(np.abs(recording["vx"]) < STANDSTILL_SPEED)
+        return np.ones(len(recording), np.bool_)
+    still = np.abs(recording["vx"]) < STANDSTILL_SPEED
     if "yaw_rate" in recording:
-        moving |= ~(np.abs(recording["yaw_rate"]) < STANDSTILL_YAW_RATE)
-    return moving
+        still &= np.abs(recording["yaw_rate"]) < STANDSTILL_YAW_RATE
+    return ~still
 
 
 class Cleaned(NamedTuple):
-    """Rows as an estimator may see them.
+    """Rows as an estimator may see them."""
 
-    Args:
-        rows: (T, C), finite, or NaN in channels that the method can skip; whatever where ``flow`` is `WAIT`.
-        measured: what was believed, (T, C).
-        flow: `USE`, `WAIT` or `RESTART` at each row, (T,).
-    """
-
-    rows: FloatArray
-    measured: NDArray[np.bool_]
-    flow: NDArray[np.int8]
+    rows: FloatArray  # (T, C), finite, or NaN in channels that the method can skip; arbitrary where ``flow`` is `WAIT`
+    measured: NDArray[np.bool_]  # which values were accepted, (T, C)
+    flow: NDArray[np.int8]  # `USE`, `WAIT` or `RESTART` at each row, (T,)
 
 
 class Guard:
-    """Believes samples or not, row after row; keeps the state between calls.
+    """Accepts or rejects samples, row after row; keeps the state between calls.
 
-    Args:
-        channels: in the order of the columns.
-        skippable: those of them that the estimator can do without.
-        limits: of each channel; what any car reaches for those that they do not name.
-        rate_hz: of the rows [Hz].
-        remembers: whether the estimator has more memory than a window: it then starts anew at a jump that is believed after all, since what
-            it remembers belongs to another level.
+    Channels are in the order of the columns; those without ``limits`` get those of any car. An estimator that ``remembers`` more than a
+    window starts anew at a jump that is accepted after all.
     """
 
     def __init__(
@@ -235,7 +205,7 @@ class Guard:
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
         self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64)
         self.state = np.zeros((len(channels) + 1, 6))
-        self.state[:-1, [0, 3, 4]] = np.nan  # nothing believed, no last value, no candidate
+        self.state[:-1, [0, 3, 4]] = np.nan  # nothing accepted, no last value, no candidate
         self.state[-1, 0] = WAIT
 
     def __call__(self, rows: FloatArray) -> Cleaned:
@@ -247,16 +217,16 @@ class Guard:
 
 @entry(nogil=True)
 def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):  # type: ignore[no-untyped-def]
-    """Decide row by row what is believed.
+    """Accept or reject values, row by row.
 
     Args:
-        rows: (T, C), whatever was received.
-        state: (C + 1, 6), of each channel: last believed value, samples since, length of the present run, last value, candidate after a
+        rows: (T, C), as received.
+        state: (C + 1, 6), of each channel: last accepted value, samples since, length of the present run, last value, candidate after a
             jump, how often it was confirmed; last row: whether the estimator waits.
         limits: (C, 6): low, high, jump, longest run in samples, lower and upper stop.
         skippable: (C,).
-        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand, whether a jump
-            that is believed makes the estimator start anew.
+        settings: columns of vx and yaw rate (-1: none), samples that are bridged, samples that a new level has to stand, whether an
+            accepted jump makes the estimator start anew.
         clean, measured, flow: output, as in `Cleaned`.
     """
     n_channels = rows.shape[1]
@@ -267,23 +237,23 @@ def guard_rows(rows, state, limits, skippable, settings, clean, measured, flow):
         for c in range(n_channels):
             x = rows[k, c]
             own = state[c]
-            believed = limits[c, 0] <= x <= limits[c, 1]  # false for NaN
-            if believed:
+            accepted = limits[c, 0] <= x <= limits[c, 1]  # false for NaN
+            if accepted:
                 own[2] = own[2] + 1.0 if x == own[3] else 0.0
                 own[3] = x
                 if own[2] > limits[c, 3] and limits[c, 4] < x < limits[c, 5] and not still:
-                    believed = False
+                    accepted = False
                 elif own[1] <= bridged and abs(x - own[0]) > limits[c, 2]:  # a jump from what is not long gone
                     own[5] = own[5] + 1.0 if abs(x - own[4]) <= limits[c, 2] else 1.0
                     own[4] = x
-                    believed = own[5] >= persists
-                    jumped = jumped or believed
-            if believed:
+                    accepted = own[5] >= persists
+                    jumped = jumped or accepted
+            if accepted:
                 own[0], own[1], own[4], own[5] = x, 0.0, math.nan, 0.0
             else:
                 own[1] += 1.0
-            measured[k, c] = believed
-            clean[k, c] = x if believed else (math.nan if skippable[c] else own[0])
+            measured[k, c] = accepted
+            clean[k, c] = x if accepted else (math.nan if skippable[c] else own[0])
             missing = math.inf if math.isnan(own[0]) else own[1]
             if skippable[c]:
                 any_skippable = True

@@ -1,4 +1,6 @@
-"""Whether an estimate can be trusted, judged from the channels it was made from.
+"""Judges estimates by the channels that they were made from: valid, degraded or invalid, with a reason.
+
+    drives -> learn_health -> HealthModel (trust.yaml) -> packed -> health_rows -> status, reason
 
 Learnt from training drives without any reference: relations between channels (`vehest.trust.relations`), an autoregression of what they
 leave (`vehest.trust.autoregression`), and for every statistic of `vehest.trust.health_kernel` the largest value that healthy training and
@@ -23,21 +25,12 @@ from vehest.data.recording import Recording
 from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest.trust.front_end import behind_front_end
-from vehest.trust.guard import ENDLESS, stops_of
-from vehest.trust.health_kernel import N_FEATURES, N_FORMS, N_LEVELS, Layout, health_kernel, memory_sizes
-from vehest.trust.relations import (
-    FEATURES,
-    RATE,
-    Relation,
-    learn_relations,
-    least_speed_of,
-    residuals_of,
-    speed_channel,
-    without_glitches,
-)
+from vehest.trust.guard import ENDLESS, longest_run, stops_of
+from vehest.trust.health_kernel import N_FORMS, N_LEVELS, Layout, Model, State, health_kernel
+from vehest.trust.named_arrays import allocated, views
+from vehest.trust.relations import FEATURES, RATE, Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
 
 VALID, DEGRADED, INVALID = 0, 1, 2
-STATUS = ("valid", "degraded", "invalid")
 
 HOLD_SECONDS = 1.0  # for which a flag stays after the last statistic went down
 BRIDGED_SECONDS = 0.5  # from which on a missing channel makes the estimate invalid
@@ -54,16 +47,15 @@ BLOCK_SECONDS = 5.0  # whose largest values set the limits
 HOURS = 100.0  # in which healthy drives are to exceed a limit about once
 BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: tyres, track, wind
 LEAST_VALUES = 10.0  # independent ones that any time holds
-LEAST_Z = 4.5  # below which no statistic that is N(0, 1) while all is well counts
 LEAST_RUN = 4.0  # equal samples in a row
 LEAST_SHARE = 0.3
-LEAST_SLIP = 0.3
+LEAST = {"normal": 4.5, "slip": 0.3}  # limits of statistics that are N(0, 1) without a fault, and of slip
 APART = 2.0  # times the next largest block, from which on a block is a fault of the recording itself
 MOST_APART = 0.01  # share of blocks that may be
 DOMAIN_MARGIN = 1.1  # of a channel over its largest value in training, beyond which it is outside what was learnt
 SPIN_MARGIN = 1.3
 HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a likelihood ratio
-STILL_YAW_RATE, STILL_AY = 0.05, 0.5  # rad/s, m/s²: below which a car may be taken to stand
+STILL = {"yaw_rate": 0.05, "ay": 0.5}  # rad/s, m/s²: below which a car may be taken to stand
 
 MAX_ORDER = 10
 MOST_COEFFICIENTS = 700
@@ -76,84 +68,49 @@ NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Number of a channel in a reason's code."""
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
-WORDS = {
-    kernel.FREE: "nothing found",
-    kernel.MISSING: "{channel} is not measured",
-    kernel.FROZEN: "{channel} is frozen",
-    kernel.HELD: "{channel} repeats its samples",
-    kernel.JUMP: "{channel} jumps",
-    kernel.NOISE: "{channel} is noisier than where the model learnt",
-    kernel.SMOOTH: "{channel} varies less than where the model learnt",
-    kernel.OFFSET: "{channel} has an offset against the other channels",
-    kernel.SCALE: "{channel} has another scale than the other channels",
-    kernel.SIGN: "{channel} has the wrong sign",
-    kernel.UNIT: "{channel} has the wrong unit",
-    kernel.CONTRADICTION: "{channel} and {partner} contradict each other",
-    kernel.OUTSIDE: "outside what the model learnt: |{channel}|",
-    kernel.SPIN: "spin",
-    kernel.LOCKED: "locked wheel: {channel}",
-    kernel.DROPOUT: "lost wheel: {channel}",
-    kernel.LATE: "{channel} comes late",
+_REASONS: dict[int, tuple[str, float]] = {
+    kernel.FREE: ("nothing found", 0.0),
+    kernel.MISSING: ("{channel} is not measured", 0.0),
+    kernel.FROZEN: ("{channel} is frozen", 8.0),
+    kernel.HELD: ("{channel} repeats its samples", 7.0),
+    kernel.JUMP: ("{channel} jumps", 2.0),
+    kernel.NOISE: ("{channel} is noisier than where the model learnt", 2.5),
+    kernel.SMOOTH: ("{channel} varies less than where the model learnt", 1.5),
+    kernel.OFFSET: ("{channel} has an offset against the other channels", 4.0),
+    kernel.SCALE: ("{channel} has another scale than the other channels", 4.0),
+    kernel.SIGN: ("{channel} has the wrong sign", 0.0),
+    kernel.UNIT: ("{channel} has the wrong unit", 0.0),
+    kernel.CONTRADICTION: ("{channel} and {partner} contradict each other", 3.0),
+    kernel.OUTSIDE: ("outside what the model learnt: |{channel}|", 1.0),
+    kernel.SPIN: ("spin", 0.0),
+    kernel.LOCKED: ("locked wheel: {channel}", 9.0),
+    kernel.DROPOUT: ("lost wheel: {channel}", 9.0),
+    kernel.LATE: ("{channel} comes late", 4.0),
 }
-"""Kind of a reason -> what is said. A code is 10000 times the kind, 100 times the channel's number, and the partner's."""
+"""Kind of a reason -> text, and priority over others: the most specific is given.
 
-PRIORITY = {
-    kernel.DROPOUT: 9.0,
-    kernel.LOCKED: 9.0,
-    kernel.FROZEN: 8.0,
-    kernel.HELD: 7.0,
-    kernel.OFFSET: 4.0,
-    kernel.SCALE: 4.0,
-    kernel.LATE: 4.0,
-    kernel.CONTRADICTION: 3.0,
-    kernel.NOISE: 2.5,
-    kernel.JUMP: 2.0,
-    kernel.SMOOTH: 1.5,
-    kernel.OUTSIDE: 1.0,
-}
-"""Which of several reasons is given: the one that says most."""
+A code is 10000 times the kind, 100 times the channel's number, and the partner's.
+"""
+WORDS = {kind: text for kind, (text, _) in _REASONS.items()}
 
 
 def reason_in_words(code: float) -> str:
-    """What a reason's code says."""
+    """Text of a reason's code."""
     kind, rest = divmod(round(code), 10_000)
     channel, partner = divmod(rest, 100)
     return WORDS[kind].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
 
 
-def reason_kind(code: float) -> int:
-    """Kind of a reason's code, one of those in `vehest.trust.health_kernel`."""
-    return round(code) // 10_000
-
-
-def reason_channel(code: float) -> str:
-    """Channel that a reason's code accuses; empty where it names none."""
-    return _NAMES.get(round(code) % 10_000 // 100, "")
-
-
-class PackedHealth(NamedTuple):
-    """A model as the kernel reads it."""
-
-    numbers: FloatArray
-    sizes: NDArray[np.int64]
-
-
 class Health(NamedTuple):
-    """What was found in rows.
+    """Status of rows."""
 
-    Args:
-        status: 0 valid, 1 degraded, 2 invalid, (T,).
-        reason: code, (T,); 0 where there is none.
-        ratio: largest statistic over its limit, (T,).
-    """
-
-    status: FloatArray
-    reason: FloatArray
-    ratio: FloatArray
+    status: FloatArray  # 0 valid, 1 degraded, 2 invalid, (T,)
+    reason: FloatArray  # code, (T,); 0 where there is none
+    ratio: FloatArray  # largest statistic over its limit, (T,)
 
 
 class Statistic(NamedTuple):
-    """One statistic: what it says, of which channel, held against which other, at which time constant [s]; its rule for a limit."""
+    """Kind of reason, channel, the other channel of a relation, time constant [s], and the rule for its limit."""
 
     kind: int
     channel: str
@@ -164,50 +121,27 @@ class Statistic(NamedTuple):
 
 @dataclass(frozen=True)
 class HealthModel:
-    """What is normal for a car's channels; C of them.
+    """Normal behaviour of a car's C channels."""
 
-    Args:
-        channels: in the order of the rows' columns.
-        rate_hz: of the rows [Hz].
-        relations: between channels.
-        constant: of the autoregression, one a channel.
-        coefficients: of the autoregression: lag, channel, former channel.
-        precision: inverse of the innovations' covariance; zero for channels that are not modelled.
-        deviation: of each channel's innovations.
-        usual: median of each channel.
-        largest: largest size of each channel in training.
-        longest_gap: longest time without a sample of each channel in training [s].
-        standstill: speed [unit of the speed channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands.
-        spin: yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump.
-        speeds: at which the noise was looked at [unit of the speed channel].
-        levels: size of the innovations at these speeds, in their deviations, one row a speed.
-        healthy: offset, scale and delay that the likelihood ratios find in each channel while all is well.
-        heaviest: weight that one sample may have in them.
-        limits: of every statistic, in the order of `statistics`.
-        stops: of each channel, between which alone it is expected to move.
-        limits_behind_front_end: the same limits for samples that a filter from a faster bus has passed (`vehest.trust.front_end`), which
-            are of another colour than in training.
-    """
-
-    channels: tuple[str, ...]
-    rate_hz: float
-    relations: tuple[Relation, ...]
-    constant: tuple[float, ...]
-    coefficients: tuple[tuple[tuple[float, ...], ...], ...]
-    precision: tuple[tuple[float, ...], ...]
-    deviation: tuple[float, ...]
-    usual: tuple[float, ...]
-    largest: tuple[float, ...]
-    longest_gap: tuple[float, ...]
-    standstill: tuple[float, float, float]
-    spin: tuple[float, float]
-    speeds: tuple[float, ...]
-    levels: tuple[tuple[float, ...], ...]
-    healthy: tuple[tuple[float, ...], ...] = ()
-    heaviest: tuple[tuple[float, ...], ...] = ()
-    limits: tuple[float, ...] = ()
-    stops: tuple[tuple[float, float], ...] = ()
-    limits_behind_front_end: tuple[float, ...] = ()
+    channels: tuple[str, ...]  # in the order of the rows' columns
+    rate_hz: float  # of the rows [Hz]
+    relations: tuple[Relation, ...]  # between channels
+    constant: tuple[float, ...]  # of the autoregression, one a channel
+    coefficients: tuple[tuple[tuple[float, ...], ...], ...]  # of the autoregression: lag, channel, former channel
+    precision: tuple[tuple[float, ...], ...]  # inverse of the innovations' covariance; zero for channels that are not modelled
+    deviation: tuple[float, ...]  # of each channel's innovations
+    usual: tuple[float, ...]  # median of each channel
+    largest: tuple[float, ...]  # largest size of each channel in training
+    longest_gap: tuple[float, ...]  # longest time without a sample of each channel in training [s]
+    standstill: tuple[float, float, float]  # speed [unit of its channel], yaw rate [rad/s], ay [m/s²], below all of which the car stands
+    spin: tuple[float, float]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
+    speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
+    levels: tuple[tuple[float, ...], ...]  # size of the innovations at these speeds, in their deviations, one row a speed
+    healthy: tuple[tuple[float, ...], ...] = ()  # offset, scale and delay that the likelihood ratios find in each channel of healthy drives
+    heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in them
+    limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
+    stops: tuple[tuple[float, float], ...] = ()  # of each channel, between which alone it is expected to move
+    limits_behind_front_end: tuple[float, ...] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
 
     @property
     def layout(self) -> Layout:
@@ -217,7 +151,7 @@ class HealthModel:
         rows = [max(round(seconds * self.rate_hz), 1) for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
         memories = (len(ENERGY_SECONDS), len(RATIO_SECONDS), len(RELATION_SECONDS))
-        return Layout(len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows)
+        return Layout._make([len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows, len(self.statistics)])
 
     @property
     def statistics(self) -> list[Statistic]:
@@ -238,86 +172,66 @@ class HealthModel:
         add(kernel.HELD, "share")
         add(kernel.OUTSIDE, "domain")
         add(kernel.LOCKED, "slip")
-        for relation in self.relations:
-            found.extend(
-                Statistic(kernel.CONTRADICTION, relation.target, relation.partner, seconds, "largest") for seconds in RELATION_SECONDS
-            )
+        for own in self.relations:
+            found.extend(Statistic(kernel.CONTRADICTION, own.target, own.partner, seconds, "largest") for seconds in RELATION_SECONDS)
         return found
 
     def start(self) -> FloatArray:
         """State before the first row."""
-        sizes = memory_sizes(self.layout)
-        state, energy = np.zeros(sum(sizes)), sum(sizes[:9])
-        state[energy : energy + sizes[9]] = 1.0
-        return state
+        memory = allocated(State, self.layout)
+        views(State, memory, self.layout)[0].energy[:] = 1.0
+        return memory
 
-    def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> PackedHealth:
-        """Tables of the kernel.
+    def packed(self, *, forgets: bool = True, behind_front_end: bool = False) -> FloatArray:
+        """The kernel's `Model` in one array.
 
         Args:
             forgets: whether the likelihood ratios do; if not, they are sums over all rows.
             behind_front_end: whether rows come through the filter from a faster bus.
         """
-        own_limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
+        limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
         layout, statistics, names = self.layout, self.statistics, list(self.channels)
-        C, coefficients = layout.channels, np.array(self.coefficients)
-        instant, average, rates = np.zeros((C, N_FEATURES)), np.zeros((layout.relations, N_FEATURES)), np.zeros(layout.relations)
-        for row, relation in enumerate(self.relations):
-            for feature, value in relation.terms.items():
-                if feature == RATE:
-                    rates[row] = value
-                    continue
-                average[row, FEATURES.index(feature)] = value
-                if relation.instant:
-                    instant[names.index(relation.target), FEATURES.index(feature)] = value
-        step = 1.0 / self.rate_hz
+        tables, step, coefficients = allocated(Model, layout), 1.0 / self.rate_hz, np.array(self.coefficients)
+        model, _ = views(Model, tables, layout)
 
-        def forgetting(seconds: Sequence[float]) -> FloatArray:
+        def forgetting(*seconds: float) -> FloatArray:
             return 1.0 - np.exp(-step / np.array(seconds))
 
-        limits = np.array(own_limits or (math.inf,) * len(statistics))
-        numbers = [
-            self.constant,
-            coefficients.transpose(0, 2, 1),
-            self.precision,
-            self.deviation,
-            instant,
-            average,
-            rates,
-            self.usual,
-            np.maximum(self.largest, 1e-12),
-            self.speeds,
-            self.levels,
-            (np.eye(C) - coefficients.sum(0)).T,
-            *self._step_filter(),
-            self.healthy or np.zeros((N_FORMS, C)),
-            self.heaviest or np.full((N_FORMS, C), math.inf),
-            forgetting(ENERGY_SECONDS),
-            forgetting(RATIO_SECONDS) if forgets else np.zeros(layout.ratios),
-            forgetting(RELATION_SECONDS),
-            limits,
-            1.0 / limits,
-            [PRIORITY[statistic.kind] for statistic in statistics],
-            [*self.standstill, step, *self.spin, *forgetting([SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS])],
-            np.array(self.stops or ((-ENDLESS, ENDLESS),) * C).T,
-        ]
-        sizes = [
-            *layout,
-            len(statistics),
-            *kernel.places(layout),
-            *(int(self.precision[i][i] > 0.0) for i in range(C)),
-            *(int(CHANNELS[name].rests) for name in names),
-            *(round(gap * self.rate_hz) for gap in self.longest_gap),
-            *(int(name.startswith("wheel_speed") and bool(instant[i].any())) for i, name in enumerate(names)),
-            *(NUMBERS[name] for name in names),
-            *(names.index(relation.target) for relation in self.relations),
-            *(statistic.kind for statistic in statistics),
-            *(names.index(statistic.channel) for statistic in statistics),
-            *(names.index(statistic.partner) if statistic.partner else -1 for statistic in statistics),
-            *(relation.involves(name, speed_channel(names)) for relation in self.relations for name in names),
-            *(names.index(relation.partner) for relation in self.relations),
-        ]
-        return PackedHealth(np.concatenate([np.ravel(np.asarray(part, np.float64)) for part in numbers]), np.array(sizes, np.int64))
+        settings = [*self.standstill, step, *self.spin, *forgetting(SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS)]
+        for place, value in zip((*model.layout, *model.settings), (*layout, *settings), strict=True):
+            place[...] = value
+        for row, relation in enumerate(self.relations):
+            model.target[row], model.versus[row] = names.index(relation.target), names.index(relation.partner)
+            model.involved[row] = [relation.involves(name, speed_channel(names)) for name in names]
+            for feature, value in relation.terms.items():
+                if feature == RATE:
+                    model.rate_gain[row] = value
+                    continue
+                model.average[row, FEATURES.index(feature)] = value
+                if relation.instant:
+                    model.instant[model.target[row], FEATURES.index(feature)] = value
+        model.lags[:] = coefficients.transpose(0, 2, 1)
+        model.largest[:] = np.maximum(self.largest, 1e-12)
+        model.settled_gain[:] = (np.eye(layout.channels) - coefficients.sum(0)).T
+        model.steps[:], model.step_power[:] = self._step_filter()
+        model.healthy[:], model.heaviest[:] = self.healthy or 0.0, self.heaviest or math.inf
+        model.forget_energy[:], model.forget_average[:] = forgetting(*ENERGY_SECONDS), forgetting(*RELATION_SECONDS)
+        model.forget_ratio[:] = forgetting(*RATIO_SECONDS) if forgets else 0.0
+        model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
+        model.limits.every[:] = limits or math.inf
+        model.inverse.every[:] = 1.0 / model.limits.every
+        model.modelled[:] = np.diag(self.precision) > 0.0
+        for i, name in enumerate(names):
+            model.rests[i], model.code[i] = CHANNELS[name].rests, NUMBERS[name]
+            model.wheel[i] = name.startswith("wheel_speed") and model.instant[i].any()
+            model.gap_limit[i] = round(self.longest_gap[i] * self.rate_hz)
+        for name in ("constant", "precision", "deviation", "usual", "speeds", "levels"):
+            getattr(model, name)[:] = getattr(self, name)
+        for k, statistic in enumerate(statistics):
+            model.kind[k], model.priority[k] = statistic.kind, _REASONS[statistic.kind][1]
+            model.accused[k] = names.index(statistic.channel)
+            model.partner[k] = names.index(statistic.partner) if statistic.partner else -1
+        return tables
 
     def _step_filter(self) -> tuple[FloatArray, FloatArray]:
         """Weights of the last p innovations on a step that began p samples ago, (p, C, C), the latest first, and their power, (C, C)."""
@@ -326,33 +240,23 @@ class HealthModel:
         return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum("jqm,qr,jrn->mn", left, precision, left)
 
 
-def health_rows(packed: PackedHealth, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
-    """Judge rows one after another; one at a time or all at once, to the same bits.
+def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
+    """Judge rows (T, C), one at a time or all at once, to the same bits; they may hold anything where ``measured`` is false.
 
-    Args:
-        packed: of `HealthModel.packed`.
-        rows: (T, C) as received, contiguous; may hold anything where ``measured`` is false.
-        measured: (T, C).
-        state: of `HealthModel.start`, changed in place.
+    ``packed`` is of `HealthModel.packed`; ``state`` of `HealthModel.start`, changed in place.
     """
     out = np.empty((3, len(rows)))
-    health_kernel(rows, measured, packed.numbers, packed.sizes, state, out, _NO_STATISTICS)
-    return Health(out[0], out[1], out[2])
+    health_kernel(rows, measured, packed, state, out, _NO_STATISTICS)
+    return Health(*out)
 
 
 _NO_STATISTICS = np.empty((0, 0))
 
 
 def learn_health(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> HealthModel:
-    """Learn what is normal; references are not looked at.
+    """Learn normal behaviour from drives at ``rate_hz``, without references: the training's limits count with those of validation.
 
     Single samples that stand apart from both neighbours are glitches of the recording and left out (`without_glitches`).
-
-    Args:
-        train: at ``rate_hz``, from which relations, noise and domain are learnt.
-        validation: at ``rate_hz``, which together with ``train`` set the limits.
-        channels: that the estimator reads, in the order of the rows' columns.
-        rate_hz: of the estimator [Hz].
 
     Raises:
         DataError: a recording has another rate or lacks a channel, or there are too few samples.
@@ -378,6 +282,10 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
     levels[:, [names.index(name) for name in usable]] = noise.factors
     largest = {name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in joined.items()}
     turning = joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
+
+    def still_at(name: str) -> float:
+        return min(STILL[name], 0.1 * largest.get(name, np.inf))
+
     found = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
@@ -385,12 +293,8 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         **_embedded(model, names, usable),
         usual=tuple(float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0 for name in names),
         largest=tuple(largest.values()),
-        longest_gap=tuple(_longest_gap([part[name] for part in received], rate_hz) for name in names),
-        standstill=(
-            least_speed,
-            min(STILL_YAW_RATE, 0.1 * largest.get("yaw_rate", np.inf)),
-            min(STILL_AY, 0.1 * largest.get("ay", np.inf)),
-        ),
+        longest_gap=tuple(max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz for name in names),
+        standstill=(least_speed, still_at("yaw_rate"), still_at("ay")),
         spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
         speeds=tuple(noise.speeds.tolist()),
         levels=_plain(levels),
@@ -425,26 +329,18 @@ def _plain(values: FloatArray) -> Any:
     return tuple(_plain(part) for part in values) if values.ndim > 1 else tuple(values.tolist())
 
 
-def _longest_gap(parts: Sequence[FloatArray], rate_hz: float) -> float:
-    longest = 0
-    for samples in parts:
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isnan(samples).astype(np.int8), [0]])))
-        longest = max(longest, int((edges[1::2] - edges[::2]).max()) if len(edges) else 0)
-    return longest / rate_hz
-
-
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
     """With the offset, scale and delay that the likelihood ratios find over all of training, and `HEAVIEST` times their mean weight."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
-    layout, sizes = model.layout, memory_sizes(model.layout)
-    begin, total = sum(sizes[:10]), np.zeros((layout.channels, 2 * N_FORMS))
+    total, weight = np.zeros((2, len(model.channels), N_FORMS))
     for recording in recordings:
-        state, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
-        health_rows(packed, rows, np.isfinite(rows), state)
-        sums = state[begin : begin + sizes[10]].reshape(layout.channels, layout.ratios, -1)
-        total += sums[:, 0, : 2 * N_FORMS]
-    found = total[:, 0::2] / np.maximum(total[:, 1::2], 1e-300)
-    heaviest = HEAVIEST * total[:, 1::2] / sum(len(recording) for recording in recordings)
+        memory, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
+        health_rows(packed, rows, np.isfinite(rows), memory)
+        state, _ = views(State, memory, model.layout)
+        total += state.ratio_sum[:, 0]
+        weight += state.ratio_weight[:, 0]
+    found = total / np.maximum(weight, 1e-300)
+    heaviest = HEAVIEST * weight / sum(len(recording) for recording in recordings)
     return replace(model, healthy=_plain(found.T), heaviest=_plain(heaviest.T))
 
 
@@ -457,34 +353,25 @@ def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatAr
         for begin in range(0, len(samples), length):
             part = samples[begin : begin + length]
             statistics = np.empty((len(part), n_statistics))
-            health_kernel(part, np.isfinite(part), *packed, state, np.empty((3, len(part))), statistics)
+            health_kernel(part, np.isfinite(part), packed, state, np.empty((3, len(part))), statistics)
             found.append(statistics.max(0))
     return np.array(found)
 
 
 def margin(seconds: float, healthy_seconds: float) -> float:
-    """By how much what is seen in a short time may be exceeded in `HOURS`.
+    """Factor between the largest value of a statistic in ``healthy_seconds`` and the one that is exceeded about once in `HOURS`.
 
-    The ratio of the largest of N normal values, √(2 ln N), times `BETWEEN_DRIVES`.
-
-    Args:
-        seconds: after which a statistic is about independent of what it was.
-        healthy_seconds: in which it was seen.
+    The ratio of the largest of N normal values, √(2 ln N), one each ``seconds``, times `BETWEEN_DRIVES`.
     """
     seen, wanted = (max(time / seconds, LEAST_VALUES) for time in (healthy_seconds, 3600.0 * HOURS))
     return BETWEEN_DRIVES * max(math.sqrt(math.log(wanted) / math.log(seen)), 1.0)
 
 
 def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float) -> tuple[float, ...]:
-    """Limits of all statistics from what blocks of healthy drives reach.
+    """Limits of all K statistics from their largest values in blocks of healthy drives, (B, K), and the sampling interval ``step`` [s].
 
     The largest value times `margin`, where blocks that stand apart from all others by a factor of `APART`, at most `MOST_APART` of them
     and one from thirty blocks on, do not count: recordings hold faults of their own.
-
-    Args:
-        maxima: of each block, (B, K).
-        statistics: K.
-        step: between samples [s].
     """
     ordered = np.sort(maxima, axis=0)[::-1]
     set_aside = max(1, int(MOST_APART * len(maxima))) if len(maxima) >= 30 else 0
@@ -493,38 +380,27 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float
         apart = [k for k in range(set_aside) if column[k] > APART * column[k + 1]]
         top = float(column[apart[-1] + 1] if apart else column[0])
         limit = margin(max(statistic.seconds, step), BLOCK_SECONDS * len(maxima)) * top
-        if statistic.rule == "normal":
-            limit = max(limit, LEAST_Z)
-        elif statistic.rule == "run":
-            limit = max(limit + 2.0, LEAST_RUN)
-        elif (
-            statistic.rule == "share"
-        ):  # half way to 1 at most, or a channel that often repeats itself could not be found to do nothing else
+        if statistic.rule == "share":  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
             limit = min(max(top + 0.15, LEAST_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
             limit = DOMAIN_MARGIN
-        elif statistic.rule == "slip":
-            limit = max(limit, LEAST_SLIP)
+        elif statistic.rule != "largest":
+            limit = max(limit + 2.0, LEAST_RUN) if statistic.rule == "run" else max(limit, LEAST[statistic.rule])
         found.append(limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300)
     return tuple(found)
 
 
 def domain_verdict(model: HealthModel, samples: Mapping[str, FloatArray]) -> str:
-    """One line on how much of a drive lies outside what the model learnt, and by which channels; empty if nothing does.
-
-    Args:
-        model: learnt with the estimator.
-        samples: channel -> (T,); what is not finite does not count.
-    """
-    outside, total, named = None, 1, []
+    """One line on the share of a drive, channel -> (T,), outside the training's range, and by which channels; empty if there is none."""
+    outside, named = np.zeros(len(next(iter(samples.values()))), bool), []
     for name, largest in zip(model.channels, model.largest, strict=True):
         values = np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)
         own = np.abs(values) > DOMAIN_MARGIN * largest
         if own.any():
             named.append((int(own.sum()), f"|{name}| above {DOMAIN_MARGIN * largest:.3g} {CHANNELS[name].unit}"))
-        outside, total = own if outside is None else outside | own, len(values)
-    if outside is None or not outside.any():
+        outside |= own
+    if not named:
         return ""
     words = ", ".join(text for _, text in sorted(named, reverse=True)[:3])
-    share = 100.0 * float(outside.sum()) / total
+    share = 100.0 * float(outside.sum()) / len(outside)
     return f"{share:.3g} % of the drive outside what the model learnt: {words}"

@@ -1,4 +1,4 @@
-"""What is known of how far a model's estimates can be trusted, on disk: trust.yaml."""
+"""Bands, limits and health of a model, read from and written to trust.yaml."""
 
 from __future__ import annotations
 
@@ -22,34 +22,21 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class About:
-    """Whose trust it is.
+    """The model."""
 
-    Args:
-        estimator: name in the registry.
-        variant: what the paper calls it.
-        note: why something is missing, for people; empty where nothing is.
-    """
-
-    estimator: str
-    variant: str = ""
-    note: str = ""
+    estimator: str  # name in the registry
+    variant: str = ""  # what the paper calls it
+    note: str = ""  # why something is missing, for people; empty where nothing is
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How far a model's estimates can be trusted; what is None was not learnt.
+    """Bands, limits and health of a model; None if not learnt."""
 
-    Args:
-        about: whose it is.
-        bands: calibrated half widths.
-        guard: limits of plausible samples.
-        health: residuals and thresholds of the health flag.
-    """
-
-    about: About
-    bands: Bands | None = None
-    guard: GuardLimits | None = None
-    health: HealthModel | None = None
+    about: About  # whose it is
+    bands: Bands | None = None  # calibrated half widths
+    guard: GuardLimits | None = None  # limits of plausible samples
+    health: HealthModel | None = None  # residuals and thresholds of the health flag
 
 
 @dataclass(frozen=True)
@@ -57,7 +44,7 @@ class _File(Trust):
     format: int = 0
 
 
-def is_elsewhere(trust: Trust | None, recording: Recording) -> bool:
+def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
     return trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
 

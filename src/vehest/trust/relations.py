@@ -1,4 +1,4 @@
-"""How the measured channels of a car go together: relations with coefficients learnt from drives, without any reference.
+"""Relations between the measured channels of a car, with coefficients learnt from drives without any reference.
 
 With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r:
 
@@ -41,19 +41,12 @@ LEAST_ROWS = 50
 
 @dataclass(frozen=True)
 class Relation:
-    """What one channel is by others.
+    """One channel as a sum of features of others."""
 
-    Args:
-        target: channel that is explained.
-        partner: channel that it is held against, for messages.
-        terms: feature, or `RATE`, -> coefficient; the target's units over the feature's.
-        instant: whether it holds for each sample and not only on average.
-    """
-
-    target: str
-    partner: str
-    terms: dict[str, float] = field(default_factory=dict)
-    instant: bool = False
+    target: str  # channel that is explained
+    partner: str  # channel that it is held against, for messages
+    terms: dict[str, float] = field(default_factory=dict)  # feature, or `RATE`, -> coefficient; the target's units over the feature's
+    instant: bool = False  # whether it holds for each sample and not only on average
 
     def involves(self, channel: str, speed: str | None) -> int:
         """1 if it takes a channel, 2 if only in the small terms of drag, 0 if not at all; ``speed`` is the channel that u stands for."""
@@ -104,10 +97,7 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
 
 
 def without_spikes(samples: FloatArray) -> FloatArray:
-    """Samples with NaN where one stands apart from both neighbours by far more than any usual change, as recordings' own glitches do.
-
-    By the second difference, against ten times its 99.9 % quantile.
-    """
+    """NaN for single samples, glitches of the recording, whose second difference exceeds ten times its 99.9 % quantile."""
     if len(samples) < LEAST_ROWS:
         return samples
     apart = np.abs(samples[1:-1] - 0.5 * (samples[:-2] + samples[2:]))
@@ -149,14 +139,7 @@ def residuals_of(
 
 
 def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], rate_hz: float, least_speed: float) -> list[Relation]:
-    """Coefficients of every relation, from drives at one rate.
-
-    Args:
-        recordings: with the channels; samples that are NaN are left out.
-        channels: that are measured.
-        rate_hz: [Hz].
-        least_speed: below which samples do not count [unit of the speed channel].
-    """
+    """Coefficients of every relation, from drives at one rate [Hz]; NaN and samples below ``least_speed`` are left out."""
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
     parts = []

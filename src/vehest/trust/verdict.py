@@ -1,4 +1,4 @@
-"""What follows from health: which channels an estimator gets, when it starts anew, what is said of its estimate, how wide its band is.
+"""Consequences of health: channels that an estimator gets, restarts, status and reason of its estimate, width of its band.
 
 - A channel that health accuses of a fault counts as not measured where the method can do without it, so that nothing adapts to it.
 - An estimator that remembers more than a window starts anew once a fault is over.
@@ -6,19 +6,15 @@
   needs, these states go back to what they were fitted to, every second until nothing is suspected any more.
 - The band is twice as wide while an estimate is degraded and four times while it is invalid, and where there is no estimate it reaches at
   least as far as sideslip did in training. These factors were set before their effect was looked at.
-
-The recursions are compiled and take one row or all of a recording, so that online and batch agree to the last bit.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vehest.constants import FloatArray
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
@@ -36,31 +32,19 @@ BAND_FACTORS = (1.0, 2.0, 4.0)
 ROLLED_BACK_SECONDS = 1.0
 
 NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
-"""Kinds of reasons that accuse no sensor of anything that an estimator could do without."""
+"""Kinds of reasons that accuse no sensor."""
 
 OWN_WORDS = {NO_ESTIMATE: "there is no estimate", BEYOND_SPEED: "the estimate exceeds what the speed allows"}
 
 
 def reason_in_words(code: float) -> str:
-    """What the code of a reason says; empty for 0."""
+    """Text of a reason's code; empty for 0."""
     kind = round(code) // 10000
     return OWN_WORDS[kind] if kind in OWN_WORDS else health_in_words(code) if code else ""
 
 
-class Verdict(NamedTuple):
-    """What is said of an estimate.
-
-    Args:
-        status: 0 valid, 1 degraded, 2 invalid, (T,).
-        reason: code of `reason_in_words`, (T,); 0 where there is none.
-    """
-
-    status: FloatArray
-    reason: FloatArray
-
-
 def adapts(estimator: Estimator) -> bool:
-    """Whether an estimator has states that adapt, such as tyres, friction or offsets: it then has a property ``adapts`` that says so."""
+    """Whether an estimator has adapting states, such as tyres, friction or offsets, by its property ``adapts``."""
     return bool(getattr(estimator, "adapts", False))
 
 
@@ -76,16 +60,13 @@ def numbers_of(channels: tuple[str, ...]) -> NDArray[np.int64]:
 
 @entry(nogil=True)
 def isolate_rows(status, reason, numbers, skippable, starts_anew, rollback, rows, measured, flow, state):  # type: ignore[no-untyped-def]
-    """Take accused channels out of the rows, and have estimators start anew after faults; in place (fault isolation).
+    """Take accused channels out of rows, and have estimators start anew after faults; ``rows, measured, flow`` are changed in place.
 
     Args:
-        status, reason: of each row, (T,).
-        numbers: of the channels, (C,).
-        skippable: which of them the estimator can do without, (C,).
-        starts_anew: whether the estimator does once the fault is over.
-        rollback: samples after which one with states that adapt goes back to what was fitted, while a channel that it needs is accused; 0
-            where nothing adapts.
-        rows, measured, flow: as in `vehest.trust.guard.Cleaned`.
+        status, reason: of health, (T,).
+        numbers, skippable: of the channels: number in a code, whether the estimator can do without it, (C,).
+        starts_anew: whether the estimator does after a fault.
+        rollback: samples after which adapting states go back to fitted values, while a needed channel is accused; 0 if nothing adapts.
         state: whether there was a fault since health was last valid, and for how many samples one in a needed channel, (2,).
     """
     for k in range(rows.shape[0]):
@@ -112,15 +93,9 @@ def isolate_rows(status, reason, numbers, skippable, starts_anew, rollback, rows
 
 @entry(nogil=True)
 def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  # type: ignore[no-untyped-def]
-    """Add to health what guard and watch know; in place.
+    """Add the findings of guard (``flow``, ``measured``) and watch (``vy``, ``marks``) to ``status, reason`` of health, in place.
 
-    Args:
-        vy: what is passed on, (T,).
-        marks: of `vehest.trust.watch`, (T,).
-        flow, measured: of `vehest.trust.guard`, (T,) and (T, C).
-        needed: channels that the estimator cannot do without, (C,).
-        numbers: of the channels, (C,).
-        status, reason: of `vehest.trust.health`, (T,); changed.
+    ``needed`` are channels that the estimator cannot do without, ``numbers`` those in codes, (C,).
     """
     for k in range(vy.shape[0]):
         found, why = int(status[k]), int(reason[k])
@@ -138,15 +113,9 @@ def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  #
 
 @entry(nogil=True)
 def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
-    """Widen the band of estimates that are not valid; in place.
+    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place.
 
-    Args:
-        status: of each row, (T,).
-        marks: of `vehest.trust.watch`, (T,).
-        vy: what is passed on, (T,) [m/s].
-        vx: speed that it goes with, (T,) [m/s].
-        farthest: 99.9th percentile of |v| of estimates in training [m/s].
-        bands: half widths of v [m/s] and β [rad], (T, 2).
+    ``farthest`` is the 99.9th percentile of |v| of estimates in training, ``vx`` the speed of the estimate [m/s].
     """
     for k in range(vy.shape[0]):
         wider = BAND_FACTORS[int(status[k])]

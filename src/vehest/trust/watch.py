@@ -1,7 +1,4 @@
-"""What is believed of an estimate: it stays finite, within what the car's speed allows, and a lost estimator starts anew.
-
-The recursion is compiled and takes one row or all of a recording, so that online and batch agree to the last bit.
-"""
+"""Clips, bridges and restarts: an estimate stays finite and within the bound by the car's speed; a diverged estimator starts anew."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from vehest.constants import FloatArray
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import RESTART, WAIT, GuardLimits
 
-LEAST_SPEED = 1.0  # m/s, below which a bound on the angle says nothing
+LEAST_SPEED = 1.0  # m/s, below which the angle is not bounded
 SPIN_RATE = 4.0  # m/s²: |a_y - u r|, the change of v, beyond which a car that keeps it up spins
 SPIN_SECONDS = 0.3
 REMEMBERED_SECONDS = 3.0  # for which a spinning car is taken to be as fast as before
@@ -27,28 +24,18 @@ EXTRAPOLATED, CLIPPED, SPINNING, STARTED = 1, 2, 4, 8
 
 
 class Watched(NamedTuple):
-    """Estimates as they are passed on.
+    """Estimates after bounds and bridging."""
 
-    Args:
-        vy: (T,) [m/s]; NaN before the first estimate only.
-        marks: sum of marks at each row, (T,).
-        done: how many rows count; fewer than there are where the estimator was lost at the last of them.
-        lost: whether it has to start anew with the next row.
-    """
-
-    vy: FloatArray
-    marks: NDArray[np.int8]
-    done: int
-    lost: bool
+    vy: FloatArray  # (T,) [m/s]; NaN before the first estimate only
+    marks: NDArray[np.int8]  # sum of marks at each row, (T,)
+    done: int  # how many rows count; fewer than there are where the estimator was lost at the last of them
+    lost: bool  # whether it has to start anew with the next row
 
 
 class Watch:
     """Watches estimates row after row; keeps the state between calls.
 
-    Args:
-        limits: top speed, largest believed ratio of v to u.
-        warm_up: samples after a start for which an estimator may have no estimate.
-        rate_hz: of the rows [Hz].
+    ``warm_up`` is the number of samples after a start for which an estimator may have no estimate.
     """
 
     def __init__(self, limits: GuardLimits, warm_up: int, rate_hz: float) -> None:
@@ -57,12 +44,9 @@ class Watch:
         self.state[0] = math.nan  # no estimate yet
 
     def __call__(self, vy: FloatArray, motion: FloatArray, flow: NDArray[np.int8]) -> Watched:
-        """Go on with further rows.
+        """Go on with the estimator's v, (T,) [m/s], NaN without one.
 
-        Args:
-            vy: what the estimator says, (T,) [m/s]; NaN where it says nothing.
-            motion: believed vx [m/s], yaw rate [rad/s] and lateral acceleration [m/s²], (T, 3); NaN what is not known.
-            flow: what it was told of each row (`vehest.trust.guard`), (T,).
+        ``motion`` holds accepted vx [m/s], yaw rate [rad/s] and ay [m/s²], (T, 3), NaN if unknown; ``flow`` is of the guard, (T,).
         """
         out, marks = np.empty(len(vy)), np.zeros(len(vy), np.int8)
         done, lost = watch_rows(vy, motion, flow, self.state, self._settings, out, marks)
@@ -71,17 +55,14 @@ class Watch:
 
 @entry(nogil=True)
 def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[no-untyped-def]
-    """Bound, bridge and judge estimates, up to the row at which the estimator is lost.
+    """Bound, bridge and judge estimates, up to the row at which the estimator is lost; returns the rows done, and whether it is lost.
 
     Args:
         vy, motion, flow: as in `Watch`.
-        state: last value passed on, speed that is remembered, seconds of spinning, seconds beyond the bound, samples since the
-            estimator's start, whether it was lost at the last row.
+        state: last value passed on, remembered speed, seconds of spinning, seconds beyond the bound, samples since the estimator's start,
+            whether it was lost at the last row.
         settings: top speed, largest tan β, warm-up in samples, sampling interval [s].
         out, marks: output, (T,).
-
-    Returns:
-        How many rows were done, and whether the estimator was lost at the last of them.
     """
     top_speed, largest_tan, warm_up, step = settings
     for k in range(vy.shape[0]):
@@ -100,26 +81,26 @@ def watch_rows(vy, motion, flow, state, settings, out, marks):  # type: ignore[n
         bound = largest_tan * max(state[1] if state[2] > 0.0 else speed, LEAST_SPEED)
         if state[2] > SPIN_SECONDS:
             marks[k] += SPINNING
-        told, lost = math.nan, False
+        value, lost = math.nan, False
         if flow[k] != WAIT:
             if math.isfinite(vy[k]):
-                told = vy[k]
-                if abs(told) > bound:
+                value = vy[k]
+                if abs(value) > bound:
                     state[3] += step
                     marks[k] += CLIPPED
-                    told = math.copysign(bound, told)
+                    value = math.copysign(bound, value)
                     lost = state[3] > LOST_SECONDS
                 else:
                     state[3] = 0.0
             else:
                 lost = state[4] >= warm_up
-        if math.isnan(told):
-            told = state[0] * math.exp(-step / FADE_SECONDS)
-            if abs(told) > bound:
-                told = math.copysign(bound, told)
+        if math.isnan(value):
+            value = state[0] * math.exp(-step / FADE_SECONDS)
+            if abs(value) > bound:
+                value = math.copysign(bound, value)
             marks[k] += EXTRAPOLATED
-        out[k] = told
-        state[0] = told
+        out[k] = value
+        state[0] = value
         if lost:
             state[5] = 1.0
             return k + 1, True

@@ -108,10 +108,10 @@ class Oracle:
         with np.errstate(all="ignore"):
             before, after, received = (residuals_of(part, self.channels, self.relations, self.least_speed) for part in parts)
             bound = MOST_DEVIATIONS * np.sqrt(np.diag(self.model.covariance))
-            signature = self.model.filtered(np.clip(np.nan_to_num(after - before), -1e3 * bound, 1e3 * bound))
+            signature = filtered(self.model, np.clip(np.nan_to_num(after - before), -1e3 * bound, 1e3 * bound))
         signature = np.clip(signature[first:], -bound, bound)
         innovations = np.nan_to_num(self.model.innovations(received)[first:])
-        levels = self.levels.at(parts[2][self.speed][first:]) if self.speed else np.ones((1, len(self.channels)))
+        levels = levels_at(self.levels, parts[2][self.speed][first:]) if self.speed else np.ones((1, len(self.channels)))
         signature, innovations = signature / levels, innovations / levels
         test = _random_test(signature, self.model.covariance) if drawn else _known_test(signature, self.model.covariance)
         threshold = self._threshold(test, within)
@@ -205,5 +205,18 @@ def learn_oracle(
     seen = len(train)
     levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
     reserve = margin(STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz)
-    healthy = tuple(own / levels.at(at) for own, at in zip(innovations, speeds, strict=True))
+    healthy = tuple(own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True))
     return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour, reserve)
+
+
+def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:
+    """A signature in the innovations, (T, C), of one that is added to the samples (zero before its first row)."""
+    found = np.array(signature, dtype=np.float64)
+    for lag, coefficient in enumerate(model.coefficients, start=1):
+        found[lag:] -= signature[: max(len(signature) - lag, 0)] @ coefficient.T
+    return found
+
+
+def levels_at(levels: NoiseLevels, speed: FloatArray) -> FloatArray:
+    """Factors at |speed|, (T, C)."""
+    return np.stack([np.interp(np.abs(speed), levels.speeds, column) for column in levels.factors.T], axis=1)

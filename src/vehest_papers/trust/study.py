@@ -25,7 +25,7 @@ from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
-from vehest.trust.bands import ELSEWHERE, LEVELS
+from vehest.trust.bands import LEVELS, OTHER_VEHICLE
 from vehest.trust.faults import parse_condition
 from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
 from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
@@ -92,7 +92,7 @@ def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
     """Coverage if the band were not widened for another car."""
     inside = []
     for position, scored in enumerate(part.scored(model, test_set)):
-        band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / ELSEWHERE
+        band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / OTHER_VEHICLE
         turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
         inside.append(np.abs(turned) <= band)
     return float(np.concatenate(inside).mean())
@@ -119,7 +119,7 @@ def _widening_in_words(board: pd.DataFrame) -> str:
         return "There is no such test set."
     with_it, without = own["coverage_90"].median(), own["without_widening"].median()
     return (
-        f"Bands are {ELSEWHERE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold "
+        f"Bands are {OTHER_VEHICLE:g} times as wide there, by a rule that was fixed before. Over estimators and test sets they hold "
         f"{100 * with_it:.0f} % of the errors (median, lowest {100 * own['coverage_90'].min():.0f} %); without the widening "
         f"{100 * without:.0f} % (lowest {100 * own['without_widening'].min():.0f} %)."
     )

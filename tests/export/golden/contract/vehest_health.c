@@ -57,7 +57,7 @@
 #define DEGRADED 1U
 #define INVALID 2U
 
-static const vehest_real BELIEVED = 1000.0f; /* times the largest size in training, beyond which a value is none */
+static const vehest_real BELIEVED = 1000.0f; /* times the largest size in training, beyond which a value counts as not measured */
 static const vehest_real CLIP = 4.0f; /* standard deviations */
 static const vehest_real STEP_CLIP = 8.0f; /* the same for steps */
 static const vehest_real CALM = 0.300000012f; /* of the mean energy, that a calm stretch counts as at least */
@@ -141,12 +141,12 @@ static const vehest_real HEALTHY[FORMS][C] = {
     { 0.00999999978f, 0.0f, 0.0199999996f },
     { 0.0f, 0.00999999978f, 0.0f },
     { 0.0f, 0.0f, 0.00999999978f }
-}; /* what likelihood ratios find while all is well */
+}; /* likelihood ratios of healthy drives */
 static const vehest_real HEAVIEST[FORMS][C] = {
     { 10.0f, 20.0f, 30.0f },
     { 10.0f, 20.0f, 30.0f },
     { 10.0f, 20.0f, 30.0f }
-}; /* what one sample may weigh in them */
+}; /* largest weight of one sample in them */
 static const vehest_real FORGET_ENERGY[E] = { 0.0951625854f, 0.0198013261f, 0.00498752063f };
 static const vehest_real FORGET_RATIO[G] = { 0.0392105617f, 0.00995016657f, 0.00249687769f, 0.000832986203f };
 static const vehest_real FORGET_AVERAGE[A] = { 0.0392105617f, 0.00995016657f, 0.00249687769f, 0.000832986203f };
@@ -343,7 +343,7 @@ static bool usable(const vehest_health *h, int32_t i)
     return found;
 }
 
-/* Innovations, scaled and clipped, and their scores S^-1 e; zero where nothing can be said. */
+/* Innovations, scaled and clipped, and their scores S^-1 e; zero where nothing can be predicted. */
 static void predict(vehest_health *h)
 {
     for (int32_t i = 0; i < C; i++) {
@@ -439,7 +439,7 @@ static void find_slope(vehest_health *h, int32_t i)
     }
 }
 
-/* h: what one unit of a form of fault in channel i does to the scaled innovations; form 0 offset, 1 scale, 2 delay. */
+/* h: effect of one unit of a form of fault in channel i on the scaled innovations; form 0 offset, 1 scale, 2 delay. */
 static void find_effect(vehest_health *h, int32_t i, int32_t form)
 {
     const vehest_real now = (form == 1) ? (h->x[i] - h->error[i]) : h->late[i];
@@ -451,7 +451,7 @@ static void find_effect(vehest_health *h, int32_t i, int32_t form)
         if (slope == 0.0f) {
             continue;
         }
-        if ((form == 0) || (m != i)) { /* what reaches other channels by relations is taken as steady */
+        if ((form == 0) || (m != i)) { /* effects on other channels by relations are taken as steady */
             const vehest_real steady = (form == 0) ? slope : (slope * now);
             for (int32_t j = 0; j < C; j++) {
                 h->effect[j] += SETTLED_GAIN[m][j] * steady;
@@ -557,7 +557,7 @@ static int32_t look_at_values(vehest_health *h, bool still)
     return slow;
 }
 
-/* What relation j leaves, and the means that tell whether it holds by far. */
+/* Residual of relation j, and the means that show whether it holds by far. */
 static void look_at_relation(vehest_health *h, int32_t j, bool still, bool complete)
 {
     const vehest_real u = h->x[0];
@@ -600,7 +600,7 @@ static void look_at_relation(vehest_health *h, int32_t j, bool still, bool compl
     }
 }
 
-/* Means of what relations leave. */
+/* Means of the residuals of relations. */
 static void look_at_relations(vehest_health *h, bool still)
 {
     const vehest_real u = h->x[0];
@@ -638,7 +638,7 @@ static int32_t likeliest(const vehest_health *h, int32_t best)
     return found;
 }
 
-/* What a relation says of the last second: FREE if it holds, SIGN or UNIT if not by far, NONE if too little happens. */
+/* Of the last second: FREE if a relation holds, SIGN or UNIT if not by far, NONE if the signals are too small. */
 static int32_t judge_relation(const vehest_health *h, int32_t j)
 {
     const vehest_real expected = h->expected_power[j];
@@ -659,8 +659,8 @@ static int32_t judge_relation(const vehest_health *h, int32_t j)
     return found;
 }
 
-/* What makes relations fail by far: the one channel that is in all that fail and in none that holds.
- * Channels that only ever stand together in what fails contradict each other; which of them is wrong nobody can tell.
+/* Cause of relations that fail by far: the one channel that is in all that fail and in none that holds.
+ * Channels that only ever occur together in failing relations contradict each other; which of them is wrong cannot be decided.
  */
 static suspicion find_contradiction(const vehest_health *h)
 {
@@ -702,7 +702,7 @@ static suspicion find_contradiction(const vehest_health *h)
     return found;
 }
 
-/* What the weightiest of all statistics beyond their limits says, and how far the farthest is. */
+/* Reason of the weightiest statistic beyond its limit, and the largest statistic over its limit. */
 static suspicion find_reason(const vehest_health *h, int32_t slow, vehest_real *highest)
 {
     suspicion found = { FREE, 0, NONE };
@@ -788,7 +788,7 @@ static uint8_t decide(vehest_health *h, int32_t absent, int32_t slow, int32_t *r
     return level;
 }
 
-/* Shift what the next row is predicted from. */
+/* Shift the samples that the next row is predicted from. */
 static void remember(vehest_health *h)
 {
     for (int32_t lag = P - 1; lag > 0; lag--) {

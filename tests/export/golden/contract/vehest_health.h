@@ -69,8 +69,8 @@ void vehest_health_start(vehest_health *health);
 
 /* Judge a row.
  *
- * row: as received; whatever where measured is false.
- * measured: what the guard believes.
+ * row: as received; arbitrary where measured is false.
+ * measured: the values that the guard accepts.
  * reason: output, 0 if there is none.
  *
  * Returns 0 valid, 1 degraded, 2 invalid.
