@@ -78,6 +78,12 @@ class Usability:
         return "not to train" if self.missing or self.patterns else "yes"
 
     @property
+    def lacks(self) -> str:
+        """Channels, samples or settings that are missing, for people; empty if none."""
+        gaps = [f"{name} without gaps" for name in self.gaps]
+        return ", ".join((*map(in_words, self.missing), *gaps)) or self.to_give
+
+    @property
     def without(self) -> str:
         """Which settings do without channels that nothing could supply, for people; empty if none do."""
         what = f"only {', '.join(self.left)} of those would be missing" if self.left else "it does without"
