@@ -710,8 +710,7 @@ def data_usable(
     """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
     from vehest.run.inspect_data import examine_usability
 
-    found = examine_usability(source, overrides or [])
-    emit(as_json, found.as_plain(), found.in_words())
+    emit(as_json, *examine_usability(source, overrides or []))
 
 
 @data_app.command("align")

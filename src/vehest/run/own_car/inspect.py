@@ -83,8 +83,8 @@ class Examined:
         return lines + ([f"  no channel: {counted(list(found.unused))}"] if found.unused else [])
 
 
-def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
-    """Read logs and propose a channel, unit and sign for each column.
+def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None], *, force: bool) -> Examined:
+    """Examine logs for a data set whose name is free.
 
     Args:
         name: of the data set.
@@ -93,17 +93,49 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         force: whether the data set's files may exist already.
 
     Raises:
-        ConfigurationError: the name is taken or cannot be part of a file's name, or the files differ in format or folder.
-        MissingError: a file does not exist.
-        DataError: a file cannot be read, or differs in layout or columns.
+        ConfigurationError: the name is taken or cannot be part of a file's name.
+        VehestError: as `examine`.
     """
     check_name(name, "data set")
     refuse_existing(name, force=force)
     if name in choices("dataset") and not paths_of(name)[0].exists():
         raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        logs = [survey(file) for file in files]
-    return _examined(name, files, logs, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
+        return examine(name, files, vehicle)
+
+
+def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None) -> Examined:
+    """Read logs and propose a channel, unit and sign for each column.
+
+    Raises:
+        ConfigurationError: the files differ in format or folder.
+        MissingError: a file does not exist.
+        DataError: a file cannot be read, or differs in layout or columns.
+    """
+    logs = [survey(file) for file in files]
+    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
+    if len(formats) > 1:
+        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
+    longest = max(logs, key=_length)
+    _refuse_other_layouts(longest, logs)
+    longest = replace(longest, **_common(longest, logs))
+    others = [log for log in logs if log.file != longest.file]
+    columns, rate = _evidence(longest)
+    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
+    if longest.source not in TABLES:  # other sources make no reference of positions
+        proposals = replace(proposals, pose=())
+    used = {one.column for one in proposals.channels}
+    for log in others:
+        missing = sorted(used - {column.name for column in log.columns})
+        if missing:
+            raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
+        proposals = possible(proposals, {column.name: column.values for column in log.columns})
+    if not proposals.channels:
+        names = ", ".join(column.name for column in longest.columns[:8])
+        raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
+    return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
 
 
 def paths_of(name: str) -> tuple[Path, Path, Path]:
@@ -130,32 +162,6 @@ def is_parquet(log: Log) -> bool:
 def rate_of(stamps: FloatArray) -> float:
     """Median rate of time stamps [Hz]."""
     return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
-
-
-def _examined(name: str, files: Sequence[Path], logs: Sequence[Log], vehicle: Mapping[str, float | None]) -> Examined:
-    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
-    if len(formats) > 1:
-        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
-    longest = max(logs, key=_length)
-    _refuse_other_layouts(longest, logs)
-    longest = replace(longest, **_common(longest, logs))
-    others = [log for log in logs if log.file != longest.file]
-    columns, rate = _evidence(longest)
-    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
-    if longest.source not in TABLES:  # other sources make no reference of positions
-        proposals = replace(proposals, pose=())
-    used = {one.column for one in proposals.channels}
-    for log in others:
-        missing = sorted(used - {column.name for column in log.columns})
-        if missing:
-            raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
-        proposals = possible(proposals, {column.name: column.values for column in log.columns})
-    if not proposals.channels:
-        names = ", ".join(column.name for column in longest.columns[:8])
-        raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
-    place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
-    return Examined(name, tuple(files), (longest, *others), proposals, place, rate, vehicle)
 
 
 def _length(log: Log) -> int:
