@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -200,12 +198,11 @@ def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 def _table(alignment: Alignment) -> str:
     """Parameters with all digits, SI units."""
-    stream = io.StringIO()
-    rows = [_plain_parameter(parameter) for parameter in alignment.parameters]
-    writer = csv.DictWriter(stream, ["recording", "kind", *rows[0]], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({"recording": alignment.recording_id, "kind": alignment.kind, **row} for row in rows)
-    return stream.getvalue()
+    import pandas as pd
+
+    recording = {"recording": alignment.recording_id, "kind": alignment.kind}
+    table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
+    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
 def _transforms(alignment: Alignment) -> str:

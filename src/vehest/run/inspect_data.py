@@ -40,16 +40,9 @@ def dataset_rows() -> list[dict[str, str]]:
     rows = []
     for name in choices("dataset"):
         dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
+        texts = {key: " ".join(str(dataset.get(key, "")).split()) for key in ("title", "licence", "citation")}
         rows.append(
-            {
-                "dataset": name,
-                "kind": kind_of(dataset),
-                "source": str(dataset.get("source", "")),
-                "here": _is_here(dataset),
-                "title": str(dataset.get("title", "")),
-                "licence": " ".join(str(dataset.get("licence", "")).split()),
-                "citation": " ".join(str(dataset.get("citation", "")).split()),
-            }
+            {"dataset": name, "kind": kind_of(dataset), "source": str(dataset.get("source", "")), "here": _is_here(dataset), **texts}
         )
     return rows
 

@@ -60,7 +60,7 @@ class Usability:
         missing: channels that the recordings lack.
         gaps: channels with gaps that it cannot skip.
         settings: overrides that avoid channels without a supply.
-        left: channels without a supply that are missing even then.
+        without: the same in words, with channels that are missing even then.
         patterns: overrides that its fit needs, since it asks for recordings by other names.
         to_give: setting that only the user knows, in words; empty if none.
         car: keys of the car's parameters, which are those of another car unless given.
@@ -72,7 +72,7 @@ class Usability:
     missing: tuple[Missing, ...] = ()
     gaps: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
-    left: tuple[str, ...] = ()
+    without: str = ""
     patterns: tuple[str, ...] = ()
     to_give: str = ""
     car: tuple[str, ...] = ()
@@ -89,12 +89,6 @@ class Usability:
         """Channels, samples or settings that are missing, for people; empty if none."""
         gaps = [f"{name} without gaps" for name in self.gaps]
         return ", ".join((*(one.in_words for one in self.missing), *gaps)) or self.to_give
-
-    @property
-    def without(self) -> str:
-        """Settings that avoid channels without a supply, for people; empty if none do."""
-        what = f"only {', '.join(self.left)} of those would be missing" if self.left else "it does without"
-        return f"with {' '.join(self.settings)} {what}" if self.settings else ""
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -142,13 +136,13 @@ def usability(name: str, config: Config, recordings: Sequence[Contents], to_esti
         absent = _absent(getattr(estimator_class(str(config["estimator"]["name"])), "channels", ()), both)
         return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
     missing = _missing(estimator, training, recordings, to_estimate)
-    settings, left = _settings_without(config, recordings, to_estimate) if any(one.supply is None for one in missing) else ((), ())
+    settings, without = _settings_without(config, recordings, to_estimate) if any(one.supply is None for one in missing) else ((), "")
     patterns = settings_without_recordings(estimator, training, [own.id for own in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
     rate = min([own_rate, *(own.rate_hz for own in both)])
     car = getattr(estimator.settings, "car", None)
     keys = tuple(f"estimator.car.{field.name}" for field in fields(car)) if is_dataclass(car) else ()
-    return Usability(name, rate, own_rate, missing, gaps_that_matter(estimator, _gappy(both)), settings, left, patterns, car=keys)
+    return Usability(name, rate, own_rate, missing, gaps_that_matter(estimator, _gappy(both)), settings, without, patterns, car=keys)
 
 
 def table_row(found: Usability) -> list[str]:
@@ -261,10 +255,8 @@ def _gappy(recordings: Sequence[Contents]) -> frozenset[str]:
     return frozenset(name for recording in recordings for name in recording.gappy)
 
 
-def _settings_without(
-    config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Overrides that avoid channels without a supply, taken while they help, and those channels that are left."""
+def _settings_without(config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> tuple[tuple[str, ...], str]:
+    """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
 
     def unsupplied(candidate: Config) -> list[str] | None:
         try:
@@ -282,7 +274,9 @@ def _settings_without(
             break
         best, config = left, own
         found[key] = text
-    return tuple(f"{key}={text}" for key, text in found.items()), tuple(best)
+    settings = tuple(f"{key}={text}" for key, text in found.items())
+    rest = f"only {', '.join(best)} of those would be missing" if best else "it does without"
+    return settings, f"with {' '.join(settings)} {rest}" if settings else ""
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, str, Config]]:

@@ -26,9 +26,8 @@ from vehest.sources.base import open_source
 from vehest.sources.columns import plain_rate
 from vehest.sources.surveys import RawColumn
 
-TABLE_POLICIES = ("strict", "interpolate", "uniform")
-POLICIES = {"tabular": TABLE_POLICIES, "text_log": TABLE_POLICIES, "vbo": TABLE_POLICIES[:2]}
-"""Source -> clocks of its data sets, the strictest first; others make their own."""
+POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
+"""Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
@@ -112,10 +111,10 @@ def draft(examined: Examined) -> Draft:
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
     """The data set with the strictest clock that all files keep, and its recordings."""
-    policies = POLICIES.get(dataset["source"], ())
-    for policy in policies:
+    for policy in POLICIES.get(dataset["source"], ()):
         with suppress(DataError):
-            return (own := dataset | {"clock": policy}), _recordings(own)
+            own = dataset | {"clock": policy}
+            return own, _recordings(own)
     return dataset, _recordings(dataset)
 
 

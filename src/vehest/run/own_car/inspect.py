@@ -84,13 +84,7 @@ class Examined:
 
 
 def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None], *, force: bool) -> Examined:
-    """Examine logs for a data set whose name is free.
-
-    Args:
-        name: of the data set.
-        files: of one format and one set of columns, a recording each.
-        vehicle: known values of `VEHICLE`.
-        force: whether the data set's files may exist already.
+    """Examine logs for a data set of that name, whose files may exist with ``force`` only.
 
     Raises:
         ConfigurationError: the name is taken or cannot be part of a file's name.
@@ -106,6 +100,11 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
 
 def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None) -> Examined:
     """Read logs and propose a channel, unit and sign for each column.
+
+    Args:
+        name: of the data set.
+        files: of one format and one set of columns, a recording each.
+        vehicle: known values of `VEHICLE`.
 
     Raises:
         ConfigurationError: the files differ in format or folder.
@@ -144,11 +143,7 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
 
 
 def refuse_existing(name: str, *, force: bool) -> None:
-    """Keep existing files of a data set.
-
-    Raises:
-        ConfigurationError: one exists, and ``force`` is not given.
-    """
+    """Raise ConfigurationError where a file of the data set exists, and ``force`` is not given."""
     existing = [str(file) for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
         raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")

@@ -161,11 +161,8 @@ def _limits(own: Draft) -> list[str]:
     """Comparisons that the recordings do not allow."""
     missing = [name for name in SCORED if name not in own.channels]
     if not missing:
-        return (
-            [f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"]
-            if own.seconds < SHORT
-            else []
-        )
+        text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
+        return [text] if own.seconds < SHORT else []
     if "vy_ref" in own.channels or "sideslip_ref" in own.channels:
         return [f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
     lacking = ", ".join(name for name in PRETRAINED_CHANNELS if name not in own.contents[0].channels)
