@@ -178,4 +178,4 @@ def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path,
     write(tmp_path / "gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     code, out, err = run_vehest(capsys, "new", "my_car", "gyro.csv", "--yes")
     assert (code, err) == (0, "")
-    assert "which lacks vx, ax, ay" in out
+    assert "it lacks vx, ax, ay" in out
