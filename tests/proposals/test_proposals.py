@@ -206,7 +206,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         (b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
         (b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
         (b"t,v\n1,2\n", "1 row of numbers"),
-        (b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column could be told"),
+        (b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column is recognised"),
     ],
 )
 def test_what_is_no_log_is_one_line(tmp_path, content: bytes, said: str) -> None:

@@ -44,7 +44,7 @@ VEHICLE = {
     "mass": "mass [kg], if you know it (with the wheelbase, filters over a single track)",
     "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
 }
-"""Values of the car that no log tells."""
+"""Values of the car that no log holds, as questions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:
         names = ", ".join(column.name for column in longest.columns[:8])
-        raise DataError(f"'{longest.file}': no column could be told to be a channel, by name or by motion (it has {names})")
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion (it has {names})")
     proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
     place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))

@@ -1,4 +1,4 @@
-"""Questions that logs leave open: Examined -> questions -> answers -> Examined with what was answered."""
+"""Questions that logs leave open: Examined -> questions -> answers -> Examined with the answers."""
 
 from __future__ import annotations
 
@@ -201,15 +201,15 @@ def _parsed(answer: str, own: Proposal) -> Proposal:
     if sign not in ("", "1", "+1", "-1"):
         raise ConfigurationError(f"'{answer}': the sign must be 1 or -1, not '{sign}'")
     factor_of = _number(factor, f"'{answer}': the factor") if factor else own.factor
-    told = replace(own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked="")
-    return told.with_evidence("as answered")
+    declared = replace(own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked="")
+    return declared.with_evidence("as answered")
 
 
-def _number(text: str, what: str) -> float:
+def _number(text: str, quantity: str) -> float:
     try:
         value = float(text.replace(",", "."))
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value > 0.0):
-        raise ConfigurationError(f"{what} must be a positive number, not '{text}'")
+        raise ConfigurationError(f"{quantity} must be a positive number, not '{text}'")
     return value

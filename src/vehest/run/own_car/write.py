@@ -118,7 +118,7 @@ class Outcome:
         lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in self.open]
         lines += _limits(own)
         if self.plan is not None:
-            lines += [f"left out: {name}: {what}" for name, what in self.plan.lacking.items()]
+            lines += [f"left out: {name}: {lack}" for name, lack in self.plan.lacking.items()]
         tried = "" if self.plan is None else ", ".join(self.plan.estimators)
         purposes = ("channels, units and signs of the columns", "ranges for training, validation and test", f"estimators: {tried}")
         for file, purpose in zip(self.files, purposes, strict=False):
@@ -201,7 +201,7 @@ def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
     ]
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
     head += ["Left out, and what each lacks:"] if plan.lacking else []
-    return _yaml(pipeline_of(name, plan, minutes), [*head, *(f"  {own}: {what}" for own, what in plan.lacking.items())])
+    return _yaml(pipeline_of(name, plan, minutes), [*head, *(f"  {own}: {lack}" for own, lack in plan.lacking.items())])
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
