@@ -163,16 +163,16 @@ def new_car(
     Proposes for every column channel, unit, sign and delay, with what speaks for it, asks what the logs do not decide, and writes
     conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
-    from vehest.run.new_car import Vehicle
-    from vehest.run.new_car_outcome import begin, conclude, found_in_words, in_words, settle
-    from vehest.run.new_car_questions import ask, key_and_answer
+    from vehest.run.own_car.inspect import inspect
+    from vehest.run.own_car.questions import ask
+    from vehest.run.own_car.write import write
 
-    given = dict(key_and_answer(text) for text in answer or [])
-    examined = begin(name, files, force=force)
-    emit(False, None, [] if as_json else found_in_words(examined, files))
-    draft, left = settle(examined, Vehicle(wheelbase, mass, steering_ratio), None if yes or as_json else ask, given)
-    outcome = conclude(draft, left, force=force, dry_run=dry_run)
-    emit(as_json, {**outcome.as_plain(), "dry_run": dry_run}, in_words(outcome, dry_run))
+    vehicle = {"wheelbase": wheelbase, "mass": mass, "steering_ratio": steering_ratio}
+    examined = inspect(name, files, vehicle, force=force)
+    emit(False, None, [] if as_json else examined.in_words())
+    examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
+    outcome = write(examined, left, force=force, dry_run=dry_run)
+    emit(as_json, outcome.as_plain(), outcome.in_words())
 
 
 @app.command(epilog=_offered("dataset"))
@@ -710,8 +710,7 @@ def data_usable(
     """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
     from vehest.run.inspect_data import examine_usability
 
-    found = examine_usability(source, overrides or [])
-    emit(as_json, found.as_plain(), found.in_words())
+    emit(as_json, *examine_usability(source, overrides or []))
 
 
 @data_app.command("align")

@@ -15,9 +15,10 @@ from planted_logs import RADIUS, drive, usual, write
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
-from vehest.run.new_car import Vehicle, draft, examine
-from vehest.run.new_car_outcome import conclude
-from vehest.run.new_car_questions import questions_of
+from vehest.run.own_car.dataset import draft
+from vehest.run.own_car.inspect import examine
+from vehest.run.own_car.questions import questions_of
+from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
 
@@ -102,7 +103,7 @@ def test_wheels_alone_give_a_speed_and_their_radius(tmp_path) -> None:
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
-    made = draft(examined, examined.proposals, Vehicle())
+    made = draft(examined)
     assert {"vx", "vy_ref"} <= made.contents[0].channels
 
 
@@ -116,9 +117,9 @@ def test_road_wheel_and_steering_wheel_are_told_apart_by_range_and_slow_corners(
 
 
 def test_steering_ratio_is_estimated_where_the_wheelbase_is_told(tmp_path) -> None:
-    examined = examine("my_car", [write(tmp_path / "lap.csv", usual(drive(300.0)))])
-    assert draft(examined, examined.proposals, Vehicle()).ratio is None
-    ratio = draft(examined, examined.proposals, Vehicle(wheelbase=2.7)).ratio
+    file = write(tmp_path / "lap.csv", usual(drive(300.0)))
+    assert draft(examine("my_car", [file])).ratio is None
+    ratio = draft(examine("my_car", [file], {"wheelbase": 2.7})).ratio
     assert ratio is not None
     assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
 
@@ -143,7 +144,7 @@ def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path) -> None:
     table = usual(d)
     table["Gyro"] = np.interp(d["t"] - 0.12, d["t"], table["Gyro"])
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
-    made = draft(examined, examined.proposals, Vehicle())
+    made = draft(examined)
     assert made.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
     assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), "an estimator in the car gets it late, too"
 
@@ -165,7 +166,7 @@ def test_slow_signals_with_empty_cells_are_bridged(tmp_path) -> None:
     table = usual(d)
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
-    made = draft(examined, examined.proposals, Vehicle())
+    made = draft(examined)
     assert made.dataset["source"] == "text_log"
     (recording,) = (open_source(made.dataset).read("lap"),)
     np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
@@ -174,9 +175,9 @@ def test_slow_signals_with_empty_cells_are_bridged(tmp_path) -> None:
 
 def test_a_log_without_reference_cannot_rank_anything(tmp_path) -> None:
     examined = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
-    outcome = conclude(draft(examined, examined.proposals, Vehicle()), (), force=False, dry_run=True)
+    outcome = write_files(examined, dry_run=True)
     assert outcome.plan is None
-    assert [one.file.parts[0] for one in outcome.files] == ["conf"]
+    assert [file.parts[0] for file in outcome.files] == ["conf"]
     assert outcome.next_commands()[-1].startswith("vehest estimate pretrained ")
 
 
@@ -187,8 +188,8 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
     y = np.cumsum(d["vx"] * np.sin(yaw) + d["vy"] * np.cos(yaw)) / 50.0
     table = usual(d).drop(columns="Beta").assign(pose_x=x, pose_y=y, pose_yaw=yaw)
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
-    made = draft(examined, examined.proposals, Vehicle())
-    assert made.has_reference
+    made = draft(examined)
+    assert "vy_ref" in made.channels
     recording = open_source(made.dataset).read("lap")
     assert np.corrcoef(recording["vy_ref"], d["vy"])[0, 1] > 0.9
 
@@ -205,7 +206,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         (b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
         (b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
         (b"t,v\n1,2\n", "1 row of numbers"),
-        (b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column could be told"),
+        (b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column is recognised"),
     ],
 )
 def test_what_is_no_log_is_one_line(tmp_path, content: bytes, said: str) -> None:
@@ -244,7 +245,7 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path) -> None
     assert (log.source, log.options["skip_rows"]) == ("text_log", 3)
     assert {column.name: column.unit for column in log.columns} == {"Ground Speed": "km/h", "Gyro Yaw": "deg/s", "G Lat": "m/s^2"}
     examined = examine("my_car", [tmp_path / "lap.csv"])
-    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    recording = open_source(draft(examined).dataset).read("lap")
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
 
@@ -290,8 +291,7 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log: st
         pytest.importorskip("rosbags", reason="the extra ros is not installed")
     files = write_log(log, data_root, tmp_path)
     examined = examine("my_car", files)
-    made = draft(examined, examined.proposals, Vehicle())
-    outcome = conclude(made, tuple(questions_of(examined)), force=False, dry_run=True)
+    outcome = write_files(examined, tuple(questions_of(examined)), dry_run=True)
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
     assert [row for row in rows_of(log, answers, outcome.as_plain()) if row["correct"] != "yes"] == []
 
@@ -335,7 +335,7 @@ def test_times_of_a_clock_are_read(tmp_path, first: str, zone: str) -> None:
     table = usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=[stamp.strftime(how)[:-3] + zone for stamp in stamps])
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.rate_hz is None
-    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    recording = open_source(draft(examined).dataset).read("lap")
     assert recording.rate_hz == pytest.approx(50.0)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
@@ -347,7 +347,7 @@ def test_marks_of_missing_samples_are_bridged(tmp_path, mark: str) -> None:
     table.loc[1000:1010, "LatAcc"] = np.nan
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     examined = examine("my_car", [write(tmp_path / "lap.csv", table, na_rep=mark)])
-    recording = open_source(draft(examined, examined.proposals, Vehicle()).dataset).read("lap")
+    recording = open_source(draft(examined).dataset).read("lap")
     assert np.isfinite(recording["ay"]).all()
     np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
 
@@ -388,7 +388,7 @@ def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
     first, second = usual(drive(seed=1)), usual(drive(100.0, seed=2))
     second["Speed"] /= 3.6
     examined = examine("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
-    remarks = draft(examined, examined.proposals, Vehicle()).remarks
+    remarks = draft(examined).remarks
     assert any(one.check == "unit" and one.message.startswith("in 'lap_2', ay is 3.6") for one in remarks)
 
 
@@ -396,7 +396,7 @@ def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
     ("options", "columns", "said"),
     [
         ({"sep": ";"}, {}, "has delimiter ';'"),
-        ({}, {"Time [s]": "Time [ms]"}, r"the times 'Time \[ms\]' in ms"),
+        ({}, {"Time [s]": "Time [ms]"}, r"has times 'Time \[ms\] in ms'"),
         ({}, {"LongAcc": "Acc"}, "has no column 'LongAcc'"),
     ],
 )
@@ -413,7 +413,7 @@ def test_a_mark_in_the_second_file_alone_is_read(tmp_path) -> None:
     second.loc[10:12, "LatAcc"] = np.nan
     files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", second, na_rep="-")]
     examined = examine("my_car", files)
-    assert len(draft(examined, examined.proposals, Vehicle()).contents) == 2
+    assert len(draft(examined).contents) == 2
 
 
 def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path) -> None:
@@ -426,9 +426,9 @@ def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path) -> 
 def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
     table = usual(drive())
     table["Gyro"] = np.repeat(table["Gyro"].to_numpy()[::10], 10)
-    notes = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
-    assert any(note.startswith("'Gyro': a new value in one of 10 rows") and "held" in note for note in notes)
-    assert not examine("my_car", [write(tmp_path / "plain.csv", usual(drive()))]).proposals.notes
+    remarks = draft(examine("my_car", [write(tmp_path / "lap.csv", table)])).remarks
+    assert any(one.check == "held" and one.channel == "yaw_rate" for one in remarks)
+    assert not draft(examine("my_car", [write(tmp_path / "plain.csv", usual(drive()))])).remarks
 
 
 def test_a_pose_that_does_not_follow_the_motion_is_told_of(tmp_path) -> None:
@@ -451,7 +451,7 @@ def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> No
     table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 9999.0
     examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
-    made = draft(examined, examined.proposals, Vehicle())
+    made = draft(examined)
     assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
     assert any("data rows 2001, 2002" in note for note in made.notes)
     recording = open_source(made.dataset).read("lap")

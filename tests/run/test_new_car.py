@@ -76,7 +76,7 @@ def test_yes_asks_nothing_and_lists_what_it_left_open(capsys, log) -> None:
     assert (code, err) == (0, "")
     assert "open, taken as proposed:\n  left_right: yes (in a left turn" in out
     assert all(f"wrote {file}: " in out for file in FILES)
-    assert "Not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
+    assert "Open, not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
 
 
 def test_json_says_all_of_it_to_a_script(capsys, log) -> None:
@@ -142,8 +142,8 @@ def test_nothing_half_written_stays(capsys, log) -> None:
         (("new", "my car", "lap.csv", "--yes"), 2, "'my car' must be made of letters"),
         (("new", "f1tenth", "lap.csv", "--yes"), 2, "is a data set that comes with vehest"),
         (("new", "my_car", "lap.csv", "--yes", "--answer", "left"), 2, "must be KEY=ANSWER"),
-        (("new", "my_car", "lap.csv", "--yes", "--answer", "gear=3"), 2, "nothing is asked of 'gear'"),
-        (("new", "my_car", "lap.csv"), 2, "nobody answers here; add --yes"),
+        (("new", "my_car", "lap.csv", "--yes", "--answer", "gear=3"), 2, "no question has the key 'gear'"),
+        (("new", "my_car", "lap.csv"), 2, "no terminal for questions; add --yes"),
     ],
 )
 def test_what_cannot_be_done_is_one_line(capsys, log, monkeypatch, words: tuple[str, ...], code: int, said: str) -> None:
@@ -178,4 +178,4 @@ def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path,
     write(tmp_path / "gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     code, out, err = run_vehest(capsys, "new", "my_car", "gyro.csv", "--yes")
     assert (code, err) == (0, "")
-    assert "which lacks vx, ax, ay" in out
+    assert "it lacks vx, ax, ay" in out

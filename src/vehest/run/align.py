@@ -1,9 +1,7 @@
-"""Aligning a measuring set-up: what `vehest data align` prints and writes. It estimates and applies nothing."""
+"""Output of `vehest data align`: recording -> alignment -> lines, JSON, and a folder of files. Nothing is applied."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,16 +40,16 @@ TITLES = {
 
 
 def align_recording(source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings) -> Alignment:
-    """Estimate what is asked for from one recording.
+    """Estimate quantities from one recording.
 
     Args:
         source: a data set, or a CSV or Parquet file.
         overrides: of the configuration that reads it.
         recording_id: which recording of a data set; not needed where it has one.
-        settings: what to estimate.
+        settings: quantities to estimate.
 
     Raises:
-        VehestError: there is no such recording, it cannot be read, or it cannot tell what is asked for.
+        VehestError: there is no such recording, it cannot be read, or it does not determine them.
     """
     config = config_of(source, overrides)
     with use_limits(limits_from_config(config["limits"])):
@@ -91,7 +89,8 @@ def in_words(alignment: Alignment, out: Path | None) -> list[str | TerminalTable
 
 def override_of(alignment: Alignment) -> str:
     """The transforms as an override that Hydra reads."""
-    return f"downsample.transforms={_in_hydra(list(alignment.transforms))}"
+    transforms = [dict(transform) for transform in alignment.transforms]
+    return f"downsample.transforms={yaml.safe_dump(transforms, default_flow_style=True, width=math.inf, sort_keys=False).strip()}"
 
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
@@ -106,14 +105,8 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
         "cutoff_hz": alignment.settings.cutoff_hz,
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
-            {
-                "channel": residual.channel,
-                "unit": residual.unit,
-                "rms_before": residual.rms_before,
-                "rms_after": residual.rms_after,
-                "rms_without_tilt": residual.rms_rest,
-            }
-            for residual in alignment.residuals
+            {key: getattr(one, key) for key in ("channel", "unit", "rms_before", "rms_after")} | {"rms_without_tilt": one.rms_rest}
+            for one in alignment.residuals
         ],
         "correlation": None if correlation is None else {"of": correlation.signal, "peak": correlation.peak, "value": correlation.highest},
         "transforms": [dict(transform) for transform in alignment.transforms],
@@ -133,11 +126,8 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
     refuse_other_files(folder)
     contents = {f"alignment.{ending}": content for ending, content in figure_files(alignment_figure(alignment)).items()}
-    contents |= {
-        "alignment.md": _report(alignment).encode("utf-8", "backslashreplace"),
-        "alignment.csv": _table(alignment).encode("utf-8", "backslashreplace"),
-        "alignment.yaml": _transforms(alignment).encode("utf-8", "backslashreplace"),
-    }
+    texts = {"alignment.md": _report(alignment), "alignment.csv": _table(alignment), "alignment.yaml": _transforms(alignment)}
+    contents |= {name: text.encode("utf-8", "backslashreplace") for name, text in texts.items()}
     with written_aside(folder, replace_folder=True) as aside:
         aside.mkdir()
         for name in FILES:
@@ -145,10 +135,10 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
 
 
 def refuse_other_files(folder: Path) -> None:
-    """See that a folder is free, or holds a former alignment only.
+    """Keep other files than those of a former alignment.
 
     Raises:
-        ConfigurationError: it does not.
+        ConfigurationError: the folder holds others, or is none.
     """
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigurationError(f"'{folder}' is not a folder; name a new one")
@@ -165,7 +155,7 @@ def _one_recording(source: str, config: Config, recording_id: str | None) -> Rec
         if recording_id is None and len(known) != 1:
             shown = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
             raise ConfigurationError(f"data set '{source}' has {len(known)} recordings ({shown}); say which: --recording ID")
-        recording = origin.read(recording_id if recording_id is not None else known[0])
+        recording = origin.read(known[0] if recording_id is None else recording_id)
     else:
         recording = read_single(dataset, Path(source))
         if recording_id not in (None, recording.id):
@@ -208,12 +198,11 @@ def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 def _table(alignment: Alignment) -> str:
     """Parameters with all digits, SI units."""
-    stream = io.StringIO()
-    rows = [_plain_parameter(parameter) for parameter in alignment.parameters]
-    writer = csv.DictWriter(stream, ["recording", "kind", *rows[0]], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({"recording": alignment.recording_id, "kind": alignment.kind, **row} for row in rows)
-    return stream.getvalue()
+    import pandas as pd
+
+    recording = {"recording": alignment.recording_id, "kind": alignment.kind}
+    table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
+    return str(table.to_csv(index=False, lineterminator="\n"))
 
 
 def _transforms(alignment: Alignment) -> str:
@@ -222,25 +211,8 @@ def _transforms(alignment: Alignment) -> str:
 
 
 def _plain_parameter(parameter: Parameter) -> dict[str, Any]:
-    return {
-        "name": parameter.name,
-        "value": parameter.value,
-        "uncertainty": parameter.uncertainty,
-        "low": parameter.low,
-        "high": parameter.high,
-        "unit": parameter.unit,
-        "from_scatter": parameter.scatter,
-        "from_tilt": parameter.tilt,
-    }
-
-
-def _in_hydra(value: Any) -> str:
-    """Plain values in Hydra's grammar; strings are names here and need no quotes."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_in_hydra(inner)}" for key, inner in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_in_hydra(inner) for inner in value) + "]"
-    return str(value)
+    plain = {key: getattr(parameter, key) for key in ("name", "value", "uncertainty", "low", "high", "unit")}
+    return plain | {"from_scatter": parameter.scatter, "from_tilt": parameter.tilt}
 
 
 def _three_digits(size: float) -> str:

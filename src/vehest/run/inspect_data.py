@@ -1,12 +1,14 @@
-"""Looking at data sets and files: what `vehest data list | show | check | usable` print."""
+"""Output of `vehest data list | show | check | usable`: data set or file -> recordings -> rows, and lines for a terminal."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.printing import TerminalTable
-from vehest.run.usable import HEADER, Missing, Usability, all_usabilities, borrowed_cars, remedies, table_row, unscored
+from vehest.run.usable import HEADER, all_usabilities, borrowed_cars, remedies, table_row, unscored
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.unused import unused_columns
 
@@ -38,16 +40,9 @@ def dataset_rows() -> list[dict[str, str]]:
     rows = []
     for name in choices("dataset"):
         dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
+        texts = {key: " ".join(str(dataset.get(key, "")).split()) for key in ("title", "licence", "citation")}
         rows.append(
-            {
-                "dataset": name,
-                "kind": kind_of(dataset),
-                "source": str(dataset.get("source", "")),
-                "here": _is_here(dataset),
-                "title": str(dataset.get("title", "")),
-                "licence": " ".join(str(dataset.get("licence", "")).split()),
-                "citation": " ".join(str(dataset.get("citation", "")).split()),
-            }
+            {"dataset": name, "kind": kind_of(dataset), "source": str(dataset.get("source", "")), "here": _is_here(dataset), **texts}
         )
     return rows
 
@@ -61,7 +56,7 @@ def datasets_in_words(rows: Sequence[Mapping[str, str]]) -> list[str | TerminalT
 
 
 def recordings_in_words(described: Mapping[str, Any]) -> Iterator[str | TerminalTable]:
-    """What `describe` found, for a terminal."""
+    """Output of `describe` for a terminal."""
     for recording in described["recordings"]:
         yield (
             f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
@@ -73,7 +68,7 @@ def recordings_in_words(described: Mapping[str, Any]) -> Iterator[str | Terminal
 
 
 def _stretch(start: float, end: float) -> str:
-    """When a recording begins and ends [s]; of unix time the date, and seconds from it on."""
+    """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
     if not EARLIEST_UNIX < start < LATEST_UNIX:
         return f"{start:.6g} s to {end:.6g} s"
     return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
@@ -93,126 +88,89 @@ def describe(source: str, overrides: Sequence[str]) -> dict[str, Any]:
     """
     config = config_of(source, overrides)
     with use_limits(limits_from_config(config["limits"])):
-        return {"source": source, "recordings": [_described(recording) for recording in _recordings(source, config)]}
+        return {"source": source, "recordings": [_described(read()) for _, read in _readers(source, config)]}
 
 
 def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
-    """What the checks find, a row a finding; a recording that cannot be read is an error too."""
+    """Findings of the checks, a row each; a recording that cannot be read is an error too."""
     config = config_of(source, overrides)
+    rows: list[dict[str, str]] = []
     with use_limits(limits_from_config(config["limits"])):
-        return [row for recording in _recordings(source, config) for row in _finding_rows(recording)]
+        for name, read in _readers(source, config):
+            try:
+                recording = read()
+            except DataError as error:
+                rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
+            else:
+                rows += [{"recording": recording.id, **asdict(finding)} for finding in checks_of_recording(recording)]
+    return rows
 
 
-@dataclass(frozen=True)
-class Examined:
-    """What estimators could do with a data set or file.
-
-    Args:
-        source: its name.
-        recordings: what they have; of a simulation that has not been ingested one alone.
-        rows: an estimator each.
-        unscored: channels by which every estimate is scored and that are missing.
-        columns: of a table, that no channel uses.
-    """
-
-    source: str
-    recordings: tuple[Contents, ...]
-    rows: tuple[Usability, ...]
-    unscored: tuple[Missing, ...]
-    columns: tuple[str, ...]
-
-    @property
-    def rate_hz(self) -> float:
-        """The lowest rate [Hz]."""
-        return min(recording.rate_hz for recording in self.recordings)
-
-    def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "source": self.source,
-            "recordings": [recording.id for recording in self.recordings],
-            "rate_hz": self.rate_hz,
-            "missing_to_score": [missing.channel for missing in self.unscored],
-            "unused_columns": list(self.columns),
-            "estimators": [row.as_plain() for row in self.rows],
-        }
-
-    def in_words(self) -> list[str | TerminalTable]:
-        """For a terminal."""
-        lines: list[str | TerminalTable] = [TerminalTable("", HEADER, [table_row(row) for row in self.rows]), "", *remedies(self.rows)]
-        if self.unscored:
-            lines.append(f"every estimate is scored by {' and '.join(missing.channel for missing in self.unscored)}")
-        if self.columns:
-            names = ", ".join(self.columns[:MOST_COLUMNS]) + (", …" if len(self.columns) > MOST_COLUMNS else "")
-            lines.append(
-                f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset"
-            )
-        borrowed = borrowed_cars(self.rows)
-        return [*lines, borrowed] if borrowed else lines
-
-
-def examine_usability(source: str, overrides: Sequence[str]) -> Examined:
-    """Which estimators a data set or file can be used with, and what it lacks.
+def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str | TerminalTable]]:
+    """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal.
 
     Raises:
         VehestError: it cannot be read.
     """
     config = config_of(source, overrides)
     with use_limits(limits_from_config(config["limits"])):
-        recordings = tuple(_contents(source, config))
-        if not recordings:
-            raise DataError(f"'{source}' holds no recordings")
+        recordings = _contents(source, config)
         columns = unused_columns(config["dataset"], None if source in choices("dataset") else Path(source))
-    return Examined(source, recordings, tuple(all_usabilities(recordings)), unscored(recordings), tuple(columns))
-
-
-def _contents(source: str, config: Config) -> Iterator[Contents]:
-    """What recordings have: from the store if they are there, else from what is read; of a slow source the first."""
-    if source in choices("dataset"):
-        ingested = find(plan_ingest(config))
-        if ingested is not None:
-            yield from (stored_contents(ingested.folder / file) for file in ingested.outputs)
-            return
-    slow = open_source(config["dataset"]).slow
-    for recording in _recordings(source, config):
-        if isinstance(recording, tuple):
-            raise recording[1]
-        yield contents_of(recording)
-        if slow:
-            return
+    if not recordings:
+        raise DataError(f"'{source}' holds no recordings")
+    rows, missing = all_usabilities(recordings), [one.channel for one in unscored(recordings)]
+    lines: list[str | TerminalTable] = [TerminalTable("", HEADER, [table_row(row) for row in rows]), "", *remedies(rows)]
+    if missing:
+        lines.append(f"every estimate is scored by {' and '.join(missing)}")
+    if columns:
+        names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
+        lines.append(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
+    borrowed = borrowed_cars(rows)
+    plain = {
+        "source": source,
+        "recordings": [recording.id for recording in recordings],
+        "rate_hz": min(recording.rate_hz for recording in recordings),
+        "missing_to_score": missing,
+        "unused_columns": list(columns),
+        "estimators": [row.as_plain() for row in rows],
+    }
+    return plain, [*lines, borrowed] if borrowed else lines
 
 
 def config_of(source: str, overrides: Sequence[str]) -> Config:
-    """The configuration that reads a data set, or else a file.
+    """The configuration that reads a data set or a file.
 
     Raises:
         ConfigurationError: it is neither, or an override makes no sense.
     """
     if source in choices("dataset"):
         return compose_config("ingest", [f"dataset={source}", *overrides])
-    if not os.path.lexists(source):  # which says no, too, where a name is too long or holds a null character
+    if not os.path.lexists(source):  # also of a name that is too long or holds a null character
         raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
     return compose_config("estimate", overrides)
 
 
-def _spread(samples: FloatArray) -> dict[str, float]:
-    """Smallest, mean and largest value and standard deviation of what was measured; NaN where nothing was."""
-    functions: dict[str, Callable[[FloatArray], Any]] = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
-    with np.errstate(over="ignore", invalid="ignore"):
-        return {name: float(function(samples)) if len(samples) else math.nan for name, function in functions.items()}
+def _contents(source: str, config: Config) -> list[Contents]:
+    """Contents of the recordings, from the store where they are ingested; of a slow source the first alone."""
+    ingested = find(plan_ingest(config)) if source in choices("dataset") else None
+    if ingested is not None:
+        return [stored_contents(ingested.folder / file) for file in ingested.outputs]
+    first = 1 if open_source(config["dataset"]).slow else None
+    return [contents_of(read()) for _, read in islice(_readers(source, config), first)]
 
 
-def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]:
-    if isinstance(recording, tuple):
-        raise recording[1]
-    channels = [
-        {
-            "name": name,
-            "unit": CHANNELS[name].unit,
-            **_spread(samples[~np.isnan(samples)]),
-        }
-        for name, samples in recording.channels.items()
-    ]
+def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Recording]]]:
+    """Names of the recordings and functions that read them; from the store where a slow source is ingested."""
+    if source not in choices("dataset"):
+        yield Path(source).name, partial(read_single, config["dataset"], Path(source))
+        return
+    origin = open_source(config["dataset"])
+    ingested = find(plan_ingest(config)) if origin.slow else None
+    for name in origin.ids():
+        yield name, partial(origin.read, name) if ingested is None else partial(read_recording, ingested.folder / recording_file(name))
+
+
+def _described(recording: Recording) -> dict[str, Any]:
     return {
         "id": recording.id,
         "vehicle": recording.vehicle,
@@ -221,48 +179,18 @@ def _described(recording: Recording | tuple[str, VehestError]) -> dict[str, Any]
         "start": recording.start_time,
         "end": recording.end_time,
         "samples": len(recording),
-        "channels": channels,
+        "channels": [{"name": name, "unit": CHANNELS[name].unit, **_spread(samples)} for name, samples in recording.channels.items()],
         "provenance": dict(recording.provenance),
         "origin": origin_in_words(recording),
     }
 
 
-def _finding_rows(recording: Recording | tuple[str, VehestError]) -> list[dict[str, str]]:
-    if isinstance(recording, tuple):
-        name, error = recording
-        return [{"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)}]
-    return [
-        {
-            "level": finding.level,
-            "recording": recording.id,
-            "check": finding.check,
-            "channel": finding.channel,
-            "message": finding.message,
-        }
-        for finding in checks_of_recording(recording)
-    ]
-
-
-def _recordings(source: str, config: Config) -> Iterator[Recording | tuple[str, VehestError]]:
-    """Recordings one after another; one that cannot be read comes as its name and the error."""
-    if source not in choices("dataset"):
-        file = Path(source)
-        try:
-            yield read_single(config["dataset"], file)
-        except DataError as error:
-            yield file.name, error
-        return
-    origin = open_source(config["dataset"])
-    ingested = find(plan_ingest(config)) if origin.slow else None
-    if ingested is not None:  # the same samples as the source would make again
-        for recording_id in origin.ids():
-            yield read_recording(ingested.folder / recording_file(recording_id))
-        return
-    for recording_id in origin.ids():
-        try:
-            yield origin.read(recording_id)
-        except DataError as error:
-            yield recording_id, error
+def _spread(samples: FloatArray) -> dict[str, float]:
+    """Range, mean and standard deviation of the measured samples; NaN where there are none."""
+    measured = samples[~np.isnan(samples)]
+    functions: dict[str, Callable[[FloatArray], Any]] = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
+    with np.errstate(over="ignore", invalid="ignore"):
+        return {name: float(function(measured)) if len(measured) else math.nan for name, function in functions.items()}
 
 
 def _is_here(dataset: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Which estimators recordings can be used with: what they lack, what could supply it, and which settings do without it."""
+"""Usability of recordings: contents and configuration -> missing channels, transforms that supply them, settings that avoid them."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from vehest.run.train import new_estimator
 SCORED = ("vx", "vy_ref")
 """Channels that every estimate is scored by."""
 
+HEADER = ("estimator", "usable", "rate", "missing", "what could supply it")
+
 Verdict = Literal["yes", "not to train", "no"]
 
 
@@ -33,13 +35,18 @@ class Missing:
         channel: that is missing.
         to_estimate: whether the estimator reads it.
         to_train: whether its fit does.
-        supply: what could make it of channels that are there; None where nothing could.
+        supply: transforms that make it of channels that are there; None where none do.
     """
 
     channel: str
     to_estimate: bool
     to_train: bool
     supply: Supply | None
+
+    @property
+    def in_words(self) -> str:
+        """The channel and its supply, for people."""
+        return f"{self.channel} ({'not in the log' if self.supply is None else self.supply.in_words()})"
 
 
 @dataclass(frozen=True)
@@ -48,15 +55,15 @@ class Usability:
 
     Args:
         estimator: name in conf/estimator.
-        rate_hz: that it would run at [Hz]; None where its settings are not complete.
-        own_rate_hz: that its configuration names [Hz].
+        rate_hz: that it would run at [Hz]; None where its settings are incomplete.
+        own_rate_hz: of its configuration [Hz].
         missing: channels that the recordings lack.
-        gaps: channels that have gaps, where it cannot do without a sample.
-        settings: overrides by which it does without channels that nothing could supply.
-        left: channels that are still missing then, and that nothing could supply.
-        patterns: overrides that its fit needs, since it asks for recordings by names that none has.
-        to_give: what only the user knows and has to give, in words; empty if nothing.
-        car: parameters of the car, which are those of another one unless they are given: their keys.
+        gaps: channels with gaps that it cannot skip.
+        settings: overrides that avoid channels without a supply.
+        without: the same in words, with channels that are missing even then.
+        patterns: overrides that its fit needs, since it asks for recordings by other names.
+        to_give: setting that only the user knows, in words; empty if none.
+        car: keys of the car's parameters, which are those of another car unless given.
     """
 
     estimator: str
@@ -65,23 +72,23 @@ class Usability:
     missing: tuple[Missing, ...] = ()
     gaps: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
-    left: tuple[str, ...] = ()
+    without: str = ""
     patterns: tuple[str, ...] = ()
     to_give: str = ""
     car: tuple[str, ...] = ()
 
     @property
     def usable(self) -> Verdict:
-        """As it is, without anything supplied or set: ``not to train`` if only a model from elsewhere would do."""
+        """As it is, without supplies and settings; ``not to train`` if only a trained model can be used."""
         if self.to_give or any(missing.to_estimate for missing in self.missing):
             return "no"
         return "not to train" if self.missing or self.patterns else "yes"
 
     @property
-    def without(self) -> str:
-        """Which settings do without channels that nothing could supply, for people; empty if none do."""
-        what = f"only {', '.join(self.left)} of those would be missing" if self.left else "it does without"
-        return f"with {' '.join(self.settings)} {what}" if self.settings else ""
+    def lacks(self) -> str:
+        """Channels, samples or settings that are missing, for people; empty if none."""
+        gaps = [f"{name} without gaps" for name in self.gaps]
+        return ", ".join((*(one.in_words for one in self.missing), *gaps)) or self.to_give
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -100,95 +107,77 @@ class Usability:
         }
 
 
-def all_usabilities(recordings: Sequence[Contents], overrides: Sequence[str] = ()) -> list[Usability]:
-    """A row an estimator: those of conf/estimator, then those that other packages installed without a file there.
+def all_usabilities(recordings: Sequence[Contents]) -> list[Usability]:
+    """A row for each estimator of conf/estimator, then of other packages that have no file there.
 
     Args:
         recordings: of a data set, at least one.
-        overrides: of ``vehest train``.
     """
-    named = choices("estimator")
-    rows = [usability(name, compose_config("train", [f"estimator={name}", *overrides]), recordings) for name in named]
+    configs: dict[str, Config] = {name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")}
     for name in estimator_names():
-        if name not in named:
-            rows.append(usability(name, {"estimator": {"name": name}, "training": {}}, recordings))
-    return rows
+        configs.setdefault(name, {"estimator": {"name": name}, "training": {}})
+    return [usability(name, config, recordings) for name, config in configs.items()]
 
 
-def usability(name: str, config: Config, recordings: Sequence[Contents]) -> Usability:
-    """Whether the estimator of a configuration can be trained on recordings, and used on them.
+def usability(name: str, config: Config, recordings: Sequence[Contents], to_estimate: Sequence[Contents] | None = None) -> Usability:
+    """Whether the estimator of a configuration can be trained on recordings and used on them.
 
     Args:
         name: of the estimator, for people.
         config: as composed for ``train``.
-        recordings: at least one.
+        recordings: to train on, at least one unless others are given to estimate on.
+        to_estimate: recordings to estimate on; by default the same.
     """
-    return _usability(name, config, recordings, recordings)
-
-
-def _usability(name: str, config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> Usability:
-    own_rate = config["estimator"].get("rate_hz")
+    to_estimate = recordings if to_estimate is None else to_estimate
+    both = [*recordings, *to_estimate]
     try:
         estimator, training = _built(config)
     except ConfigurationError as error:
-        missing = _missing_of_class(str(config["estimator"]["name"]), to_estimate)
-        return Usability(name, None, own_rate, missing, to_give=str(error))
+        absent = _absent(getattr(estimator_class(str(config["estimator"]["name"])), "channels", ()), both)
+        return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
+    missing = _missing(estimator, training, recordings, to_estimate)
+    settings, without = _settings_without(config, recordings, to_estimate) if any(one.supply is None for one in missing) else ((), "")
+    patterns = settings_without_recordings(estimator, training, [own.id for own in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
-    missing = _missing(estimator, training, to_train, to_estimate)
-    settings, left = _settings_without(config, to_train, to_estimate) if any(one.supply is None for one in missing) else ((), ())
-    patterns = settings_without_recordings(estimator, training, [recording.id for recording in to_train]) if to_train else ()
-    recordings = [*to_train, *to_estimate]
-    rate = min([own_rate, *(recording.rate_hz for recording in recordings)])
-    gaps = gaps_that_matter(estimator, _gappy(recordings))
+    rate = min([own_rate, *(own.rate_hz for own in both)])
     car = getattr(estimator.settings, "car", None)
     keys = tuple(f"estimator.car.{field.name}" for field in fields(car)) if is_dataclass(car) else ()
-    return Usability(name, rate, own_rate, missing, gaps, settings, left, patterns, car=keys)
-
-
-HEADER = ("estimator", "usable", "rate", "missing", "what could supply it")
+    return Usability(name, rate, own_rate, missing, gaps_that_matter(estimator, _gappy(both)), settings, without, patterns, car=keys)
 
 
 def table_row(found: Usability) -> list[str]:
-    """Cells of `HEADER`; how channels are made in full stands in `remedies`."""
-    channels = [missing.channel for missing in found.missing if missing.to_estimate]
-    for_training = [missing.channel for missing in found.missing if not missing.to_estimate]
-    cells = [", ".join(channels), f"to train {', '.join(for_training)}" if for_training else "", _setting_in(found.to_give)]
-    cells += ["training recordings of the name it expects" if found.patterns else ""]
-    cells += [f"parts of {', '.join(found.gaps)}" if found.gaps else ""]
-    made = [f"{missing.channel}: {missing.supply.transforms[-1]['name']}" for missing in found.missing if missing.supply is not None]
-    absent = [missing.channel for missing in found.missing if missing.supply is None]
-    told = [", ".join(made), "" if not absent else f"{'the others are ' if made else ''}not in the log"]
-    told += [found.without, found.to_give, *found.patterns]
-    told += ["leave gaps out in conf/split" if found.gaps else ""]
+    """Cells of `HEADER`; `remedies` has the transforms in full."""
+    to_estimate = ", ".join(one.channel for one in found.missing if one.to_estimate)
+    to_train = ", ".join(one.channel for one in found.missing if not one.to_estimate)
+    setting = re.search(r"estimator\.\w+", found.to_give)
+    missing = [to_estimate, f"to train {to_train}" if to_train else "", setting[0] if setting else "a setting" if found.to_give else ""]
+    missing += ["training recordings of the name it expects" if found.patterns else ""]
+    missing += [f"parts of {', '.join(found.gaps)}" if found.gaps else ""]
+    made = ", ".join(f"{one.channel}: {one.supply.transforms[-1]['name']}" for one in found.missing if one.supply is not None)
+    is_absent = any(one.supply is None for one in found.missing)
+    supplies = [made, f"{'the others are ' if made else ''}not in the log" if is_absent else "", found.without, found.to_give]
+    supplies += [*found.patterns, "leave gaps out in conf/split" if found.gaps else ""]
     rate = "" if found.rate_hz is None else f"{found.rate_hz:g} Hz"
     if found.rate_hz is not None and found.rate_hz != found.own_rate_hz:
         rate += f", not {found.own_rate_hz:g}"
-    return [found.estimator, found.usable, rate, *("; ".join(cell for cell in part if cell) for part in (cells, told))]
-
-
-def _setting_in(told: str) -> str:
-    """The setting that a refusal names; empty where there is none."""
-    named = re.search(r"estimator\.\w+", told)
-    return named[0] if named else "a setting" if told else ""
+    return [found.estimator, found.usable, rate, *("; ".join(filter(None, cells)) for cells in (missing, supplies))]
 
 
 def remedies(found: Sequence[Usability]) -> list[str]:
-    """How each channel that some estimator lacks could be made, a line a channel."""
+    """Transforms that make channels that some estimator lacks, a line a channel."""
     supplies = {missing.channel: missing.supply for own in found for missing in own.missing if missing.supply is not None}
     return [f"{channel}: {supply.in_words()}" for channel, supply in supplies.items()]
 
 
 def borrowed_cars(found: Sequence[Usability]) -> str:
-    """Which estimators take another car's parameters unless they are given, as one line; empty if none."""
-    names = [own.estimator for own in found if own.car]
-    keys = list(dict.fromkeys(key.removeprefix("estimator.") for own in found for key in own.car))
-    if not names:
-        return ""
-    return f"your car's parameters, estimator.{keys[0]}=… and so on, are wanted by {', '.join(names)}; else they take those of another car"
+    """Estimators that take another car's parameters unless they are given, as one line; empty if none."""
+    names = ", ".join(own.estimator for own in found if own.car)
+    key = next((own.car[0] for own in found if own.car), "")
+    return f"your car's parameters, {key}=… and so on, are wanted by {names}; else they take those of another car" if names else ""
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Contents]]) -> str:
-    """Why a job cannot be done, as one line: what recordings of a split lack that its estimator needs; empty if nothing.
+    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none.
 
     Args:
         config: as composed for ``train`` or ``eval``; with ``evaluation`` the tests count too.
@@ -206,39 +195,33 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Contents]
         [replace(own, channels=own.channels | made) for own in part]
         for part in (_recordings([*split.train, *split.validation], contents), scored)
     )
-    found = _usability(estimator.name, config, to_train, to_estimate)
-    by_scores = unscored(scored) if scored else ()
-    known = {missing.channel for missing in found.missing}
-    reasons = [in_words(missing) for missing in (*found.missing, *(own for own in by_scores if own.channel not in known))]
-    if reasons:
-        for_training = {missing.channel for missing in found.missing if missing.to_train}
-        for_estimates = {missing.channel for missing in found.missing if missing.to_estimate}
-        parts = ((for_training, to_train), (for_estimates, to_estimate), ({missing.channel for missing in by_scores}, scored))
+    found = usability(estimator.name, config, to_train, to_estimate)
+    by_scores = unscored(scored)
+    known = {one.channel for one in found.missing}
+    missing = [*found.missing, *(one for one in by_scores if one.channel not in known)]
+    if missing:
+        parts = (
+            ({one.channel for one in found.missing if one.to_train}, to_train),
+            ({one.channel for one in found.missing if one.to_estimate}, to_estimate),
+            ({one.channel for one in by_scores}, scored),
+        )
         lacking = dict.fromkeys(recording.id for wanted, part in parts for recording in part if not wanted <= recording.channels)
-        others = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+        first, others = next(iter(lacking)), f" and {len(lacking) - 1} more lack" if len(lacking) > 1 else " lacks"
+        reasons = "; ".join(one.in_words for one in missing)
         without = f"; {found.without}" if found.settings else ""
-        who = f"recording '{next(iter(lacking))}'{others} lack{'' if others else 's'}"
-        return f"{who} what estimator '{estimator.name}' needs: {'; '.join(reasons)}{without}"
+        return f"recording '{first}'{others} what estimator '{estimator.name}' needs: {reasons}{without}"
     trained = [recording.id for recording in _recordings(split.train, contents)]
     patterns = settings_without_recordings(estimator, training, trained) if trained else ()
     return f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}" if patterns else ""
 
 
 def unscored(recordings: Sequence[Contents]) -> tuple[Missing, ...]:
-    """Channels by which every estimate is scored and that some recording lacks."""
-    held = common_channels(recordings)
-    return tuple(Missing(name, True, True, _supply(name, recordings)) for name in SCORED if name not in held)
-
-
-def in_words(missing: Missing) -> str:
-    """A missing channel and what could supply it, for people."""
-    if missing.supply is None:
-        return f"{missing.channel} (not in the log)"
-    return f"{missing.channel} ({missing.supply.in_words()})"
+    """Channels of `SCORED` that some recording lacks."""
+    return _absent(SCORED, recordings) if recordings else ()
 
 
 def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[Contents]]) -> list[Contents]:
-    """The recordings of ranges, each once; one that a data set does not have is left to those who read it."""
+    """The recordings of ranges, each once; unknown ones are skipped, and reported where they are read."""
     named = {(span.dataset, span.recording) for span in spans}
     return [own for dataset, recordings in contents.items() for own in recordings if (dataset, own.id) in named]
 
@@ -251,38 +234,29 @@ def _built(config: Config) -> tuple[Estimator, Any]:
 
 def _missing(estimator: Estimator, training: Any, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> tuple[Missing, ...]:
     """Channels that some recording lacks, in the order of the estimator's channels, references last."""
-    for_estimates = _of_all(to_estimate, lambda channels: lacking_to_estimate(estimator, channels))
-    for_training = _of_all(to_train, lambda channels: lacking_to_train(estimator, training, channels))
-    both = [*to_train, *to_estimate]
-    return tuple(
-        Missing(name, name in for_estimates, name in for_training, _supply(name, both))
-        for name in dict.fromkeys((*for_estimates, *for_training))
-    )
+    read = [name for own in to_estimate for name in lacking_to_estimate(estimator, own.channels)]
+    learnt = [name for own in to_train for name in lacking_to_train(estimator, training, own.channels)]
+    return _with_supplies(read, learnt, [*to_train, *to_estimate])
 
 
-def _missing_of_class(name: str, recordings: Sequence[Contents]) -> tuple[Missing, ...]:
-    """The same of an estimator that cannot be built, as far as its class tells."""
-    channels: tuple[str, ...] = getattr(estimator_class(name), "channels", ())
+def _absent(channels: Sequence[str], recordings: Sequence[Contents]) -> tuple[Missing, ...]:
     held = common_channels(recordings)
-    return tuple(Missing(channel, True, True, _supply(channel, recordings)) for channel in channels if channel not in held)
+    absent = [name for name in channels if name not in held]
+    return _with_supplies(absent, absent, recordings)
 
 
-def _of_all(recordings: Sequence[Contents], lacking: Any) -> list[str]:
-    return list(dict.fromkeys(name for recording in recordings for name in lacking(recording.channels)))
-
-
-def _supply(channel: str, recordings: Sequence[Contents]) -> Supply | None:
-    return supply_of(channel, common_channels(recordings), _gappy(recordings), min(recording.rate_hz for recording in recordings))
+def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[Contents]) -> tuple[Missing, ...]:
+    held, gappy, rate = common_channels(recordings), _gappy(recordings), min((own.rate_hz for own in recordings), default=0.0)
+    names = dict.fromkeys((*read, *learnt))
+    return tuple(Missing(name, name in read, name in learnt, supply_of(name, held, gappy, rate)) for name in names)
 
 
 def _gappy(recordings: Sequence[Contents]) -> frozenset[str]:
     return frozenset(name for recording in recordings for name in recording.gappy)
 
 
-def _settings_without(
-    config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Overrides by which fewer channels are wanted that nothing could supply, taken while they help; and those channels that are left."""
+def _settings_without(config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> tuple[tuple[str, ...], str]:
+    """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
 
     def unsupplied(candidate: Config) -> list[str] | None:
         try:
@@ -300,7 +274,9 @@ def _settings_without(
             break
         best, config = left, own
         found[key] = text
-    return tuple(f"{key}={text}" for key, text in found.items()), tuple(best)
+    settings = tuple(f"{key}={text}" for key, text in found.items())
+    rest = f"only {', '.join(best)} of those would be missing" if best else "it does without"
+    return settings, f"with {' '.join(settings)} {rest}" if settings else ""
 
 
 def _alternatives(config: Config) -> Iterator[tuple[str, str, Config]]:

@@ -1,0 +1,265 @@
+"""Makes a data set of proposals and reads it once: Examined -> configuration -> recordings, checks, delays, steering ratio -> Draft."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vehest.alignment.align import align
+from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.findings import Finding
+from vehest.alignment.proposals.lateness import Late, late_channels
+from vehest.alignment.proposals.proposal import Proposal
+from vehest.alignment.settings import AlignmentSettings
+from vehest.data.channels import CHANNELS
+from vehest.data.contents import Contents, common_channels, contents_of
+from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.recording import Recording
+from vehest.data.supplies import supply_of
+from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, MOST_LISTED, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.sources.base import open_source
+from vehest.sources.columns import plain_rate
+from vehest.sources.surveys import RawColumn
+
+POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
+"""Source -> clocks of its data sets, the strictest first; other sources make their own."""
+BAG_HZ = 100.0
+LEAST_GAP = 0.05  # s
+LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
+MOST_STRAY = 0.002  # of the rows
+POSE_SECONDS = 0.15  # of the filter that differentiates poses
+CONTRADICTIONS = ("sign", "unit", "impossible")
+"""Checks that contradict a proposal."""
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A data set with what its recordings show.
+
+    Args:
+        examined: the logs, delays among their proposals.
+        dataset: for conf/dataset.
+        late: channel -> its delay in the longest recording.
+        contents: of the recordings.
+        remarks: findings of the checks that concern the proposals.
+        ratio: estimated steering ratio and its uncertainty; None where it is given or not needed.
+        notes: further remarks.
+        seconds: duration of all recordings [s].
+    """
+
+    examined: Examined
+    dataset: Mapping[str, Any]
+    late: Mapping[str, Late]
+    contents: tuple[Contents, ...]
+    remarks: tuple[Finding, ...]
+    ratio: tuple[float, float] | None
+    notes: tuple[str, ...]
+    seconds: float
+
+    @property
+    def channels(self) -> frozenset[str]:
+        """Channels that all recordings have."""
+        return common_channels(self.contents)
+
+
+def draft(examined: Examined) -> Draft:
+    """A data set by the proposals, read as an ingest reads it.
+
+    Raises:
+        VehestError: it cannot be read.
+    """
+    proposals, vehicle = examined.proposals, examined.vehicle
+    if not proposals.channels:
+        raise ConfigurationError("no column is left that would be a channel")
+    dataset = _dataset(examined)
+    speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
+    dataset, recordings = _read_strictest(dataset | {"transforms": speed})
+    longest = max(recordings, key=lambda own: own.duration)
+    late, ratio, notes = late_channels(longest), None, list(proposals.notes)
+    for stem, rows in dataset.get("drop_rows", {}).items():
+        listed = ", ".join(map(str, rows[:MOST_LISTED])) + (", …" if len(rows) > MOST_LISTED else "")
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data row{'s' * (len(rows) > 1)} {listed}")
+    if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
+        try:
+            found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]
+            ratio = (found.value, found.uncertainty)
+        except VehestError as error:
+            notes.append(f"the steering ratio could not be estimated: {error}")
+    dataset |= {"transforms": _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))}
+    recordings = _recordings(dataset)
+    channels = tuple(
+        replace(one, delay=late[one.channel].delay).with_evidence(late[one.channel].evidence) if one.channel in late else one
+        for one in proposals.channels
+    )
+    return Draft(
+        replace(examined, proposals=replace(proposals, channels=channels)),
+        dataset,
+        late,
+        tuple(contents_of(own) for own in recordings),
+        tuple(_remarks(longest, recordings)),
+        ratio,
+        tuple(notes),
+        sum(own.duration for own in recordings),
+    )
+
+
+def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
+    """The data set with the strictest clock that all files keep, and its recordings."""
+    for policy in POLICIES.get(dataset["source"], ()):
+        with suppress(DataError):
+            own = dataset | {"clock": policy}
+            return own, _recordings(own)
+    return dataset, _recordings(dataset)
+
+
+def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
+    source = open_source(dataset)
+    return [source.read(name) for name in source.ids()]
+
+
+def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[Finding]:
+    """Findings of the longest recording, and contradictions in the longest one of each other file."""
+    found = [one for one in checks_of_recording(longest) if one.check in REMARKS and one.level != "note"]
+    by_file = {own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)}
+    by_file.pop(longest.provenance.get("file"), None)
+    for own in by_file.values():
+        contradictions = (one for one in checks_of_recording(own) if one.check in CONTRADICTIONS and one.level != "note")
+        found += [replace(one, message=f"in '{own.id}', {one.message}") for one in contradictions]
+    return found
+
+
+def _dataset(examined: Examined) -> dict[str, Any]:
+    """The configuration of the source, without transforms."""
+    log, name, proposals = examined.log, examined.name, examined.proposals
+    dataset: dict[str, Any] = {
+        "name": name,
+        "title": f"Recordings of {name}",
+        "kind": "real",
+        "vehicle": name,
+        "licence": "yours",
+        "citation": "none",
+    }
+    dataset |= {"source": log.source, **examined.place}
+    columns = {column.name: column for column in log.columns}
+    if log.source == "rosbag":
+        return dataset | _bag_options(columns, proposals.channels)
+    if log.source == "mdf":
+        return dataset | _mdf_options(columns, proposals.channels)
+    dataset |= log.options
+    if log.source != "vbo":
+        dataset["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
+        dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
+    stray = _stray_rows(examined) if log.source in TABLES and log.clock is not None else {}
+    dataset |= {"drop_rows": stray} if stray else {}
+    dataset["clock"] = "strict"
+    gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
+    short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
+    if short and log.source in TABLES and not is_parquet(log):
+        dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * max(short) * 1.05) / 100.0}
+        gaps = {name: gap for name, gap in gaps.items() if gap > BRIDGED}
+    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place) for one in proposals.channels}
+    dataset["gappy"] = [name for name, gap in gaps.items() if gap > 0.0]
+    if proposals.pose:
+        rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
+        parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
+        made = [name for name in ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref") if name not in dataset["channels"]]
+        dataset["pose"] = {**parts, "window": max(2 * round(POSE_SECONDS * rate / 2.0) + 1, 5), "order": 2, "channels": made}
+    return dataset
+
+
+def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
+    """A channel's declaration."""
+    entry = {**place, "unit": one.unit}
+    entry |= {"sign": one.sign} if one.sign != 1 else {}
+    return entry | ({"factor": one.factor} if one.factor != 1.0 else {})
+
+
+def _stray_rows(examined: Examined) -> dict[str, list[int]]:
+    """File's stem -> rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes."""
+    found = {}
+    for log in examined.logs:
+        columns = {column.name: column.values for column in log.columns}
+        beyond = np.any([one.beyond(columns[one.column]) for one in examined.proposals.channels], axis=0)
+        if 0.0 < beyond.mean() <= MOST_STRAY:
+            found[log.file.stem] = (np.flatnonzero(beyond) + 1).tolist()
+    return found
+
+
+def _longest_gap(examined: Examined, column: str) -> float:
+    """Longest time without a sample in any file [s]; infinite where there are no times, 0 where none is missing."""
+    longest = 0.0
+    for log in examined.logs:
+        values = next(own.values for own in log.columns if own.name == column)
+        known = np.isfinite(values)
+        if known.all():
+            continue
+        seconds = log.seconds if log.seconds is not None else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+        for run in log.runs:
+            edges = np.concatenate([seconds[run][:1], seconds[run][known[run]], seconds[run][-1:]])
+            longest = max(longest, float(np.diff(edges).max(initial=0.0))) if known[run].any() else math.inf
+    return longest
+
+
+def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+    channels, rates = {}, []
+    for one in proposals:
+        rate, gap = _rate_and_gap(columns[one.column])
+        rates.append(rate)
+        channels[one.channel] = _entry(one, columns[one.column].place)
+        if 3.0 / rate < gap <= LONGEST_GAP:
+            channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
+    gappy = [one.channel for one in proposals if one.gappy]
+    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), "channels": channels, "gappy": gappy}
+
+
+def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
+    topics: dict[str, dict[str, Any]] = {}
+    channels: dict[str, dict[str, Any]] = {}
+    rates = []
+    for one in proposals:
+        place = columns[one.column].place
+        short = str(place["topic"]).strip("/").replace("/", "_")
+        if short not in topics:
+            rate, gap = _rate_and_gap(columns[one.column])
+            rates.append(rate)
+            max_gap = max(LEAST_GAP, math.ceil(150.0 * gap) / 100.0)
+            topics[short] = {"topic": place["topic"], "type": place["type"], "stamps": place["stamps"], "max_gap": max_gap}
+        entry = _entry(one, {"topic": short, "field": place["field"]})
+        channels[one.channel] = entry | ({"offset": float(f"{one.offset:.5g}")} if one.offset else {})
+    return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), RATE_TOLERANCE), "topics": topics, "channels": channels}
+
+
+def _rate_and_gap(column: RawColumn) -> tuple[float, float]:
+    """Median rate [Hz] and longest gap [s] of a column with times of its own."""
+    assert column.stamps is not None
+    return rate_of(column.stamps), float(np.diff(column.stamps).max())
+
+
+def _transforms(
+    examined: Examined, longest: Recording, late: Mapping[str, Late], speed: Sequence[dict[str, Any]], ratio: float | None
+) -> list[dict[str, Any]]:
+    """Transforms that make the channels that estimators want.
+
+    A reference that is late is put on the others' clock; a measured channel is not, since an estimator in the car would get it late, too.
+    """
+    made: list[dict[str, Any]] = []
+    for name, own in late.items():
+        if CHANNELS[name].is_reference:
+            made.append({"name": "delay_correction", "delay": own.delay, "channels": [name]})
+    offsets = {one.channel: float(f"{one.factor * one.sign * one.offset:.5g}") for one in examined.proposals.channels if one.offset}
+    if offsets and examined.log.source != "rosbag":  # whose channels have an offset of their own
+        made.append({"name": "offset_correction", "offsets": offsets})
+    made += speed
+    for name in ("vy_ref", "ax"):
+        supply = supply_of(name, longest.channels, longest.gappy, longest.rate_hz) if name not in longest else None
+        if supply is not None and not supply.meanings:  # no value is unknown
+            made += map(dict, supply.transforms)
+    if "handwheel" in longest and "steer" not in longest and ratio:
+        made.append({"name": "steering_ratio", "ratio": float(f"{ratio:.4g}")})
+    return made

@@ -1,0 +1,285 @@
+"""Inspects logs that no data set describes yet: files -> surveys -> evidence on one clock -> proposals of channels, units and signs."""
+
+from __future__ import annotations
+
+import glob
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import filter as matching
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.alignment.proposals.assign import possible, propose
+from vehest.alignment.proposals.proposal import Proposals
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.splits import check_name
+from vehest.run.config import compose_config
+from vehest.run.config_files import choices
+from vehest.run.printing import counted
+from vehest.sources.columns import plain_rate
+from vehest.sources.surveys import Log, survey
+from vehest.sources.text_log import bridged
+from vehest.sources.unit_spellings import plain_unit
+
+EVIDENCE_HZ = 50.0
+LONGEST_EVIDENCE = 1200.0  # s
+ENDS = 1.0  # s at either end of a longer drive that do not count
+BRIDGED = 1.0  # s without a sample that straight lines bridge
+MOST_LISTED = 5
+RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
+CLOCKWISE = {"vbo": "heading"}
+"""Source -> column that counts a heading clockwise by its format."""
+WEST_POSITIVE = ("vbo",)
+TABLES = ("tabular", "text_log")
+LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
+"""Options of a table's layout with their defaults."""
+VEHICLE = {
+    "wheelbase": "wheelbase [m], if you know it (also gives the steering ratio by slow corners, and baselines from the data sheet)",
+    "mass": "mass [kg], if you know it (with the wheelbase, filters over a single track)",
+    "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
+}
+"""Values of the car that no log holds, as questions."""
+
+
+@dataclass(frozen=True, eq=False)
+class Examined:
+    """Logs with their proposals.
+
+    Args:
+        name: of the data set.
+        files: in the order given.
+        logs: the longest first; its layout is that of all.
+        proposals: for all logs.
+        place: options ``path``, ``files`` and ``exclude`` of the data set.
+        rate_hz: sampling rate of logs without times; else None.
+        vehicle: values of `VEHICLE`, None where unknown.
+    """
+
+    name: str
+    files: tuple[Path, ...]
+    logs: tuple[Log, ...]
+    proposals: Proposals
+    place: dict[str, Any]
+    rate_hz: float | None
+    vehicle: Mapping[str, float | None]
+
+    @property
+    def log(self) -> Log:
+        """The longest one."""
+        return self.logs[0]
+
+    def in_words(self) -> list[str]:
+        """Files and proposals for a terminal, a line each."""
+        found = self.proposals
+        lines = [f"read {file}" for file in self.files]
+        lines += [f"{'?' if one.asked else ' '} {one.in_words}" for one in found.channels]
+        lines += [f"  left and right: {found.left_right}"] if found.left_right else []
+        return lines + ([f"  no channel: {counted(list(found.unused))}"] if found.unused else [])
+
+
+def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None], *, force: bool) -> Examined:
+    """Examine logs for a data set of that name, whose files may exist with ``force`` only.
+
+    Raises:
+        ConfigurationError: the name is taken or cannot be part of a file's name.
+        VehestError: as `examine`.
+    """
+    check_name(name, "data set")
+    refuse_existing(name, force=force)
+    if name in choices("dataset") and not paths_of(name)[0].exists():
+        raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
+    with use_limits(limits_from_config(compose_config("estimate")["limits"])):
+        return examine(name, files, vehicle)
+
+
+def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None) -> Examined:
+    """Read logs and propose a channel, unit and sign for each column.
+
+    Args:
+        name: of the data set.
+        files: of one format and one set of columns, a recording each.
+        vehicle: known values of `VEHICLE`.
+
+    Raises:
+        ConfigurationError: the files differ in format or folder.
+        MissingError: a file does not exist.
+        DataError: a file cannot be read, or differs in layout or columns.
+    """
+    logs = [survey(file) for file in files]
+    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
+    if len(formats) > 1:
+        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
+    longest = max(logs, key=_length)
+    _refuse_other_layouts(longest, logs)
+    longest = replace(longest, **_common(longest, logs))
+    others = [log for log in logs if log.file != longest.file]
+    columns, rate = _evidence(longest)
+    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
+    if longest.source not in TABLES:  # other sources make no reference of positions
+        proposals = replace(proposals, pose=())
+    used = {one.column for one in proposals.channels}
+    for log in others:
+        missing = sorted(used - {column.name for column in log.columns})
+        if missing:
+            raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
+        proposals = possible(proposals, {column.name: column.values for column in log.columns})
+    if not proposals.channels:
+        names = ", ".join(column.name for column in longest.columns[:8])
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion (it has {names})")
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
+    return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
+
+
+def paths_of(name: str) -> tuple[Path, Path, Path]:
+    """Data set, split and pipeline of that name, in ./conf and ./pipelines."""
+    return Path("conf") / "dataset" / f"{name}.yaml", Path("conf") / "split" / f"{name}.yaml", Path("pipelines") / f"{name}.yaml"
+
+
+def refuse_existing(name: str, *, force: bool) -> None:
+    """Raise ConfigurationError where a file of the data set exists, and ``force`` is not given."""
+    existing = [str(file) for file in paths_of(name) if os.path.lexists(file)]
+    if existing and not force:
+        raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
+
+
+def is_parquet(log: Log) -> bool:
+    """Whether a table is no text."""
+    return log.file.suffix.lower() in (".parquet", ".pq")
+
+
+def rate_of(stamps: FloatArray) -> float:
+    """Median rate of time stamps [Hz]."""
+    return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
+
+
+def _length(log: Log) -> int:
+    return int(log.runs[0].stop - log.runs[0].start) if log.runs else max(len(column.values) for column in log.columns)
+
+
+def _refuse_other_layouts(longest: Log, logs: Sequence[Log]) -> None:
+    for log in logs:
+        layouts = [(key, log.options.get(key, default), longest.options.get(key, default)) for key, default in LAYOUT.items()]
+        for key, own, other in (*layouts, ("times", _clock(log), _clock(longest))):
+            if own != other:
+                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {other!r}; write both alike, or make a data set of each")
+
+
+def _clock(log: Log) -> str | None:
+    return None if log.clock is None else f"{log.clock.column} in {log.clock.unit}"
+
+
+def _common(longest: Log, logs: Sequence[Log]) -> dict[str, Any]:
+    """Source and options for all files: marks of missing samples, and times that restart."""
+    options = dict(longest.options)
+    marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
+    options |= {"missing": marks} if marks else {}
+    if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
+        options["time_restarts"] = True
+    return {"options": options, "source": "text_log" if any(log.source == "text_log" for log in logs) else longest.source}
+
+
+def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
+    """Parts of the files that were not read, and long gaps."""
+    yield from (f"not read: {text}" for text in longest.skipped[:MOST_LISTED])
+    if len(longest.skipped) > MOST_LISTED:
+        yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
+    for log in logs:
+        for run in log.runs if log.seconds is not None else ():
+            assert log.seconds is not None
+            stamps = log.seconds[run]
+            steps = np.diff(stamps)
+            if steps.max(initial=0.0) > BRIDGED:
+                start = stamps[np.argmax(steps)]
+                yield f"'{log.file.name}' has a gap of {steps.max():.3g} s, {start:.4g} s after its start, which lines bridge; cut it there"
+                break
+
+
+def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
+    """Folder of the files, pattern that they match, and stems of further files that match.
+
+    Raises:
+        ConfigurationError: they lie in several folders, two have the same stem, or no pattern separates them from other files.
+    """
+    folders = sorted({file.resolve().parent for file in files})
+    if len(folders) > 1:
+        listed = ", ".join(map(str, folders))
+        raise ConfigurationError(f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder")
+    folder, names = folders[0], sorted({file.name for file in files})
+    stems = [Path(name).stem for name in names]
+    doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
+    if doubled:
+        raise ConfigurationError(f"two files are called '{doubled[0]}'; a recording's name must be unique")
+    path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
+    if source == "rosbag":
+        return {"path": path, "files": [file.name for file in files]}
+    both = (names, [name[::-1] for name in names])
+    start, end = (os.path.commonprefix(words).rstrip("0123456789") for words in both)  # noqa: RUF071 (of characters)
+    pattern = f"{glob.escape(start)}*{glob.escape(end[::-1])}" if len(names) > 1 else glob.escape(names[0])
+    beside = sorted(file.name for file in folder.iterdir() if file.is_file() and file.name not in names)
+    others = [Path(name).stem for name in matching(beside, pattern)]
+    if others and source not in TABLES:
+        raise ConfigurationError(
+            f"'{folder}' holds other files of that name ('{others[0]}'); put those of the data set into a folder of their own"
+        )
+    return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
+
+
+def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None]:
+    """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz]; without times rows as they are.
+
+    Of a long drive the minutes in which columns change most are taken.
+    """
+    columns, rate = _on_one_clock(log)
+    if rate is None:
+        return columns, None
+    n_rows = len(columns[0][2])
+    cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
+    factor = max(math.floor(rate / EVIDENCE_HZ), 1)
+    whole = (n_rows - 2 * cut) // factor * factor
+    slower = [(name, unit, values[cut : cut + whole].reshape(-1, factor).mean(axis=1)) for name, unit, values in columns]
+    kept = _busiest([values for _, _, values in slower], round(LONGEST_EVIDENCE * rate / factor), max(round(60.0 * rate / factor), 1))
+    return [(name, unit, values[kept]) for name, unit, values in slower], rate / factor
+
+
+def _on_one_clock(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None]:
+    units = [plain_unit(column.unit) or "" for column in log.columns]
+    if log.columns[0].stamps is not None:
+        timed = [
+            (own, unit, own.stamps) for own, unit in zip(log.columns, units, strict=True) if own.stamps is not None and len(own.stamps) > 1
+        ]
+        begin, end = (float(np.median([stamps[edge] for _, _, stamps in timed])) for edge in (0, -1))
+        rate = plain_rate(min(max(rate_of(stamps) for _, _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
+        grid = np.arange(begin, end, 1.0 / rate)
+        return [(own.name, unit, np.interp(grid, stamps, own.values)) for own, unit, stamps in timed], rate
+    run = log.runs[0]
+    rows = [(own.name, unit, own.values[run]) for own, unit in zip(log.columns, units, strict=True)]
+    if log.seconds is None:
+        return rows, None
+    stamps = log.seconds[run]
+    columns = [(name, unit, bridged(values, stamps, BRIDGED)) for name, unit, values in rows]
+    step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
+    rate = plain_rate(1.0 / step, RATE_TOLERANCE)
+    grid = np.arange(stamps[0], stamps[-1], 1.0 / rate)
+    is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
+    if is_even or len(grid) > 4 * len(stamps):
+        return columns, rate
+    return [(name, unit, np.interp(grid, stamps, values)) for name, unit, values in columns], rate
+
+
+def _busiest(columns: Sequence[FloatArray], most: int, minute: int) -> slice:
+    """Rows of the stretch in which the columns change most."""
+    if len(columns[0]) <= most:
+        return slice(None)
+    starts = np.arange(0, len(columns[0]) - minute, minute)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        changes = [[np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts] for values in columns]
+    activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)
+    first = int(starts[np.argmax(np.convolve(activity, np.ones(most // minute), mode="valid"))])
+    return slice(first, first + most)

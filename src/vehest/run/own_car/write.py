@@ -1,0 +1,219 @@
+"""Writes data set, split and pipeline of a new car: Draft -> plan -> YAML with comments -> files, all or none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from vehest.data.channels import CHANNELS
+from vehest.data.errors import ConfigurationError, printable
+from vehest.data.files import written_aside
+from vehest.data.limits import limits_from_config, use_limits
+from vehest.run.config import compose_config
+from vehest.run.own_car.dataset import Draft, draft
+from vehest.run.own_car.families import Plan, pipeline_of, plan_of
+from vehest.run.own_car.inspect import Examined, paths_of, refuse_existing
+from vehest.run.own_car.questions import Question
+from vehest.run.usable import SCORED
+
+LEARNT = 0.7  # of the recordings: training and validation
+SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
+PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
+DATASET_COMMENTS = {
+    "time": "unit: s, ms, us or ns; null: no column of times",
+    "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
+    "bridge": "longest time without a sample that a straight line bridges [s]",
+    "channels": "sign: -1 where a column counts the other way than ISO 8855 (x forward, y left)",
+    "gappy": "channels with missing samples",
+    "pose": "the reference is made of positions and yaw (z up); yaw_offset, lever_x and lever_y where the markers sit askew",
+    "reference_point": "{x: …, y: …} ahead and to the left of the centre of gravity [m], where it is known",
+    "imu_point": "likewise",
+    "accept": "checks whose errors do not stop the ingest",
+}
+SPLIT_HEAD = """of each recording, 50 % for training, then 20 % for validation, then 30 % as test. They are blocks, since neighbouring
+samples are nearly the same, and would reveal the answer. Of several laps the last: tests: {test: last lap}. A few minutes only:
+cross-validate, by report: folds in the pipeline and folds: {number: 5, of: seconds, gap_seconds: 2} here, for the last three keys."""
+PIPELINE_HEAD = """every family that its channels allow, the most promising first, with small budgets. Run it by
+  vehest run {name} --minutes 15
+which does as much as fits, and goes on when it is run again. Lines may go, budgets may grow (training.max_epochs=1000 is what
+the papers' comparisons use); finished trainings are not repeated. Parts show how many minutes of reference are needed."""
+ASSUMED = """The car's parameters are made of wheelbase and mass: centre of gravity in the middle and at 0.2·L, yaw inertia m·(L/2)²,
+cornering stiffness of an axle 10/rad times its load. Write yours where you know them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Outcome of `vehest new`.
+
+    Args:
+        draft: the data set.
+        plan: estimators to try; None where there is no reference or none can be used.
+        open: questions without an answer, those of the vehicle left out.
+        files: path -> text, written unless ``dry_run``.
+        dry_run: whether nothing was written.
+    """
+
+    draft: Draft
+    plan: Plan | None
+    open: tuple[Question, ...]
+    files: Mapping[Path, str]
+    dry_run: bool
+
+    def next_commands(self) -> list[str]:
+        """Commands to go on with."""
+        name, file = self.draft.examined.name, self.draft.examined.files[0]
+        commands = [f"vehest data check {name}", f"vehest data usable {name}"]
+        if self.plan is not None:
+            return [*commands, f"vehest run {name} --minutes 15"]
+        if file.is_dir() or not self.draft.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
+            return commands
+        return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
+
+    def as_plain(self) -> dict[str, Any]:
+        """For JSON."""
+        own, examined = self.draft, self.draft.examined
+        found = examined.proposals
+        channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
+        return {
+            "name": examined.name,
+            "files": [str(file) for file in examined.files],
+            "source": examined.log.source,
+            "recordings": [one.id for one in own.contents],
+            "rate_hz": min(one.rate_hz for one in own.contents),
+            "seconds": own.seconds,
+            "time": None if examined.log.clock is None else asdict(examined.log.clock),
+            "channels": [one | {"asked": one["asked"] or None} for one in channels],
+            "left_right": found.left_right or None,
+            "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
+            "unused": list(found.unused),
+            "open": [question.as_plain() for question in self.open],
+            "vehicle": dict(examined.vehicle),
+            "steering_ratio_found": None if own.ratio is None else {"value": own.ratio[0], "uncertainty": own.ratio[1]},
+            "has_reference": "vy_ref" in own.channels,
+            "estimators": [] if self.plan is None else list(self.plan.estimators),
+            "lacking": {} if self.plan is None else dict(self.plan.lacking),
+            "findings": [f"{one.channel}: {one.message}" if one.channel else one.message for one in own.remarks],
+            "notes": list(own.notes),
+            "written": [str(file) for file in self.files],
+            "next": self.next_commands(),
+            "dry_run": self.dry_run,
+        }
+
+    def in_words(self) -> list[str]:
+        """For a terminal, a line each."""
+        own, lines = self.draft, []
+        if own.ratio is not None:
+            value, spread = own.ratio
+            doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
+            lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
+        lines += [f"{name} {late.evidence}" for name, late in own.late.items()]
+        lines += [f"note: {note}" for note in own.notes]
+        lines += [f"warning: {one.channel + ': ' if one.channel else ''}{one.message}" for one in own.remarks]
+        lines += ["open, taken as proposed:"] if self.open else []
+        lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in self.open]
+        lines += _limits(own)
+        if self.plan is not None:
+            lines += [f"left out: {name}: {lack}" for name, lack in self.plan.lacking.items()]
+        tried = "" if self.plan is None else ", ".join(self.plan.estimators)
+        purposes = ("channels, units and signs of the columns", "ranges for training, validation and test", f"estimators: {tried}")
+        for file, purpose in zip(self.files, purposes, strict=False):
+            lines.append(f"{'would write' if self.dry_run else 'wrote'} {file}: {purpose}")
+        return [*lines, "next:", *(f"  {command}" for command in self.next_commands())]
+
+
+def write(examined: Examined, left: Sequence[Question] = (), *, force: bool = False, dry_run: bool = False) -> Outcome:
+    """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
+
+    Args:
+        examined: logs after the answers.
+        left: questions without an answer.
+        force: whether existing files may be replaced.
+        dry_run: whether to write nothing.
+
+    Raises:
+        ConfigurationError: a file exists, and ``force`` is not given.
+        MissingError: the disk is full, or a folder cannot be written to.
+        VehestError: the data set cannot be read.
+    """
+    name = examined.name
+    with use_limits(limits_from_config(compose_config("estimate")["limits"])):
+        made = draft(examined)
+    plan = plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else None
+    texts = [_dataset_text(made, left)]
+    if plan is not None and plan.sweeps:
+        split = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
+        texts += [_yaml(split, [f"{name}: {SPLIT_HEAD}"]), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
+    files = dict(zip(paths_of(name), texts, strict=False))
+    if not dry_run:
+        refuse_existing(name, force=force)
+        with ExitStack() as stack:
+            for file, text in files.items():
+                stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
+    return Outcome(made, plan if len(texts) > 1 else None, tuple(left), files, dry_run)
+
+
+def _limits(own: Draft) -> list[str]:
+    """Comparisons that the recordings do not allow."""
+    made = {"vy_ref"} if "sideslip_ref" in own.channels else set()  # with vx
+    missing = [name for name in SCORED if name not in own.channels | made]
+    if not missing:
+        text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
+        return [text] if own.seconds < SHORT else []
+    if "vy_ref" not in missing:
+        return [f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
+    lacking = ", ".join(name for name in PRETRAINED_CHANNELS if name not in own.contents[0].channels)
+    return [
+        "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
+        f"the model that comes with vehest can estimate, vehest estimate pretrained{f'; it lacks {lacking}' if lacking else ''}"
+    ]
+
+
+def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
+    examined = made.examined
+    head = [
+        f"Recordings of {examined.name}: columns with the evidence for their channels; `vehest data check {examined.name}` checks them."
+    ]
+    head += [f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}." for question in left]
+    for name, late in made.late.items():
+        if not CHANNELS[name].is_reference:
+            head += [
+                f"{name} {late.evidence}.",
+                "An estimator in the car would get it as late; if only the log is, add to transforms:",
+                f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{name}]}}",
+            ]
+    comments = dict(DATASET_COMMENTS)
+    for one in examined.proposals.channels:
+        evidence = one.evidence[0] if one.evidence else CHANNELS[one.channel].meaning
+        comments[f"  {one.channel}"] = f"asked: {one.asked}; {evidence}" if one.asked else evidence
+    dataset = {key: value for key, value in made.dataset.items() if key != "transforms" or value}
+    return _yaml({**dataset, "reference_point": "unknown", "imu_point": "unknown", "accept": []}, head, comments)
+
+
+def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
+    head = [
+        f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}",
+        *([ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []),
+    ]
+    head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
+    head += ["Left out, and what each lacks:"] if plan.lacking else []
+    return _yaml(pipeline_of(name, plan, minutes), [*head, *(f"  {own}: {lack}" for own, lack in plan.lacking.items())])
+
+
+def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
+    """YAML below a comment, with further comments behind some keys.
+
+    Raises:
+        ConfigurationError: a value would be read as a reference.
+    """
+    lines = yaml.safe_dump(dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False).splitlines()
+    for line in lines:
+        if "${" in line:
+            raise ConfigurationError(f"'{printable(line.strip()[:60])}' holds '${{', which configurations read as a reference; rename it")
+    known = {key: printable(comment) for key, comment in (comments or {}).items()}
+    behind = [f"{line:<44} # {known[key]}" if (key := line.partition(":")[0]) in known else line for line in lines]
+    return "\n".join([*(f"# {printable(line)}" for text in head for line in text.splitlines()), *behind, ""])
