@@ -75,13 +75,11 @@ class RayLauncher:
                     report(position, None)
                 for task in self._ray.wait(list(running), timeout=POLL_SECONDS)[0] if running else []:
                     position = running.pop(task)
-                    try:
-                        done = self._done(position, task)
-                    except NotShared:
-                        waiting.append(position)
-                        continue
+                    done = self._done(position, task)
                     if done is not None:
                         yield done
+                    elif not stopping:
+                        waiting.append(position)
 
     def close(self) -> None:
         """Leave the cluster, or end the Ray of one's own."""
@@ -117,7 +115,7 @@ class RayLauncher:
         return task.remote(spec, *(self._stored[folder] for folder in inputs))
 
     def _done(self, position: int, task: Any) -> Done | None:
-        """The outcome of a task; none if it was called off before it began."""
+        """The outcome of a task; none if it was called off before it began, or needs copies."""
         errors = self._ray.exceptions
         try:
             report: TaskReport = self._ray.get(task)
@@ -130,7 +128,7 @@ class RayLauncher:
                 self._stored = {}
                 detail = "does not share the output root: recordings and artefacts are sent"
                 self._messages.line("note", "cluster", str(error.cause), detail)
-            raise error.cause from error
+            return None
         except errors.RayError as error:
             return Done(position, Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"))
         unpack(report.made)
