@@ -104,14 +104,14 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
 
 
 def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
-    spec = replace(task_of(Group([job(tmp_path)]), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
+    spec = replace(task_of(0, Group([job(tmp_path)]), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
     with pytest.raises(MissingError, match=r"torch .* instead of 1\.0; install the same versions"):
         run_task(spec, {}, lambda: False)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_machine_without_the_output_root_does_nothing_before_it_gets_copies(tmp_path):
-    spec = task_of(Group([job(tmp_path / "out")]), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
+    spec = task_of(0, Group([job(tmp_path / "out")]), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
     with pytest.raises(NotShared):
         run_task(spec, None, lambda: False)
     assert not list(tmp_path.iterdir())

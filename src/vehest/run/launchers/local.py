@@ -6,10 +6,11 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from dataclasses import dataclass
-from multiprocessing import get_context
+from dataclasses import dataclass, field
+from multiprocessing import get_context, parent_process
+from pathlib import Path
 from typing import Any
 
 from vehest.data.limits import Limits, current_limits, use_limits
@@ -23,15 +24,18 @@ Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]
 """A function of (should_stop, on_progress), picklable."""
 Reporter = Callable[[int, Progress | Waiting | None], None]
 POLL_SECONDS = 0.2
+Files = MutableMapping[Path, Mapping[str, bytes]]
+"""Folder of an artefact -> its files."""
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a task returned, or why it failed, and how long it ran [s]."""
+    """What a task returned, or why it failed, how long it ran [s], and what it made that is not in the output root yet."""
 
     position: int
     outcome: Any
     seconds: float = 0.0
+    made: Files = field(default_factory=dict)
 
 
 class LocalLauncher:
@@ -86,7 +90,7 @@ def guarded(task: Task, should_stop: Callable[[], bool], on_progress: Callable[[
 def _launch_in_processes(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
     context = get_context("spawn")
     stopping, messages = context.Event(), context.SimpleQueue()
-    pool = ProcessPoolExecutor(jobs, context, _start_worker, (stopping, messages, os.getpid(), current_limits()))
+    pool = ProcessPoolExecutor(jobs, context, _start_worker, (stopping, messages, current_limits()))
     with stop.deferred(), pool:
         futures = {pool.submit(_work, position, task): position for position, task in enumerate(tasks)}
         waiting = set(futures)
@@ -112,17 +116,18 @@ def _launch_in_processes(tasks: Sequence[Task], jobs: int, stop: StopSignals | T
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(stopping: Any, messages: Any, parent: int, limits: Limits) -> None:
+def _start_worker(stopping: Any, messages: Any, limits: Limits) -> None:
     """Leave signals to the parent, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker.update(stopping=stopping, messages=messages, limits=limits)
 
 
-def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(POLL_SECONDS)
+def _end_with_parent() -> None:
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
     os._exit(1)
 
 

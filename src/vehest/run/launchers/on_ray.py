@@ -19,8 +19,8 @@ from vehest.data.errors import MissingError
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.local import POLL_SECONDS, Done, Reporter
-from vehest.run.launchers.task import TIMES, Files, NotShared, TaskReport, TaskSpec, inputs_of, new_mark, pack, run_task, task_of, unpack
+from vehest.run.launchers.local import POLL_SECONDS, Done, Files, Reporter
+from vehest.run.launchers.task import TIMES, NotShared, TaskSpec, inputs_of, new_mark, pack, run_task, task_of, unpack
 from vehest.run.signals import StopSignals, TimeLimit
 
 ENVIRONMENT = {
@@ -46,6 +46,7 @@ class RayLauncher:
         self._address = address or os.environ.get("RAY_ADDRESS") or "local"
         self._jobs, self._output, self._messages = jobs, output, messages
         self._ray: Any = None
+        self._task: Any = None
         self._mark = Path()
         self._stored: dict[Path, Any] | None = None  # artefacts in Ray's object store; none while machines are taken to share the root
 
@@ -71,7 +72,7 @@ class RayLauncher:
                         self._ray.cancel(task)
                 while waiting and len(running) < self.cores:
                     position = waiting.popleft()
-                    running[self._begin(groups[position])] = position
+                    running[self._begin(position, groups[position])] = position
                     report(position, None)
                 for task in self._ray.wait(list(running), timeout=POLL_SECONDS)[0] if running else []:
                     position = running.pop(task)
@@ -101,13 +102,14 @@ class RayLauncher:
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
         self._ray, self._mark = ray, new_mark(self._output)
+        self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
         machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
-    def _begin(self, group: Group) -> Any:
-        task = self._ray.remote(num_cpus=1, max_retries=TIMES - 1, name=group.name)(_run)
-        spec = task_of(group, self._output, self._mark)
+    def _begin(self, position: int, group: Group) -> Any:
+        task = self._task.options(name=group.name)
+        spec = task_of(position, group, self._output, self._mark)
         if self._stored is None:
             return task.remote(spec)
         inputs = inputs_of(group)
@@ -118,7 +120,7 @@ class RayLauncher:
         """The outcome of a task; none if it was called off before it began, or needs copies."""
         errors = self._ray.exceptions
         try:
-            report: TaskReport = self._ray.get(task)
+            done: Done = self._ray.get(task)
         except errors.TaskCancelledError:
             return None
         except errors.RayTaskError as error:
@@ -131,11 +133,11 @@ class RayLauncher:
             return None
         except errors.RayError as error:
             return Done(position, Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"))
-        unpack(report.made)
-        return Done(position, report.outcome, report.seconds)
+        unpack(done.made)
+        return done
 
 
-def _run(spec: TaskSpec, *copies: Files) -> TaskReport:
+def _run(spec: TaskSpec, *copies: Files) -> Done:
     """The task that Ray runs, and cancels by SIGINT."""
     cancelled = threading.Event()
     handler = signal.signal(signal.SIGINT, lambda *_: cancelled.set())

@@ -18,7 +18,7 @@ from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
 from vehest.run.launchers.local import Done, Reporter, default_jobs
-from vehest.run.launchers.task import TIMES, TaskReport, TaskSpec, new_mark, run_task, task_of
+from vehest.run.launchers.task import TIMES, TaskSpec, new_mark, run_task, task_of
 from vehest.run.signals import StopSignals, TimeLimit
 
 MOST_REQUEUED = 100  # times that a job whose time was up goes on
@@ -54,7 +54,7 @@ def _positive(name: str, text: str) -> float:
 class SlurmTask:
     """A job; submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again."""
 
-    def __call__(self, spec: TaskSpec) -> TaskReport:
+    def __call__(self, spec: TaskSpec) -> Done:
         """Run a group until it is done or the driver asks for its end."""
         return run_task(spec, None, (spec.mark / STOP).exists)
 
@@ -99,7 +99,7 @@ class SlurmLauncher:
                     waiting = []
                     self._call_off()
                 room = len(waiting) if self._cluster == "slurm" else self.cores - len(self._running)
-                self._running |= zip(self._begin([groups[position] for position in waiting[:room]]), waiting[:room], strict=True)
+                self._running |= zip(self._begin(groups, waiting[:room]), waiting[:room], strict=True)
                 waiting = waiting[room:]
                 for job, position in self._running.items():
                     if job.state in ("RUNNING", "COMPLETED"):
@@ -129,8 +129,8 @@ class SlurmLauncher:
         self._executor = submitit.AutoExecutor(new_mark(self._output), self._cluster, **limit)
         self._executor.update_parameters(**self._parameters, slurm_array_parallelism=self._jobs)
 
-    def _begin(self, groups: Sequence[Group]) -> Sequence[Any]:
-        specs = [task_of(group, self._output, self._executor.folder) for group in groups]
+    def _begin(self, groups: Sequence[Group], positions: Sequence[int]) -> Sequence[Any]:
+        specs = [task_of(position, groups[position], self._output, self._executor.folder) for position in positions]
         try:
             return self._executor.map_array(SlurmTask(), specs) if specs else []
         except RuntimeError as error:
@@ -148,7 +148,7 @@ class SlurmLauncher:
         """The outcome of a job; none if it ended without one."""
         log = f"its log: {job.paths.stderr}"
         try:
-            report: TaskReport = job.result()
+            return job.result()  # type: ignore[no-any-return]
         except RuntimeError as error:
             self._lost[name] += 1
             if not job.paths.result_pickle.exists():
@@ -157,6 +157,8 @@ class SlurmLauncher:
                     return Done(position, Failure(f"{why} ({TIMES} times)"))
                 self._messages.line("again", "train", name, why)
                 return None
-            reason = next((line for line in reversed(str(error).splitlines()) if "Error: " in line and "submitit" not in line), str(error))
+            reason = next(
+                (line for line in reversed(str(error).splitlines()) if "Error: " in line and "submitit" not in line),
+                str(error).splitlines()[0],
+            )
             raise MissingError(f"a machine of the cluster cannot run jobs: {reason.strip()}; {log}") from error
-        return Done(position, report.outcome, report.seconds)

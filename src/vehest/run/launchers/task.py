@@ -1,6 +1,6 @@
 """A group as a task of a cluster: idempotent by the keys of its members, so that a second try makes nothing twice.
 
-Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> TaskReport -> artefacts in the driver's output root
+Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts in the driver's output root
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import platform
 import socket
 import tempfile
 import time
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +20,10 @@ from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.artefacts import MANIFEST, commit, library_versions, read_artefact
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
-from vehest.run.launchers.local import guarded
+from vehest.run.launchers.local import Done, Files, guarded
 from vehest.version import __version__
 
 TIMES = 3  # that a group is tried, if its tasks end without a report
-Files = MutableMapping[Path, Mapping[str, bytes]]
-"""Folder of an artefact -> its files."""
 
 
 class NotShared(Exception):
@@ -36,20 +34,12 @@ class NotShared(Exception):
 class TaskSpec:
     """A group with the driver's paths, relative ones by ``folder``; a machine that sees ``mark`` shares the output root."""
 
+    position: int
     group: Group
     folder: Path
     mark: Path
     versions: Mapping[str, str]
     limits: Limits
-
-
-@dataclass(frozen=True)
-class TaskReport:
-    """The outcome of a group, the time it took [s], and what it made on a machine that does not share the output root."""
-
-    outcome: Sequence[Member] | Failure
-    seconds: float
-    made: Files
 
 
 def new_mark(output: Path) -> Path:
@@ -59,12 +49,12 @@ def new_mark(output: Path) -> Path:
     return Path(tempfile.mkdtemp(prefix="run-", dir=folder))
 
 
-def task_of(group: Group, output: Path, mark: Path) -> TaskSpec:
+def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
     """What a machine is sent of a group."""
-    return TaskSpec(group, output if output.is_absolute() else Path.cwd(), mark, versions_here(), current_limits())
+    return TaskSpec(position, group, output if output.is_absolute() else Path.cwd(), mark, versions_here(), current_limits())
 
 
-def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> TaskReport:
+def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
     """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none while machines are taken to share the root.
 
     Raises:
@@ -83,7 +73,7 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
         unpack({} if shared or copies is None else copies)
         outcome = guarded(spec.group.run, should_stop, lambda _: None)
         made = {} if shared or isinstance(outcome, Failure) else pack(folders_of(outcome).difference(copies or ()))
-    return TaskReport(outcome, time.monotonic() - begun, made)
+    return Done(spec.position, outcome, time.monotonic() - begun, made)
 
 
 def versions_here() -> dict[str, str]:
