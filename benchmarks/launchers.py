@@ -31,7 +31,6 @@ from vehest.run.console import Messages
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.failures import Failure
 from vehest.run.group import Evaluation, Group
-from vehest.run.launchers import on_ray
 from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.on_ray import RayLauncher
@@ -76,7 +75,6 @@ def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
     """Both launchers on the same groups, each into a fresh output root; the median of the repeats."""
     recordings = scratch / "recordings"
     found: dict[str, list[dict[str, float]]] = {"local": [], "ray": []}
-    on_ray.LEAST_SECONDS = 0.0  # a task a group
     for repeat in range(repeats):
         for name, own in found.items():
             output = scratch / f"{name}-{repeat}"
@@ -87,22 +85,17 @@ def launchers(scratch: Path, number: int, repeats: int) -> dict[str, Any]:
 
 
 def scheduler(number: int) -> dict[str, float]:
-    """Tasks that do nothing, and exchanges with the board, a second, from one process [1/s]."""
+    """Tasks that do nothing, a second, from one process [1/s]."""
     import ray
 
     ray.init(address="local", num_cpus=CORES, include_dashboard=False, log_to_driver=False, logging_level=50)
     nothing = ray.remote(num_cpus=1)(_nothing)
-    board = ray.remote(on_ray.ProgressMailbox).remote()
     ray.get([nothing.remote() for _ in range(200)])
     begun = time.perf_counter()
     ray.get([nothing.remote() for _ in range(number)])
     tasks = number / (time.perf_counter() - begun)
-    ray.get(board.drain.remote(False))
-    begun = time.perf_counter()
-    ray.get([board.exchange.remote(0, None) for _ in range(number)])
-    exchanges = number / (time.perf_counter() - begun)
     ray.shutdown()
-    return {"empty_tasks_a_second": round(tasks), "board_exchanges_a_second": round(exchanges)}
+    return {"empty_tasks_a_second": round(tasks)}
 
 
 def _nothing() -> None:

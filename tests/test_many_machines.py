@@ -29,7 +29,6 @@ def quoted() -> dict[str, str]:
         "mlflow": f"| {1000 * tracked['mlflow_s_a_training']:.0f} ms of processor a training | {million['MLflow, one process']:.0f} h |",
         "planning": f"| {1000 * combination:.0f} ms of processor a combination | {million['planning, one process']:.1f} h with a seed each",
         "leftovers": f"for 100,000 entries | {million['looking for leftovers, all cores']:.2f} h of all cores |",
-        "news": f"| {per_second['board_exchanges_a_second']:,} exchanges a second |",
         "artefacts": f"| {plain['bytes_a_training'] / 1000:.0f} kB, {plain['files_a_training']:.0f} files a training "
         f"| {million['artefacts [GB]']:.0f} GB, {million['files [millions]']:.0f} million files |",
         "rows": f"| {tracked['mlflow_rows_a_training']:.0f} rows, {tracked['mlflow_bytes_a_training'] / 1000:.0f} kB a training "

@@ -71,18 +71,20 @@ def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, tmp_p
     assert not manifests(output)
 
 
-def test_a_queue_that_takes_no_more_jobs_fails_what_is_left_and_no_other(folder, alone, tmp_path):  # noqa: F811
+def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, tmp_path):  # noqa: F811
     output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
     environment = install(queue)
+    sbatch = queue / "bin" / "sbatch"
+    takes_jobs = sbatch.read_text()
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     lost = driver.sees(lambda: with_a_checkpoint(output))
-    (queue / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n")
+    sbatch.write_text("#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n")
     os.kill(lost["pid"], signal.SIGKILL)
-    assert driver.ended() == 5, driver.said
-    assert "failed  train      n_local=" in driver.said
-    assert "SLURM takes no jobs" in driver.said.rstrip().splitlines()[-1]
+    assert driver.ended() == 4, driver.said
+    assert "error: SLURM takes no jobs" in driver.said.rstrip().splitlines()[-1]
     assert "out of hours" in driver.said
     assert "Traceback" not in driver.said
-    assert manifests(output)
-    assert lost["name"] not in manifests(output)
-    assert set(states(queue).values()) == {"COMPLETED", "FAILED"}
+    sbatch.write_text(takes_jobs)
+    again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
+    assert again.ended() == 0, again.said
+    assert metrics(output) == metrics(alone["longer"])

@@ -118,7 +118,6 @@ def test_a_killed_worker_is_replaced_and_the_bits_are_the_same(cluster, folder, 
     assert driver.ended() == 0, driver.said
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
-    assert "its worker died; it goes on elsewhere from its last checkpoint" in driver.said
     assert before.items() <= manifests(output).items(), "nothing that had finished was trained again"
     assert not list(output.glob("checkpoints/*"))
 
@@ -133,7 +132,6 @@ def test_a_lost_node_takes_nothing_that_was_finished(mortal, folder, alone, tmp_
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
     assert before.items() <= manifests(output).items()
-    assert "its machine was lost" in driver.said or "its worker died" in driver.said
 
 
 def test_ctrl_c_loses_nothing_and_the_next_call_goes_on(cluster, folder, alone, tmp_path):
@@ -153,19 +151,13 @@ def test_ctrl_c_loses_nothing_and_the_next_call_goes_on(cluster, folder, alone, 
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can hide a folder from other processes")
-def test_nodes_that_do_not_see_the_output_root_get_copies_and_send_artefacts_back(folder, alone, tmp_path):
+def test_nodes_that_do_not_share_the_output_root_get_copies_and_send_artefacts_back(mortal, folder, alone, tmp_path):
     output = with_recordings(alone["longer"], tmp_path / "out")
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    nodes = TwoNodes(TMPDIR=str(scratch))
-    try:
-        driver = swept(nodes, folder, output, *LONGER, alone=True)
-        driver.sees(lambda: list(scratch.glob("vehest-*/checkpoints/*/checkpoint.safetensors")))
-        nodes.lose(nodes.nodes[1])
-        assert driver.ended() == 0, driver.said
-    finally:
-        nodes.shut_down()
-    assert "does not see the output root" in driver.said
+    driver = swept(mortal, folder, output, *LONGER, alone=True)
+    driver.sees(lambda: list((tmp_path / "hidden" / "checkpoints").glob("*/checkpoint.safetensors")))
+    mortal.lose(mortal.nodes[1])
+    assert driver.ended() == 0, driver.said
+    assert "does not share the output root" in driver.said
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
 
@@ -181,7 +173,7 @@ def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(clus
         killed.add(entry["pid"])
         os.kill(entry["pid"], signal.SIGKILL)
     assert driver.ended() == 5, driver.said
-    assert driver.said.count("its worker died, the 3rd time") >= 1
+    assert "3 times; --launcher local shows what ends it" in driver.said
     assert len(metrics(output)) == 3
     again = swept(cluster, folder, output, *one_seed)
     assert again.ended() == 0, again.said

@@ -22,16 +22,15 @@ PATIENCE = 900.0  # s, after which an event that never came is a failure of the 
 class TwoNodes:
     """A cluster of a head and a further node, a core each, on loopback."""
 
-    def __init__(self, **environment: str) -> None:
+    def __init__(self) -> None:
         from ray.cluster_utils import Cluster
 
         self._cluster = Cluster()
-        self.nodes = [self._add(environment, include_dashboard=False), self._add(environment)]
+        self.nodes = [self._add(include_dashboard=False), self._add()]
         self._cluster.wait_for_nodes()
 
-    def _add(self, environment: dict[str, str], **options: Any) -> Any:
-        own = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0", **environment}
-        return self._cluster.add_node(num_cpus=1, env_vars=own, **options)
+    def _add(self, **options: Any) -> Any:
+        return self._cluster.add_node(num_cpus=1, env_vars={"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}, **options)
 
     @property
     def address(self) -> str:

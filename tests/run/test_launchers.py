@@ -1,4 +1,4 @@
-"""What launchers share: progress, artefacts that travel, paths of another machine, options."""
+"""What launchers share: progress, artefacts that travel, options."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,6 @@ import pytest
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
-from vehest.data.limits import current_limits
 from vehest.run import console
 from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
@@ -24,7 +24,7 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.on_slurm import slurm_parameters
 from vehest.run.launchers.options import LauncherOptions
 from vehest.run.launchers.progress import LaunchProgress
-from vehest.run.launchers.task import TaskSpec, moved, pack, run_task, unpack, versions_here
+from vehest.run.launchers.task import NotShared, pack, run_task, task_of, unpack, versions_here
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
@@ -55,17 +55,16 @@ def trained(own: TrainJob, seconds: float, text: str = "weights") -> Artefact:
 # How far a launch is
 
 
-def test_standing_counts_and_estimates_the_end():
-    now = iter([0.0])
-    standing = LaunchProgress(10, clock=lambda: next(now, 5.0))
-    standing.runs(0)
-    standing.runs(1)
-    assert (standing.running, standing.waiting, standing.seconds_left(2)) == (2, 8, None)
-    standing.ended(0, 10.0, failed=False)
-    standing.ended(1, 20.0, failed=True)
-    assert (standing.done, standing.failed, standing.waiting) == (1, 1, 8)
-    assert standing.seconds_left(4) == 8 * 15.0 / 4
-    assert standing.row(4)["core hours"] == "0.008"
+def test_progress_counts_and_estimates_the_end():
+    progress = LaunchProgress(10)
+    progress.runs(0)
+    progress.runs(1)
+    begun = {"done": "0", "running": "2", "waiting": "8", "failed": "0", "core hours": "0.000", "cores": "2", "left": ""}
+    assert progress.row(2) == begun
+    progress.ended(0, 10.0, failed=False)
+    progress.ended(1, 20.0, failed=True)
+    ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "30 s"}
+    assert progress.row(4) == ended
     assert LaunchProgress(1).row(4) == {}
 
 
@@ -82,11 +81,11 @@ def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
 def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
     made = trained(job(tmp_path / "here"), 1.0)
     there = tmp_path / "there" / "train" / made.folder.name
-    unpack(pack(made.folder), there)
+    files = pack({made.folder})[made.folder]
+    unpack({there: files})
     assert read_artefact(there).digest == made.digest
-    cut = {**pack(made.folder), "model.safetensors": b"weigh"}
     with pytest.raises(DataError, match="gone or truncated"):
-        unpack(cut, tmp_path / "other" / "train" / made.folder.name)
+        unpack({tmp_path / "other" / "train" / made.folder.name: {**files, "model.safetensors": b"weigh"}})
     assert not list((tmp_path / "other" / "train").iterdir())
 
 
@@ -99,30 +98,26 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
     manifest["outputs"]["model.safetensors"]["sha256"] = "../home/precious.txt"
     (made.folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(DataError, match="64 hexadecimal digits"):
-        unpack(pack(made.folder), tmp_path / "there" / "train" / made.folder.name)
+        unpack({tmp_path / "there" / "train" / made.folder.name: pack({made.folder})[made.folder]})
     assert find(job(tmp_path / "here").plan) is None
     assert precious.read_text() == "precious"
 
 
 def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
-    spec = TaskSpec(Group([job(tmp_path)]), tmp_path, "run", {**versions_here(), "torch": "1.0"}, current_limits(), 1.0)
-    report = run_task(spec, {}, lambda _: False)
-    assert "torch" in report.unsuitable
-    assert "instead of 1.0" in report.unsuitable
-    assert report.outcome is None
+    spec = replace(task_of(0, Group([job(tmp_path)]), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
+    with pytest.raises(MissingError, match=r"torch .* instead of 1\.0; install the same versions"):
+        run_task(spec, {}, lambda: False)
+    assert not list(tmp_path.iterdir())
 
 
-# Paths, machines and choices
+def test_a_machine_without_the_output_root_does_nothing_before_it_gets_copies(tmp_path):
+    spec = task_of(0, Group([job(tmp_path / "out")]), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
+    with pytest.raises(NotShared):
+        run_task(spec, None, lambda: False)
+    assert not list(tmp_path.iterdir())
 
 
-def test_a_group_moves_to_another_root_and_back_with_the_same_keys(tmp_path):
-    here, there = tmp_path / "here", tmp_path / "there"
-    group = Group([job(here, start_from=str(here / "train" / "model"))])
-    gone = moved(group, here, there)
-    assert gone.jobs[0].plan.folder.is_relative_to(there)
-    assert gone.jobs[0].training["start_from"] == str(there / "train" / "model")
-    assert gone.jobs[0].plan.key == group.jobs[0].plan.key
-    assert moved(gone, there, here) == group
+# Machines and choices
 
 
 def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch):

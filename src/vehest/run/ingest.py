@@ -17,7 +17,7 @@ from vehest.data.store import write_recording
 from vehest.run.artefacts import StagePlan
 from vehest.run.config import Config, missing_keys
 from vehest.run.failures import Failure
-from vehest.run.launchers.local import Task, launch
+from vehest.run.launchers.local import launch
 from vehest.run.locks import held_at_once
 from vehest.run.signals import StopSignals
 from vehest.run.versions import version_of_source
@@ -107,9 +107,9 @@ def _make_side_by_side(
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
     missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
-    tasks = [Task(recording_id, partial(_make_part, dict(dataset), recording_id, parts)) for recording_id in missing]
+    tasks = [partial(_make_part, dict(dataset), recording_id, parts) for recording_id in missing]
     made, failures = [recording_id for recording_id in ids if recording_id not in missing], []
-    for end in launch(tasks, jobs, stop, lambda at, _: report(len(made), len(ids), tasks[at].name)):
+    for end in launch(tasks, jobs, stop, lambda at, _: report(len(made), len(ids), missing[at])):
         if isinstance(end.outcome, Failure):
             failures.append(end.outcome)
         else:

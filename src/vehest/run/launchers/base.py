@@ -1,36 +1,32 @@
-"""Launchers: one interface for this machine's cores, a Ray cluster and a SLURM queue."""
+"""Launchers have one interface: this machine's cores, a Ray cluster and a SLURM queue."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.console import Messages
-from vehest.run.group import Group, Member
+from vehest.run.group import Group
 from vehest.run.launchers.local import Done, LocalLauncher, Reporter, default_jobs
 from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
 from vehest.run.signals import StopSignals, TimeLimit
 
 
 class Launcher(Protocol):
-    """Runs groups; finished ones come back to this process, which alone tracks and draws."""
+    """Runs groups; outcomes come back to this process, which alone tracks and draws."""
 
     @property
     def cores(self) -> int:
         """Groups that can run at a time."""
 
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[list[Member]]]:
-        """Run groups and yield them as they end; a group that fails is a value and keeps no other from running.
-
-        Args:
-            groups: begun in this order.
-            stop: when a signal came or the time is up, running trainings are asked to end and no other is begun.
-            report: called with a group's position and its progress (None when it starts), or what it waits for.
+    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+        """Run groups as `local.launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
 
         Raises:
-            MissingError: there is nothing to run on.
+            MissingError: there is no cluster, it takes no tasks, or one of its machines cannot run them.
         """
 
     def close(self) -> None:
@@ -38,30 +34,30 @@ class Launcher(Protocol):
 
 
 def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
-    """The launcher of a command.
-
-    Args:
-        options: of the command.
-        jobs: most groups at a time; none for as many as there are cores.
-        output: the output root.
-        messages: prints what happens on a cluster.
+    """The launcher of a command; without ``jobs`` it runs as many groups at a time as there are cores.
 
     Raises:
         ConfigurationError: there is no such launcher, or it takes no such option.
-        MissingError: a package that it needs is not installed.
+        MissingError: a package that it needs is not installed, or there is no SLURM here.
     """
-    if options.launcher not in LAUNCHERS:
-        raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{options.launcher}'")
-    if options.address and options.launcher == "local":
+    name = options.launcher
+    if name not in LAUNCHERS:
+        raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{name}'")
+    if options.address and name == "local":
         raise ConfigurationError("--address is for --launcher ray and slurm, not for local")
-    if options.slurm and options.launcher != "slurm":
-        raise ConfigurationError(f"--slurm is for --launcher slurm, not for {options.launcher}")
-    if options.launcher == "local":
+    if options.slurm and name != "slurm":
+        raise ConfigurationError(f"--slurm is for --launcher slurm, not for {name}")
+    if name == "local":
         return LocalLauncher(jobs or default_jobs())
-    if options.launcher == "slurm":
-        from vehest.run.launchers.on_slurm import SlurmLauncher
-
-        return SlurmLauncher(options.address, jobs, options.slurm, output, messages)
     from vehest.run.launchers.on_ray import RayLauncher
+    from vehest.run.launchers.on_slurm import SlurmLauncher, slurm_parameters
 
+    if name == "slurm" and options.address not in (None, "local"):
+        raise ConfigurationError(f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{options.address}'")
+    parameters = slurm_parameters(options.slurm)
+    package = {"ray": "ray", "slurm": "submitit"}[name]
+    if importlib.util.find_spec(package) is None:
+        raise MissingError(f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'")
+    if name == "slurm":
+        return SlurmLauncher(options.address or "slurm", jobs, parameters, output, messages)
     return RayLauncher(options.address, jobs, output, messages)

@@ -1,254 +1,164 @@
 """Groups as jobs of a SLURM cluster, through submitit, or as processes that submitit starts here to try it.
 
-A group is a job. All jobs are handed to the queue at once; a job that dies is handed in again. A job whose time is up is put back into the
-queue by submitit and goes on from its last checkpoint. Machines share the output root.
+A job whose time is up is put back into the queue by submitit and goes on from its last checkpoint. Machines share the output root.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import ConfigurationError, MissingError
-from vehest.data.limits import current_limits
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
-from vehest.run.group import Group, Member
+from vehest.run.group import Group
 from vehest.run.launchers.local import Done, Reporter, default_jobs
-from vehest.run.launchers.task import (
-    MARKS,
-    TaskReport,
-    TaskSpec,
-    forget_mark,
-    leave_mark,
-    moved,
-    new_run,
-    received,
-    run_task,
-    versions_here,
-)
+from vehest.run.launchers.task import TIMES, TaskSpec, new_mark, run_task, task_of
 from vehest.run.signals import StopSignals, TimeLimit
 
-INSTALL = "pip install 'vehest[slurm]'"
-HERE = "local"  # address under which submitit starts processes of this machine
-MOST_DEATHS = 3  # of jobs at one group, after which the group is what ends them
 MOST_REQUEUED = 100  # times that a job whose time was up goes on
-POLL_SECONDS = {HERE: 0.2, "slurm": 2.0}
-BEAT_SECONDS = {HERE: 0.5, "slurm": 5.0}
-OPTIONS: Mapping[str, tuple[str, type]] = {
-    "account": ("slurm_account", str),
-    "constraint": ("slurm_constraint", str),
-    "memory_gb": ("mem_gb", float),
-    "minutes": ("timeout_min", float),
-    "partition": ("slurm_partition", str),
-    "qos": ("slurm_qos", str),
-}
-"""Name in ``--slurm NAME=VALUE`` -> parameter of submitit, and its type."""
-DEFAULTS: Mapping[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
+POLL_SECONDS = {"local": 0.2, "slurm": 2.0}
+STOP = "stop"  # file that asks all jobs to end
+PARAMETERS = {"account": "slurm_account", "constraint": "slurm_constraint", "memory_gb": "mem_gb", "minutes": "timeout_min"}
+PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
+"""Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
     """What jobs ask the queue for.
 
-    Args:
-        words: ``NAME=VALUE`` each, of `OPTIONS`.
-
     Raises:
-        ConfigurationError: a word is not of this form, or its value is no positive number where it must be one.
+        ConfigurationError: a word is not NAME=VALUE with a name of `PARAMETERS`, or its value is no positive number where it must be one.
     """
-    found = dict(DEFAULTS)
+    found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
     for word in words:
         name, _, value = word.partition("=")
-        if name not in OPTIONS or not value:
-            raise ConfigurationError(f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(OPTIONS)}")
-        key, kind = OPTIONS[name]
-        if kind is float:
-            try:
-                number = float(value)
-            except ValueError:
-                number = 0.0
-            if not 0.0 < number < float("inf"):
-                raise ConfigurationError(f"--slurm {name} must be a positive number, not '{value}'")
-            found[key] = max(round(number), 1) if key == "timeout_min" else number
-        else:
-            found[key] = value
-    return found
+        if name not in PARAMETERS or not value:
+            raise ConfigurationError(f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}")
+        found[PARAMETERS[name]] = _positive(name, value) if name in ("memory_gb", "minutes") else value
+    return {**found, "timeout_min": max(round(found["timeout_min"]), 1)}
 
 
-class OnSlurm:
+def _positive(name: str, text: str) -> float:
+    with suppress(ValueError):
+        if 0.0 < float(text) < float("inf"):
+            return float(text)
+    raise ConfigurationError(f"--slurm {name} must be a positive number, not '{text}'")
+
+
+class SlurmTask:
     """A job; submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again."""
 
-    def __call__(self, spec: TaskSpec, stop: Path) -> TaskReport:
-        """Run a group until it is done or the file ``stop`` is there."""
-        return run_task(spec, {}, lambda _: stop.exists())
+    def __call__(self, spec: TaskSpec) -> Done:
+        """Run a group until it is done or the driver asks for its end."""
+        return run_task(spec, None, (spec.mark / STOP).exists)
 
-    def checkpoint(self, spec: TaskSpec, stop: Path) -> Any:
-        """The same task again: finished artefacts are found by their keys, a training goes on from its checkpoint."""
+    def checkpoint(self, spec: TaskSpec) -> Any:
+        """The same task again."""
         from submitit.helpers import DelayedSubmission
 
-        return DelayedSubmission(self, spec, stop)
+        return DelayedSubmission(self, spec)
 
 
 class SlurmLauncher:
-    """Runs groups as SLURM jobs.
-
-    Args:
-        address: none for SLURM, or ``local`` for processes of this machine.
-        jobs: most jobs at a time; none for as many as the queue begins, here as there are cores.
-        words: resources of a job, ``NAME=VALUE`` each.
-        output: the output root, which all machines see under the same path.
-        messages: prints jobs that are handed in again.
+    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of this machine.
 
     Raises:
-        ConfigurationError: an address or a word is not known.
-        MissingError: submitit is not installed, or there is no SLURM here.
+        MissingError: there is no SLURM here.
     """
 
-    def __init__(self, address: str | None, jobs: int | None, words: Sequence[str], output: Path, messages: Messages) -> None:
-        if address not in (None, HERE):
-            raise ConfigurationError(f"--address must be left out for --launcher slurm, or be '{HERE}' to try it here, not '{address}'")
-        self._parameters = slurm_parameters(words)
-        if importlib.util.find_spec("submitit") is None:
-            raise MissingError(f"--launcher slurm needs submitit, which is not installed: {INSTALL}")
-        self._cluster = HERE if address == HERE else "slurm"
-        if self._cluster == "slurm" and shutil.which("sbatch") is None:
-            raise MissingError(f"there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address {HERE}")
-        self._most = jobs or (default_jobs() if self._cluster == HERE else None)
-        self._output, self._messages = output, messages
-        self._run = new_run()
-        self._folder = output.resolve() / MARKS / f"slurm-{self._run}"
+    def __init__(self, cluster: str, jobs: int | None, parameters: Mapping[str, Any], output: Path, messages: Messages) -> None:
+        if cluster == "slurm" and shutil.which("sbatch") is None:
+            raise MissingError("there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local")
+        self._cluster, self._parameters, self._output, self._messages = cluster, parameters, output, messages
+        self._jobs = jobs or (default_jobs() if cluster == "local" else None)
         self._executor: Any = None
-        self._failed = False
-        self._under_way = 0
+        self._running: dict[Any, int] = {}
+        self._lost: Counter[str] = Counter()  # jobs, by the name of their group
 
     @property
     def cores(self) -> int:
-        """Jobs at a time, as many as are allowed or else as have begun."""
-        return self._most or max(1, self._under_way)
+        """Jobs at a time, as many as are allowed or else as run now."""
+        return self._jobs or max(1, sum(job.state == "RUNNING" for job in self._running))
 
-    @property
-    def _stop(self) -> Path:
-        """File that asks all jobs to end."""
-        return self._folder / "stop"
-
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done[list[Member]]]:
+    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """See `Launcher`."""
         if stop.requested() or not groups:
             return
-        self._prepare()
-        waiting = deque(range(len(groups)))
-        flying: dict[int, Any] = {}
-        begun: set[int] = set()
-        deaths: Counter[int] = Counter()
+        if self._executor is None:
+            self._connect()
+        waiting = list(range(len(groups)))
         with stop.deferred():
-            while waiting or flying:
-                for position, job in flying.items():
-                    if position not in begun and job.state in ("RUNNING", "COMPLETED"):
-                        begun.add(position)
-                        report(position, None)
-                self._under_way = len(begun & set(flying))
+            while waiting or self._running:
                 if stop.requested():
-                    waiting.clear()
-                    self._call_off(flying, begun)
-                else:
-                    yield from self._hand_in(groups, waiting, flying, refused=not deaths and not flying)
-                ended = [position for position, job in flying.items() if job.done()]
-                if flying and not ended:
+                    waiting = []
+                    self._call_off()
+                room = len(waiting) if self._cluster == "slurm" else self.cores - len(self._running)
+                self._running |= zip(self._begin(groups, waiting[:room]), waiting[:room], strict=True)
+                waiting = waiting[room:]
+                for job, position in self._running.items():
+                    if job.state in ("RUNNING", "COMPLETED"):
+                        report(position, None)
+                ended = [job for job in self._running if job.done()]
+                if self._running and not ended:
                     time.sleep(POLL_SECONDS[self._cluster])
-                for position in ended:
-                    done = self._ended(flying.pop(position), position, groups[position], deaths)
+                for job in ended:
+                    position = self._running.pop(job)
+                    done = self._done(position, job, groups[position].name)
                     if done is not None:
                         yield done
                     elif not stop.requested():
-                        begun.discard(position)
                         waiting.append(position)
 
     def close(self) -> None:
-        """Forget what was handed over; logs of jobs that failed stay."""
+        """Call off what is left; logs of jobs that were lost stay."""
         if self._executor is not None:
-            forget_mark(self._output, self._run)
-            if not self._failed:
-                shutil.rmtree(self._folder, ignore_errors=True)
+            self._call_off()
+            if not self._lost:
+                shutil.rmtree(self._executor.folder, ignore_errors=True)
 
-    def _prepare(self) -> None:
-        if self._executor is not None:
-            return
+    def _connect(self) -> None:
         import submitit
 
-        leave_mark(self._output, self._run)
-        self._folder.mkdir(mode=0o700)
-        self._executor = submitit.AutoExecutor(self._folder, cluster=self._cluster, **{f"{self._cluster}_max_num_timeout": MOST_REQUEUED})
-        self._executor.update_parameters(**self._parameters)
-        if self._cluster == "slurm" and self._most:
-            self._executor.update_parameters(slurm_array_parallelism=self._most)
+        limit = {f"{self._cluster}_max_num_timeout": MOST_REQUEUED}
+        self._executor = submitit.AutoExecutor(new_mark(self._output), self._cluster, **limit)
+        self._executor.update_parameters(**self._parameters, slurm_array_parallelism=self._jobs)
 
-    def _hand_in(
-        self, groups: Sequence[Group], waiting: deque[int], flying: dict[int, Any], *, refused: bool
-    ) -> Iterator[Done[list[Member]]]:
-        """Give the queue all that waits, or as much as may run here; failures where it takes no more.
-
-        Raises:
-            MissingError: ``refused``, it takes no jobs from the start.
-        """
-        import submitit
-
-        room = len(waiting) if self._cluster == "slurm" else self.cores - len(flying)
-        positions = [waiting.popleft() for _ in range(min(room, len(waiting)))]
-        if not positions:
-            return
-        root = self._output.resolve()
-        fixed = (root, self._run, versions_here(), current_limits(), BEAT_SECONDS[self._cluster])
-        specs = [TaskSpec(moved(groups[position], self._output, root), *fixed) for position in positions]
+    def _begin(self, groups: Sequence[Group], positions: Sequence[int]) -> Sequence[Any]:
+        specs = [task_of(position, groups[position], self._output, self._executor.folder) for position in positions]
         try:
-            handed = self._executor.map_array(OnSlurm(), specs, [self._stop] * len(specs))
-        except (submitit.core.utils.FailedSubmissionError, submitit.core.utils.UncompletedJobError) as error:
+            return self._executor.map_array(SlurmTask(), specs) if specs else []
+        except RuntimeError as error:
             reason = " ".join(str(error).split())[-300:]
-            why = f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit"
-            if refused:
-                raise MissingError(why) from error
-            positions += waiting
-            waiting.clear()
-            yield from (Done(position, Failure(why, exit_code=MissingError.exit_code)) for position in positions)
-            return
-        flying |= dict(zip(positions, handed, strict=True))
+            raise MissingError(f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit") from error
 
-    def _ended(self, job: Any, position: int, group: Group, deaths: Counter[int]) -> Done[list[Member]] | None:
-        """The outcome of a job; none where it is to be handed in again, or was called off."""
-        import submitit
-
-        try:
-            told: TaskReport = job.result()
-        except submitit.core.utils.FailedJobError as error:  # a defect, or a package that a machine lacks
-            self._failed = True
-            reason = next((line for line in reversed(str(error).splitlines()) if "Error" in line and "submitit" not in line), str(error))
-            return Done(position, Failure(f"{reason.strip()}; the job's log: {job.paths.stderr}", detail=str(error)))
-        except submitit.core.utils.UncompletedJobError:
-            self._failed = True
-            deaths[position] += 1
-            state = str(job.state).lower().replace("_", " ")
-            if deaths[position] >= MOST_DEATHS:
-                hint = f"{MOST_DEATHS} jobs with it ended without an outcome (the last: {state}); its log: {job.paths.stderr}"
-                return Done(position, Failure(hint))
-            detail = f"its job ended without an outcome ({state}); it goes on in another from its last checkpoint"
-            self._messages.line("again", "train", group.name, detail)
-            return None
-        if told.unsuitable or told.apart:
-            why = told.unsuitable or f"does not see the output root '{self._output.resolve()}'; mount it there under the same path"
-            return Done(position, Failure(f"{told.host}: {why}", exit_code=MissingError.exit_code))
-        outcome = received(told, self._output)
-        return None if outcome is None else Done(position, outcome, told.seconds)
-
-    def _call_off(self, flying: dict[int, Any], begun: set[int]) -> None:
+    def _call_off(self) -> None:
         """Ask jobs to end after their batch, and take back those that have not begun."""
-        self._stop.touch()
-        if self._cluster == "slurm":
-            for position in set(flying) - begun:
-                with suppress(Exception):  # it has just ended
-                    flying[position].cancel(check=False)
-                del flying[position]
+        (self._executor.folder / STOP).touch()
+        for job in [job for job in self._running if job.state in ("PENDING", "UNKNOWN")]:
+            job.cancel(check=False)
+            del self._running[job]
+
+    def _done(self, position: int, job: Any, name: str) -> Done | None:
+        """The outcome of a job; none if it ended without one."""
+        log = f"its log: {job.paths.stderr}"
+        try:
+            return job.result()  # type: ignore[no-any-return]
+        except RuntimeError as error:
+            self._lost[name] += 1
+            if not job.paths.result_pickle.exists():
+                why = f"its job ended without an outcome ({str(job.state).lower()}); {log}"
+                if self._lost[name] == TIMES:
+                    return Done(position, Failure(f"{why} ({TIMES} times)"))
+                self._messages.line("again", "train", name, why)
+                return None
+            reason = next(
+                (line for line in reversed(str(error).splitlines()) if "Error: " in line and "submitit" not in line),
+                str(error).splitlines()[0],
+            )
+            raise MissingError(f"a machine of the cluster cannot run jobs: {reason.strip()}; {log}") from error

@@ -1,4 +1,4 @@
-"""Options of a command that say where trainings run."""
+"""Options of a command: where trainings run."""
 
 from __future__ import annotations
 
@@ -10,13 +10,7 @@ LAUNCHERS = ("local", "ray", "slurm")
 
 @dataclass(frozen=True)
 class LauncherOptions:
-    """Where trainings run.
-
-    Args:
-        launcher: one of `LAUNCHERS`.
-        address: of the cluster, for ``ray``; ``local`` for ``slurm`` on this machine.
-        slurm: resources of a job, ``NAME=VALUE`` each, for ``slurm``.
-    """
+    """Where trainings run: one of `LAUNCHERS`, the address of a cluster, and resources of SLURM jobs as ``NAME=VALUE``."""
 
     launcher: str = "local"
     address: str | None = None

@@ -1,32 +1,23 @@
-"""How far a launch is: groups done, running, waiting and failed, what they cost, and when the last will be done."""
+"""Counts the groups of a launch, and estimates when the last will be done."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
 @dataclass
 class LaunchProgress:
-    """Counts of the groups of a launch.
-
-    Args:
-        total: groups.
-        clock: reading [s]; monotonic.
-    """
+    """Of so many groups those that are done, running and failed."""
 
     total: int
-    clock: Callable[[], float] = time.monotonic
     core_seconds: float = 0.0
     done: int = 0
     failed: int = 0
     _running: set[int] = field(default_factory=set)
-    _begun: float | None = None
 
     def runs(self, position: int) -> None:
         """A group has begun, or goes on."""
-        self._begun = self.clock() if self._begun is None else self._begun
         self._running.add(position)
 
     def ended(self, position: int, seconds: float, *, failed: bool) -> None:
@@ -36,36 +27,20 @@ class LaunchProgress:
         self.failed += failed
         self.done += not failed
 
-    @property
-    def running(self) -> int:
-        """Groups under way."""
-        return len(self._running)
-
-    @property
-    def waiting(self) -> int:
-        """Groups that nobody has begun."""
-        return self.total - self.done - self.failed - self.running
-
-    def seconds_left(self, cores: int) -> float | None:
-        """Until all is done, if the rest takes what those that ended took; those under way count half. None before the first has ended."""
-        ended = self.done + self.failed
-        if not ended:
-            return None
-        mean = self.core_seconds / ended
-        return max((self.waiting + 0.5 * self.running) * mean / max(1, cores), 0.5 * mean if self.running else 0.0)
-
     def row(self, cores: int) -> Mapping[str, str]:
-        """What is shown, heading -> value; nothing for a single group."""
+        """What is shown, heading -> value; nothing for a single group.
+
+        The time left is that of groups which take as long as those that ended; running ones count half.
+        """
         if self.total < 2:
             return {}
-        left = self.seconds_left(cores)
-        counts = {"done": self.done, "running": self.running, "waiting": self.waiting, "failed": self.failed}
-        return {
-            **{name: str(value) for name, value in counts.items()},
-            "core hours": f"{self.core_seconds / 3600:.3f}",
-            "cores": str(cores),
-            "left": "" if left is None else duration(left),
-        }
+        running, ended = len(self._running), self.done + self.failed
+        waiting = self.total - ended - running
+        mean = self.core_seconds / max(1, ended)
+        left = max((waiting + 0.5 * running) * mean / max(1, cores), 0.5 * mean if running else 0.0)
+        counts = {"done": self.done, "running": running, "waiting": waiting, "failed": self.failed}
+        texts = {"core hours": f"{self.core_seconds / 3600:.3f}", "cores": str(cores), "left": duration(left) if ended else ""}
+        return {name: str(value) for name, value in counts.items()} | texts
 
 
 def duration(seconds: float) -> str:
