@@ -186,7 +186,15 @@ def _check_output(folder: Path, name: str, entry: Output, stage: str) -> None:
     manifest, again = f"'{folder / MANIFEST}'", f"run the stage '{stage}' again"
     parts = PurePosixPath(name).parts
     too_long = any(len(part.encode("utf-8", "surrogatepass")) > 255 for part in parts)
-    if not parts or too_long or PurePosixPath(*parts).as_posix() != name or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
+    if (
+        not parts
+        or too_long
+        or PurePosixPath(*parts).as_posix() != name
+        or parts[0] == "/"
+        or ".." in parts
+        or "\\" in name
+        or "\0" in name
+    ):
         raise DataError(f"{manifest}: outputs names {name[:80]!r}, which is no file inside the folder; {again}")
     if not DIGEST.fullmatch(entry.sha256):
         raise DataError(f"{manifest}: the digest of '{name}' is not 64 hexadecimal digits; {again}")

@@ -1,8 +1,8 @@
 """Locks across processes: one process at a time makes an artefact.
 
-The operating system drops a lock when its holder ends. The files stay: removing one while another process waits for it would make two locks.
-While a process waits it holds no other lock, except that of the tracking store, under which nothing waits; so two runs never wait for each
-other.
+The operating system drops a lock when its holder ends. The files stay: removing one while another process waits for it would make two
+locks. While a process waits it holds no other lock, except that of the tracking store, under which nothing waits; so two runs never wait
+for each other.
 """
 
 from __future__ import annotations
