@@ -289,7 +289,7 @@ def constraints() -> dict[str, str]:
 @cache
 def commit() -> str:
     """Commit of the checkout that vehest runs from, marked if it has changes; empty without a checkout."""
-    if not (CHECKOUT / ".git").exists() or "site-packages" in CHECKOUT.parts:
+    if not (CHECKOUT / ".git").exists():
         return ""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:

@@ -20,8 +20,7 @@ from vehest.run.failures import Failure
 from vehest.run.launchers.local import Task, launch
 from vehest.run.locks import held
 from vehest.run.signals import StopSignals
-from vehest.run.versions import version_of_source
-from vehest.sources.base import Source, open_source
+from vehest.sources.base import Source, open_source, source_class
 from vehest.training.context import Progress
 
 STAGE = "ingest"
@@ -69,7 +68,7 @@ def code_of_ingest(dataset: Mapping[str, Any]) -> str:
     Args:
         dataset: its configuration.
     """
-    return f"ingest={VERSION} {version_of_source(dataset)}"
+    return f"ingest={VERSION} {dataset['source']}={source_class(dataset).version}"
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
