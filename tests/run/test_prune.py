@@ -12,7 +12,7 @@ import pytest
 
 from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
-from vehest.run import calibrate, downsample, evaluate, ingest, train
+from vehest.run import calibrate, downsample, evaluate, ingest, report, train
 from vehest.run.artefacts import Artefact, StagePlan, make
 from vehest.run.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
 
@@ -58,6 +58,12 @@ def a_dead_process() -> int:
 
 
 def test_what_todays_code_has_made_stays(root):
+    assert root.found() == {}
+
+
+def test_a_report_of_calibrated_models_stays(root):
+    inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
+    root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
     assert root.found() == {}
 
 

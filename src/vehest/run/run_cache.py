@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
 
 FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 3
-MOST_FILES = 20_000  # of raw data; beyond, looking at each takes longer than a run in full
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env\s*:\s*([A-Za-z_]\w*)")
 _RESOLVERS = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:")
 
@@ -149,10 +149,10 @@ class RunCache:
         runner: Runner,
         report: Artefact,
         summary: TerminalSummary,
-        raw: Mapping[str, str] | None,
+        raw: Mapping[str, str],
         publication: Publication | None = None,
     ) -> None:
-        """Record a finished study, unless runs are left to track, files changed meanwhile or changes could not be noticed.
+        """Record a finished study, unless runs are left to track or files changed meanwhile.
 
         Args:
             runner: that made all artefacts.
@@ -162,7 +162,7 @@ class RunCache:
             publication: what is published.
         """
         tracker, output = runner.tracker, runner.output
-        if self.file is None or not self.key or raw is None or output != self.file.parents[1] or self._key() != self.key:
+        if self.file is None or not self.key or output != self.file.parents[1] or self._key() != self.key:
             return
         if tracker is not None and not tracker.complete:
             return
@@ -201,37 +201,32 @@ class RunCache:
         return digest.hexdigest()
 
 
-def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, str] | None:
-    """Folder of raw files of each data set -> its stamp; none if there are too many files to look at each time.
+def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Folder of raw files of each data set -> its stamp.
 
     Args:
         datasets: name -> configuration.
     """
-    stamps = {str(dataset["path"]): stamp_of(str(dataset["path"])) for dataset in datasets.values() if "path" in dataset}
-    return {path: stamp for path, stamp in stamps.items() if stamp} if all(stamps.values()) else None
+    return {str(dataset["path"]): stamp_of(str(dataset["path"])) for dataset in datasets.values() if "path" in dataset}
 
 
 def stamp_of(path: str) -> str:
-    """Hash of names, sizes, times and inodes of all files below a folder, links followed; empty if they are too many or cannot be read.
+    """Hash of names, sizes, times and inodes of all files below a folder, links followed.
 
     The time of the last change of an inode shows that a file was replaced by one of the same size and date.
     """
     entries: list[tuple[str, int, int, int, int]] = []
-    visited: set[tuple[int, int]] = set()
-    try:
-        for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
-            own = os.stat(folder)
-            if (own.st_dev, own.st_ino) in visited:
-                folders.clear()
-                continue
-            visited.add((own.st_dev, own.st_ino))
-            for file in (os.path.join(folder, name) for name in names):
-                about = os.stat(file) if os.path.exists(file) else os.lstat(file)
+    visited: set[str] = set()
+    for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        for file in (os.path.join(folder, name) for name in names):
+            with suppress(OSError):  # a link to nothing
+                about = os.stat(file)
                 entries.append((file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino))
-            if len(entries) > MOST_FILES:
-                return ""
-    except OSError:
-        return ""
     return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
 
 

@@ -16,7 +16,7 @@ import sqlite3
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -70,35 +70,30 @@ class Tracker:
         self._output, self._root = output, str(output.resolve())
         self._warn, self._should_stop = warn, should_stop
         self._study = study
-        self._client: Any = None
-        self._experiment_id = ""
 
     @property
     def store(self) -> str:
         """Name of the local store in the output root; empty where nothing is tracked, or a server has the runs."""
         return STORE if self._wanted and not self._uri else ""
 
-    def lacks(self, artefact: Artefact) -> bool:
-        """Whether an artefact has to be logged."""
-        return self._asked(lambda: not _is_finished(self._run_of(artefact)))
-
     def log(
         self,
         artefact: Artefact,
-        metrics: Mapping[str, float],
+        metrics: Callable[[], Mapping[str, float]],
         history: Path | None = None,
         figures: Mapping[str, Callable[[], Any]] | None = None,
     ) -> None:
-        """Log an artefact as a run, unless another process has logged it.
+        """Log an artefact as a run, unless it is.
 
         Args:
             artefact: its label is the run's name.
-            metrics: final ones.
+            metrics: reads the final ones.
             history: CSV with a column ``epoch`` and metrics over it.
             figures: file name -> what draws it (a matplotlib figure, or none if there is nothing to draw).
         """
-        drawings = {name: drawing for name, draw in (figures or {}).items() if (drawing := draw()) is not None}
-        self._asked(lambda: self._log(artefact, metrics, history, drawings))
+        if self._asked(lambda: not _is_finished(self._run_of(artefact))):
+            values, drawings = metrics(), {name: draw() for name, draw in (figures or {}).items()}
+            self._asked(lambda: self._log(artefact, values, history, drawings))
 
     def _asked(self, action: Callable[[], bool]) -> bool:
         """Use the store while no other process does; False once tracking is given up."""
@@ -107,12 +102,10 @@ class Tracker:
         try:
             with held(Lock(self._output, "tracking", "mlflow"), self._should_stop) as mine:
                 if mine:
-                    self._connect()
                     return action()
         except Exception as error:  # results matter more than any failure of a tracking server
-            where = self._uri or _sqlite(self._output / STORE)
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
-            self._warn(f"MLflow at {where} does not answer ({why}); going on without tracking, the next run makes up for it")
+            self._warn(f"MLflow at {self._address} does not answer ({why}); going on without tracking, the next run makes up for it")
         self.complete = False
         return False
 
@@ -132,7 +125,7 @@ class Tracker:
 
         client, run = self._client, self._run_of(artefact)
         if _is_finished(run):
-            return True
+            return True  # by another process
         run = run or client.create_run(self._experiment_id, tags=self._tags_of(artefact))
         run_id, begun = str(run.info.run_id), run.info.start_time  # metrics with the same time are kept once
         client.log_inputs(run_id, datasets=_datasets(artefact))
@@ -148,7 +141,8 @@ class Tracker:
             if not file.endswith(".parquet"):
                 client.log_artifact(run_id, str(artefact.folder / file), None if folder == "." else folder)
         for name, drawing in drawings.items():
-            client.log_figure(run_id, drawing, f"figures/{name}")
+            if drawing is not None:
+                client.log_figure(run_id, drawing, f"figures/{name}")
         if artefact.status == "complete" and artefact.outputs:
             self._link_model(artefact, run_id)
         client.set_terminated(run_id, "FINISHED" if artefact.status == "complete" else "KILLED")
@@ -201,9 +195,8 @@ class Tracker:
         elif models:
             client.log_inputs(run_id, models=[LoggedModelInput(models[0].model_id)])
 
-    def _connect(self) -> None:
-        if self._client is not None:
-            return
+    @cached_property
+    def _client(self) -> Any:
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
         from mlflow import MlflowClient
@@ -212,19 +205,24 @@ class Tracker:
             logging.getLogger(noisy).setLevel(logging.ERROR)
         logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # its errors are raised too
 
-        uri, location = self._uri, None
-        if not uri:
+        if not self._uri:
             store = self._output / STORE
-            uri, location = _sqlite(store), (self._output / "mlartifacts").resolve().as_uri()
             remove_leftovers(self._output)
             if not store.exists():
                 with written_aside(store) as aside:  # a process that is killed here leaves no store with half of its tables
                     MlflowClient(_sqlite(aside)).search_experiments(max_results=1)
             _check_store(store)
-        client = MlflowClient(str(uri))
-        found = client.get_experiment_by_name(self._experiment)
-        self._experiment_id = found.experiment_id if found else client.create_experiment(self._experiment, location)
-        self._client = client
+        return MlflowClient(self._address)
+
+    @cached_property
+    def _experiment_id(self) -> str:
+        found = self._client.get_experiment_by_name(self._experiment)
+        location = None if self._uri else (self._output / "mlartifacts").resolve().as_uri()
+        return str(found.experiment_id if found else self._client.create_experiment(self._experiment, location))
+
+    @property
+    def _address(self) -> str:
+        return str(self._uri or _sqlite(self._output / STORE))
 
 
 def _is_finished(run: Any) -> bool:
@@ -295,8 +293,7 @@ def log_member(tracker: Tracker, member: Member, how: Evaluation | None) -> None
     model = member.model
     if model is None:
         return
-    if tracker.lacks(model):
-        tracker.log(model, read_fit_metrics(model.folder), model.folder / HISTORY, {"learning.png": partial(_learning_figure, model)})
+    tracker.log(model, partial(read_fit_metrics, model.folder), model.folder / HISTORY, {"learning.png": partial(_learning_figure, model)})
     if member.calibration is not None:
         log_calibration(tracker, member.calibration)
     if member.evaluation is not None and how is not None:
@@ -305,15 +302,13 @@ def log_member(tracker: Tracker, member: Member, how: Evaluation | None) -> None
 
 def log_calibration(tracker: Tracker, calibration: Artefact) -> None:
     """Log a calibration unless it is: blocks and seconds behind its bands."""
-    if tracker.lacks(calibration):
-        tracker.log(calibration, calibration_figures(calibration.folder))
+    tracker.log(calibration, partial(calibration_figures, calibration.folder))
 
 
 def log_evaluation(tracker: Tracker, evaluation: Artefact, model: Artefact, how: Evaluation) -> None:
     """Log an evaluation unless it is: metrics, and traces over each test set."""
-    if tracker.lacks(evaluation):
-        drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
-        tracker.log(evaluation, test_figures(evaluation), None, drawn)
+    drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
+    tracker.log(evaluation, partial(test_figures, evaluation), None, drawn)
 
 
 def rmse_of_tests(evaluation: Artefact) -> dict[str, float]:
