@@ -499,7 +499,7 @@ def run(
 
     words = overrides or []
     options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
-    cache = RunCache(("run", pipeline, *words), words, pipeline)
+    cache = RunCache("run", pipeline, words)
     ran = cache.repeat(options)
     if ran is None:
         from vehest.run.study_run import run_study
@@ -545,7 +545,7 @@ def report(
     from vehest.run.run_cache import RunCache, RunOptions
 
     words, options = overrides or [], RunOptions(force, dry_run, quiet, 1)
-    cache = RunCache(("run", pipeline, *words), words, pipeline)
+    cache = RunCache("run", pipeline, words)
     ran = cache.repeat(options)
     if ran is None:
         from vehest.run.study_run import run_study
@@ -589,7 +589,7 @@ def sweep(
 
     words = overrides or []
     options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
-    cache = RunCache(("sweep", name or "", *words), words)
+    cache = RunCache("sweep", name or "", words)
     ran = cache.repeat(options)
     if ran is None:
         from vehest.run.study_run import run_sweep
@@ -625,12 +625,12 @@ def prune(
     That is what other code has made than today's, what is damaged or half-written, and what was made from something that is gone. Models
     and recordings of today's code stay, whatever their settings, and so does everything that vehest has not made.
     """
-    from vehest.run.prune import remove_found, size_in_words, unnamed
+    from vehest.run.prune import remove_unused, size_in_words, unused_artefacts
 
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
-    found = unnamed(Path(str(config["output"])))
+    found = unused_artefacts(Path(str(config["output"])))
     total = sum(one.size for one in found)
     shown = [TerminalTable("", ("no present key names", "size", "age", "since"), [one.in_words() for one in found])] if found else []
     emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {size_in_words(total)}" if found else "nothing to remove"])
@@ -639,7 +639,7 @@ def prune(
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("there is no terminal to ask at; add --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
-            remove_found(found, lambda one: removed.append(str(one.path)))
+            remove_unused(found, lambda one: removed.append(str(one.path)))
     listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
     emit(as_json, {"found": listed, "bytes": total, "removed": removed}, [f"{len(removed)} removed"] if removed else [])
 

@@ -39,8 +39,8 @@ STUDY = ("run", "quickstart", "training.max_epochs=3", "training.checkpoint_seco
 MOMENTS = {
     "ingest": ("begun", "part", "made"),
     "downsample": ("begun", "made"),
-    "train": ("locked", "checkpoint", "made", "store", "tracking", "tracked"),
-    "evaluate": ("locked", "begun", "made", "tracking", "tracked"),
+    "train": ("locked", "checkpoint", "made", "store", "tracking"),
+    "evaluate": ("locked", "begun", "made", "tracking"),
     "report": ("begun", "file", "made"),
 }
 PR_SET_PDEATHSIG = 1  # of Linux's prctl: a run ends with this process
@@ -190,13 +190,7 @@ def seen(output: Path, stage: str, moment: str) -> set[str]:
         }
     if moment == "store":
         return names(output, lambda name: name.endswith("mlflow.db"))
-    if moment == "tracking":
-        return names(output / "mlartifacts", lambda name: True)
-    return {name for folder in names(output / "tracked", lambda name: True) for name in names(output / "tracked" / folder, _of(stage))}
-
-
-def _of(stage: str) -> Callable[[str], bool]:
-    return lambda name: name.startswith(f"{stage}-")
+    return names(output / "mlartifacts", lambda name: True)
 
 
 def killed(output: Path, stage: str, number: signal.Signals, jobs: int, draw: random.Random, log: Path) -> Kill | None:

@@ -12,9 +12,9 @@ import pytest
 
 from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
-from vehest.run import calibrate, downsample, evaluate, ingest, train
+from vehest.run import calibrate, downsample, evaluate, ingest, report, train
 from vehest.run.artefacts import Artefact, StagePlan, make
-from vehest.run.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unnamed
+from vehest.run.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
 
 
 class Root:
@@ -38,8 +38,8 @@ class Root:
         return make(plan, lambda folder: (folder / "content").write_text(label) and None)
 
     def found(self) -> dict[str, str]:
-        """Path in the root -> why no key names it."""
-        return {found.path.relative_to(self.output).as_posix(): found.reason for found in unnamed(self.output)}
+        """Path in the root."""
+        return {found.path.relative_to(self.output).as_posix(): found.reason for found in unused_artefacts(self.output)}
 
 
 @pytest.fixture
@@ -58,6 +58,12 @@ def a_dead_process() -> int:
 
 
 def test_what_todays_code_has_made_stays(root):
+    assert root.found() == {}
+
+
+def test_a_report_of_calibrated_models_stays(root):
+    inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
+    root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
     assert root.found() == {}
 
 
@@ -119,7 +125,7 @@ def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not
 def test_a_record_of_a_study_that_lost_an_artefact_is_found(root):
     (root.output / "finished").mkdir()
     for name, folder in (("whole", root.model.folder), ("lost", root.model.folder.with_name("two-0123456789ab"))):
-        made = [{"folder": folder.relative_to(root.output).as_posix(), "key": "", "digest": ""}]
+        made = {folder.relative_to(root.output).as_posix(): ""}
         (root.output / "finished" / f"{name}.json").write_text(json.dumps({"made": made}))
     assert root.found() == {"finished/lost.json": BROKEN}
 

@@ -34,7 +34,7 @@ from vehest.run.downsample import write_downsample
 from vehest.run.estimate import preparation_of
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.ingest import recording_file
-from vehest.run.publishing import PROVENANCE, publish, shown_in
+from vehest.run.publishing import PROVENANCE, Published, publish, published_in
 from vehest.run.study import read_study
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.sources.base import open_source
@@ -408,9 +408,9 @@ def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path: Path) -> None:
 def test_a_published_study_that_is_damaged_shows_nothing(tmp_path: Path) -> None:
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
-        assert shown_in(tmp_path) == set()
+        assert published_in(tmp_path) is None
     (tmp_path / PROVENANCE).write_text('{"kinds": {"a": "real"}, "parts": ["b"], "command": "x"}')
-    assert shown_in(tmp_path) == {"a", "b"}
+    assert published_in(tmp_path) == Published(kinds={"a": "real"}, parts=("b",))
 
 
 def test_nothing_is_published_through_a_link(tmp_path: Path) -> None:

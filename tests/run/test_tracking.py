@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import sqlite3
@@ -78,31 +77,17 @@ def _local(place: Place, stage: str = "") -> list:
     return [run for run in runs if run.data.tags["vehest.stage"] == stage or (not stage and run.data.tags["vehest.stage"] != "study")]
 
 
-def _markers(place: Place) -> list[str]:
-    return sorted(file.name for file in (place.folder / "outputs" / "tracked").rglob("*") if file.is_file())
-
-
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Place, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
         code, _, err = place("run", "small", "--jobs", "1")
         assert code == 0, err
         assert err.count("does not answer") == 1
-    assert _markers(place) == []
+    assert not (place.folder / "outputs" / "finished").exists()
     code, _, err = place("run", "small", "--jobs", "1")
     assert code == 0, err
     assert "done" not in err, "nothing is made again for it"
     assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
-    assert len(_markers(place)) == 12
-
-
-def test_a_run_that_was_logged_and_not_marked_is_not_logged_twice(place: Place):
-    assert place(*TRAIN)[0] == 0
-    marked = _markers(place)
-    shutil.rmtree(place.folder / "outputs" / "tracked")
-    assert place(*TRAIN)[0] == 0
-    assert _markers(place) == marked
-    assert len(_local(place, "train")) == 1
 
 
 @pytest.mark.parametrize("step", ["log_batch", "log_artifact", "log_figure", "set_terminated"])
@@ -141,10 +126,8 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     [folder] = (place.folder / "outputs" / "train").iterdir()
     artefact = read_artefact(folder)
     assert run.data.tags["vehest.key"] == artefact.key
-    assert tracker.is_tracked(artefact)
-    other = replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64})
-    assert not tracker.is_tracked(other)
-    tracker.log(other, {})
+    tracker.log(artefact, lambda: pytest.fail("it is logged already"))
+    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict)
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
@@ -172,7 +155,6 @@ def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place: Pl
     full = _in_process(FULL, *TRAIN)
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    assert _markers(place) == []
     assert not list((place.folder / "outputs").glob("*mlflow.db*")), "no half of a store stays"
     code, _, err = place(*TRAIN)
     assert code == 0, err
@@ -189,10 +171,8 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
     full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    assert len(_markers(place)) < 14
     code, _, err = place("run", "small", "--jobs", "1")
     assert code == 0, err
-    assert len(_markers(place)) == 14
     assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
 
@@ -302,7 +282,7 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
     (tmp_path / MANIFEST).write_text("{}")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
     said: list[str] = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, {})
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict)
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}")).values()
     assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}

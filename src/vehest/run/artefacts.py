@@ -1,8 +1,9 @@
-"""What a stage leaves behind: one folder with a manifest, complete or not there at all.
+"""Artefacts: one folder a stage, with a manifest, complete or not there at all.
 
-The folder's name ends in the stage's key. The key is a hash of everything that determines the content: the stage's
-configuration, the digests of its inputs and the version of its code. Commit, library versions, time and machine are
-written down as provenance and are not part of the key.
+StagePlan -> `find`, or `make` under its lock -> Artefact
+
+The folder's name ends in the stage's key: a hash of everything that determines the content, which is the stage's configuration, the digests
+of its inputs and the version of its code. Commit, library versions, time and machine are provenance and not part of the key.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
@@ -39,12 +41,12 @@ Status = Literal["complete", "interrupted"]
 
 @dataclass(frozen=True)
 class StagePlan:
-    """What a stage is going to make.
+    """An artefact before it is made.
 
     Args:
         stage: name of the stage.
-        label: what it is made from, for people; start of the folder's name.
-        config: the part of the configuration that matters here, plain values.
+        label: start of the folder's name, for people.
+        config: the part of the configuration that determines the content, plain values.
         inputs: input name -> digest.
         code: version of the stage's code.
         output: the output root.
@@ -58,10 +60,14 @@ class StagePlan:
     output: Path
 
     @property
+    def content(self) -> dict[str, Any]:
+        """What determines the content."""
+        return {"stage": self.stage, "config": self.config, "inputs": dict(self.inputs), "code": self.code}
+
+    @property
     def key(self) -> str:
         """Hash of what determines the content."""
-        content = {"stage": self.stage, "config": self.config, "inputs": dict(self.inputs), "code": self.code}
-        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(self.content, sort_keys=True, default=str).encode()).hexdigest()
 
     @property
     def folder(self) -> Path:
@@ -70,8 +76,8 @@ class StagePlan:
 
     @property
     def lock(self) -> Lock:
-        """What a process holds while it makes the artefact."""
-        return Lock(self.output, self.stage, self.folder.name)
+        """Held by the process that makes the artefact."""
+        return Lock(self.output, self.stage, self._folder_name)
 
     @property
     def checkpoint_folder(self) -> Path:
@@ -85,20 +91,15 @@ class StagePlan:
 
 @dataclass(frozen=True)
 class Artefact:
-    """What a stage made.
+    """A folder that a stage has made.
 
     Args:
         folder: where it is.
-        stage: which stage made it.
-        label: what it was made from.
-        key: see the module.
+        stage, label, key, config, inputs, code: of its `StagePlan`.
         status: ``complete``, or ``interrupted`` where a fit was stopped with its best so far.
         outputs: file -> sha256.
-        config: configuration of the stage.
-        inputs: input name -> digest.
         provenance: time, seconds, versions, machine.
         skipped: whether it was there already.
-        code: version of the code that made it.
     """
 
     folder: Path
@@ -122,7 +123,7 @@ class Artefact:
 
 @dataclass(frozen=True)
 class Output:
-    """A file of an artefact: digest and length of its bytes."""
+    """Digest and length of a file's bytes."""
 
     sha256: str
     bytes: int
@@ -130,20 +131,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What manifest.json says; see `Artefact`, and docs/cli.md.
-
-    Args:
-        stage: name of the stage that wrote it.
-        label: what the artefact is made from, for people.
-        key: hash of what determines the content.
-        status: ``complete``, or ``interrupted``.
-        config: configuration of the stage.
-        inputs: input name -> digest.
-        outputs: file, relative to the folder -> what it is.
-        provenance: circumstances.
-        code: version of the stage's code.
-        format: version of this layout; 0 where none is stated, which is otherwise the same as 1.
-    """
+    """Keys of manifest.json (docs/cli.md); a format of 0, where none is stated, is otherwise the same as 1."""
 
     stage: str
     label: str
@@ -158,14 +146,12 @@ class Manifest:
 
 
 def find(plan: StagePlan) -> Artefact | None:
-    """The finished artefact of a plan, if it is there whole."""
+    """The complete artefact of a plan; none where it is missing, damaged, interrupted or another's."""
     try:
         artefact = read_artefact(plan.folder)
     except (DataError, MissingError):
         return None
-    if artefact.key != plan.key or artefact.status != "complete":
-        return None
-    return artefact
+    return artefact if artefact.key == plan.key and artefact.status == "complete" else None
 
 
 def read_artefact(folder: Path) -> Artefact:
@@ -186,52 +172,49 @@ def read_artefact(folder: Path) -> Artefact:
     manifest = validated(Manifest, content, f"'{path}'")
     for name, entry in manifest.outputs.items():
         _check_output(folder, name, entry, manifest.stage)
-    return Artefact(
-        folder=folder,
-        stage=manifest.stage,
-        label=manifest.label,
-        key=manifest.key,
-        status=manifest.status,
-        outputs={name: entry.sha256 for name, entry in manifest.outputs.items()},
-        config=manifest.config,
-        inputs=manifest.inputs,
-        provenance=manifest.provenance,
-        skipped=True,
-        code=manifest.code,
-    )
+    about = {**vars(manifest), "outputs": {name: entry.sha256 for name, entry in manifest.outputs.items()}}
+    del about["format"]
+    return Artefact(folder, skipped=True, **about)
 
 
 def _check_output(folder: Path, name: str, entry: Output, stage: str) -> None:
-    """See that a file of a manifest is there, in its size, and lies in the folder itself.
+    """Check that a file of a manifest has its size and lies in the folder itself.
 
     Raises:
         DataError: it does not.
     """
+    manifest, again = f"'{folder / MANIFEST}'", f"run the stage '{stage}' again"
     parts = PurePosixPath(name).parts
-    longest = max((len(part.encode("utf-8", "surrogatepass")) for part in parts), default=256)
-    if longest > 255 or PurePosixPath(*parts).as_posix() != name or parts[0] == "/" or ".." in parts or "\\" in name or "\0" in name:
-        raise DataError(
-            f"'{folder / MANIFEST}': outputs names {name[:80]!r}, which is no file inside the folder; run the stage '{stage}' again"
-        )
+    too_long = any(len(part.encode("utf-8", "surrogatepass")) > 255 for part in parts)
+    if (
+        not parts
+        or too_long
+        or PurePosixPath(*parts).as_posix() != name
+        or parts[0] == "/"
+        or ".." in parts
+        or "\\" in name
+        or "\0" in name
+    ):
+        raise DataError(f"{manifest}: outputs names {name[:80]!r}, which is no file inside the folder; {again}")
     if not DIGEST.fullmatch(entry.sha256):
-        raise DataError(f"'{folder / MANIFEST}': the digest of '{name}' is not 64 hexadecimal digits; run the stage '{stage}' again")
+        raise DataError(f"{manifest}: the digest of '{name}' is not 64 hexadecimal digits; {again}")
     path = folder.joinpath(*parts)
     if any(folder.joinpath(*parts[: n + 1]).is_symlink() for n in range(len(parts))):
-        raise DataError(f"'{path}' is a link; an artefact holds its files itself: run the stage '{stage}' again")
+        raise DataError(f"'{path}' is a link; an artefact holds its files itself: {again}")
     if not path.is_file() or path.stat().st_size != entry.bytes:
-        raise DataError(f"'{path}' is gone or truncated; run the stage '{stage}' again")
+        raise DataError(f"'{path}' is gone or truncated; {again}")
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-    """Run a stage: let ``write`` fill a folder aside, add the manifest, put the folder in its place.
+    """Run a stage: ``write`` fills a folder aside, which gets its manifest and is then moved to its place.
 
     Args:
-        plan: what is made.
+        plan: of the artefact.
         write: fills an empty folder; returns ``interrupted`` if it was stopped.
 
     Raises:
         MissingError: the disk is full or not writable.
-        VehestError: whatever ``write`` raises; nothing is left behind then.
+        VehestError: of ``write``; nothing is left behind then.
     """
     started = time.monotonic()
     remove_leftovers(plan.folder.parent)
@@ -239,22 +222,17 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
         aside.mkdir()
         status = write(aside) or "complete"
         files = sorted(file for file in aside.rglob("*") if file.is_file())
-        outputs = {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files}
         manifest = {
             "format": FORMAT,
-            "stage": plan.stage,
             "label": plan.label,
             "key": plan.key,
             "status": status,
-            "config": plan.config,
-            "inputs": dict(plan.inputs),
-            "code": plan.code,
-            "outputs": outputs,
+            **plan.content,
+            "outputs": {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files},
             "provenance": provenance(time.monotonic() - started),
         }
         (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
-    made = read_artefact(plan.folder)
-    return Artefact(**{**made.__dict__, "skipped": False})
+    return replace(read_artefact(plan.folder), skipped=False)
 
 
 def ensured(
@@ -262,28 +240,21 @@ def ensured(
     write: Callable[[Path], Status | None],
     force: bool,
     should_stop: Callable[[], bool],
-    say: Callable[[Waiting], None],
+    on_wait: Callable[[Waiting], None],
 ) -> Artefact | None:
     """Make an artefact, or take the one that another process is making; none if ``should_stop`` ended the waiting for it.
-
-    Args:
-        plan: what is made.
-        write: see `make`.
-        force: whether to make it although it is there.
-        should_stop: asked while another process makes it.
-        say: told what is waited for.
 
     Raises:
         VehestError: as `make` does.
     """
-    with held(plan.lock, should_stop, say) as mine:
+    with held(plan.lock, should_stop, on_wait) as mine:
         if not mine:
             return None
         return (None if force else find(plan)) or make(plan, write)
 
 
 def provenance(seconds: float) -> dict[str, Any]:
-    """Circumstances that are worth knowing and do not determine the content."""
+    """Circumstances that do not determine the content."""
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(seconds, 3),
@@ -303,10 +274,8 @@ def library_versions() -> dict[str, str]:
     names = ("torch", "numpy", "scipy", "numba", "pandas", "pyarrow", "hydra-core", "mlflow", "commonroad-vehicle-models")
     versions = {}
     for name in names:
-        try:
+        with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
     return versions
 
 
@@ -319,18 +288,12 @@ def constraints() -> dict[str, str]:
 
 @cache
 def commit() -> str:
-    """Commit of the checkout that vehest runs from, with a mark if it has changes; empty if it is no checkout."""
-    if not (CHECKOUT / ".git").exists() or "site-packages" in CHECKOUT.parts:
+    """Commit of the checkout that vehest runs from, marked if it has changes; empty without a checkout."""
+    if not (CHECKOUT / ".git").exists():
         return ""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
-        result = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=CHECKOUT,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
+        result = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return ""
     return result.stdout.strip()

@@ -18,9 +18,9 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
+from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
 from vehest.run.train import file_digest, recording_file
-from vehest.run.versions import version_of_estimator
 from vehest.trust.bands import Bands, Origin, Piece, band_inputs, calibrated
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
@@ -83,7 +83,7 @@ def code_of_calibration(estimator: str) -> str:
     Raises:
         ConfigurationError: the name is unknown.
     """
-    return f"calibrate={VERSION} {version_of_estimator(estimator)}"
+    return f"calibrate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
 def write_calibration(job: CalibrateJob, folder: Path) -> None:

@@ -20,6 +20,7 @@ from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import About, load_model, read_description
+from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
 from vehest.evaluation.blocks import Segments, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
@@ -39,7 +40,6 @@ from vehest.evaluation.metrics import (
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
-from vehest.run.versions import version_of_estimator
 from vehest.studies.artefacts import read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.record import read_trust
@@ -176,7 +176,7 @@ def code_of_evaluation(estimator: str) -> str:
     Raises:
         ConfigurationError: the name is unknown.
     """
-    return f"evaluate={VERSION} {version_of_estimator(estimator)}"
+    return f"evaluate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:

@@ -21,7 +21,7 @@ from vehest.run.calibrate import CalibrateJob, plan_calibrate, write_calibration
 from vehest.run.evaluate import plan_evaluate
 from vehest.run.evaluate_faults import FaultedJob, write_faulted
 from vehest.run.faults import FaultSettings
-from vehest.run.locks import Waiting, held, held_at_once
+from vehest.run.locks import Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
@@ -154,7 +154,7 @@ def is_calibrated(group: Group) -> bool:
 def drop_finished_checkpoint(job: TrainJob) -> None:
     """Remove the checkpoint of a model that is there, which a killed process left; not while somebody trains it."""
     if job.plan.checkpoint_folder.exists():
-        with held_at_once(job.plan.lock) as free:
+        with held(job.plan.lock) as free:
             if free:
                 drop_checkpoint(job.plan.checkpoint_folder)
 
@@ -166,7 +166,7 @@ def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], say: Callab
     Whoever waits holds no other training, so that two processes never wait for each other.
     """
     with ExitStack() as stack:
-        free = [job for job in jobs if stack.enter_context(held_at_once(job.plan.lock))]
+        free = [job for job in jobs if stack.enter_context(held(job.plan.lock))]
         if not free and stack.enter_context(held(jobs[0].plan.lock, should_stop, say)):
             free = [jobs[0]]
         yield free

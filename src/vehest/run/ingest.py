@@ -18,10 +18,9 @@ from vehest.run.artefacts import StagePlan
 from vehest.run.config import Config, missing_keys
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
-from vehest.run.locks import held_at_once
+from vehest.run.locks import held
 from vehest.run.signals import StopSignals
-from vehest.run.versions import version_of_source
-from vehest.sources.base import Source, open_source
+from vehest.sources.base import Source, open_source, source_class
 from vehest.training.context import Progress
 
 STAGE = "ingest"
@@ -69,7 +68,7 @@ def code_of_ingest(dataset: Mapping[str, Any]) -> str:
     Args:
         dataset: its configuration.
     """
-    return f"ingest={VERSION} {version_of_source(dataset)}"
+    return f"ingest={VERSION} {dataset['source']}={source_class(dataset).version}"
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
@@ -129,7 +128,7 @@ def _make_side_by_side(
 def drop_parts(plan: StagePlan) -> None:
     """Remove what was kept for an ingest that is finished, unless somebody makes it once more."""
     if _parts_of(plan).exists():
-        with held_at_once(plan.lock) as free:
+        with held(plan.lock) as free:
             if free:
                 remove(_parts_of(plan))
 

@@ -1,7 +1,8 @@
-"""One process at a time makes an artefact: a lock a name in an output root, which the operating system drops when its holder dies.
+"""Locks across processes: one process at a time makes an artefact.
 
-The files stay: one that is removed while somebody waits for it would be two locks. Nothing waits while it holds another lock, other than
-for the tracking store, which waits for nothing; so no two runs can wait for each other.
+The operating system drops a lock when its holder ends. The files stay: removing one while another process waits for it would make two
+locks. While a process waits it holds no other lock, except that of the tracking store, under which nothing waits; so two runs never wait
+for each other.
 """
 
 from __future__ import annotations
@@ -24,13 +25,7 @@ POLL_SECONDS = 0.05
 
 @dataclass(frozen=True)
 class Waiting:
-    """A lock that somebody else holds.
-
-    Args:
-        stage: of the artefact that is wanted.
-        label: of the artefact that is wanted.
-        holder: who holds it, for people.
-    """
+    """A lock that another process holds: stage and label of the artefact, and the holder, for people."""
 
     stage: str
     label: str
@@ -38,12 +33,12 @@ class Waiting:
 
 
 class Lock:
-    """A lock across processes; it ends with the process that holds it, however that ends.
+    """A lock across processes; it ends with the process that holds it.
 
     Args:
         output: the output root.
-        stage: of what is locked.
-        name: of what is locked, unique in its stage; need not suit a file.
+        stage: of the artefact.
+        name: unique in its stage; need not suit a file.
     """
 
     def __init__(self, output: Path, stage: str, name: str) -> None:
@@ -52,7 +47,7 @@ class Lock:
         self._lock = FileLock(self._path, fallback_to_soft=False)  # a file that only stands for a lock would outlive its process
 
     def take(self) -> bool:
-        """Take the lock if nobody holds it.
+        """Take the lock if it is free.
 
         Raises:
             MissingError: the output root cannot be written to.
@@ -68,49 +63,32 @@ class Lock:
             self._path.write_text(f"process {os.getpid()} on {socket.gethostname()}\n", encoding="utf-8")
         return True
 
-    def wait(self, should_stop: Callable[[], bool], say: Callable[[Waiting], None] | None = None) -> bool:
-        """Take the lock as soon as it is free; False if ``should_stop`` says so before.
-
-        Args:
-            should_stop: asked while waiting.
-            say: told once what is waited for, and who holds it.
-        """
-        said = False
-        while not self.take():
-            if say is not None and not said:
-                said = True
-                say(Waiting(self.stage, self.name, self.holder))
-            if should_stop():
-                return False
-            time.sleep(POLL_SECONDS)
-        return True
-
     @property
     def holder(self) -> str:
-        """Who took the lock last, for people."""
-        try:
+        """The process that took the lock last, for people."""
+        with suppress(OSError, UnicodeDecodeError):
             return self._path.read_text(encoding="utf-8").strip() or "another process"
-        except (OSError, UnicodeDecodeError):
-            return "another process"
+        return "another process"
 
     def release(self) -> None:
-        """Let it go; nothing happens where it is not held."""
+        """Release the lock; nothing happens where it is not held."""
         self._lock.release()
 
 
 @contextmanager
-def held(lock: Lock, should_stop: Callable[[], bool], say: Callable[[Waiting], None] | None = None) -> Iterator[bool]:
-    """Wait for a lock and hold it; yields False, and holds nothing, if ``should_stop`` ended the waiting."""
-    try:
-        yield lock.wait(should_stop, say)
-    finally:
-        lock.release()
+def held(lock: Lock, should_stop: Callable[[], bool] = lambda: True, on_wait: Callable[[Waiting], None] | None = None) -> Iterator[bool]:
+    """Hold a lock, and wait for it until ``should_stop``, by default not at all; yields whether it is held.
 
-
-@contextmanager
-def held_at_once(lock: Lock) -> Iterator[bool]:
-    """Hold a lock if nobody does; yields whether it is held."""
+    Raises:
+        MissingError: the output root cannot be written to.
+    """
     try:
-        yield lock.take()
+        mine = lock.take()
+        if not mine and on_wait is not None:
+            on_wait(Waiting(lock.stage, lock.name, lock.holder))
+        while not mine and not should_stop():
+            time.sleep(POLL_SECONDS)
+            mine = lock.take()
+        yield mine
     finally:
         lock.release()

@@ -1,9 +1,9 @@
-"""Which published results are those of today's versions, configuration and raw files; neither models nor an output root are needed.
+"""Compares published results with today's versions, configuration and raw files, without models or an output root.
 
 study -> `keys_of_study` -> provenance.json of results/STUDY -> `check_published` -> up to date, stale with its causes, or not known
 
-A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and raw files, so the keys of a study are
-the same as long as these are.
+A stage's own key holds digests of earlier artefacts. Those follow from versions, configuration and raw files, which the keys of a study
+therefore hold instead.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -52,15 +53,14 @@ def keys_of_study(
     dataset_config: Callable[[str, Config], Config],
     inputs_of: Callable[[Config], Mapping[str, str] | None],
 ) -> Keys:
-    """What determines the results of a study.
+    """Keys of everything that determines the results of a study.
 
     Args:
         study: with its parts or data sets.
         jobs: of the study.
         absent: parts or data sets that it goes on without.
         dataset_config: name of a data set and a job's configuration -> configuration of its ingest.
-        inputs_of: configuration of an ingest -> name of a raw file, or of a library -> digest, or version; none where the raw files are
-            missing, so that they are not compared.
+        inputs_of: configuration of an ingest -> raw file or library -> digest or version; none where raw files are missing.
     """
     keys: Keys = {}
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
@@ -94,11 +94,10 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         yield f"train {name}", {CODE: code_of_training(name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
             yield f"calibrate {name}", {CODE: code_of_calibration(name), CONFIGURATION: _hash(None)}
-        if not faults:
-            yield f"evaluate {name}", {CODE: code_of_evaluation(name), CONFIGURATION: _hash(first["evaluation"])}
-            continue
-        conditions = [first["evaluation"], *map(asdict, faults)]
-        yield f"evaluate {name}", {CODE: code_under_faults(code_of_evaluation(name)), CONFIGURATION: _hash(conditions)}
+        code, conditions = code_of_evaluation(name), first["evaluation"]
+        if faults:
+            code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
+        yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
 
 
 def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, str]:
@@ -127,12 +126,7 @@ def _hash(content: Any) -> str:
 
 @dataclass(frozen=True)
 class Change:
-    """Something that is not as it was when results were published.
-
-    Args:
-        what: is made of it, for example ``train ksnn``.
-        cause: ``code``, ``configuration`` or ``data``.
-    """
+    """Something that differs from when results were published: for example ``train ksnn``, and one of `CAUSES`."""
 
     what: str
     cause: str
@@ -140,13 +134,13 @@ class Change:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of a published study.
+    """The state of a published study.
 
     Args:
         study: its name.
         state: of its results.
         changes: why they are stale.
-        note: what could not be compared, or why nothing is known; may be empty.
+        note: on parts that could not be compared, or why the state is not known; may be empty.
     """
 
     study: str
@@ -162,16 +156,16 @@ class Verdict:
             if named:
                 more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
                 words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
-        why = [*([", ".join(words)] if words else []), *([self.note] if self.note else [])]
-        return ": ".join([self.study, self.state, *(["; ".join(why)] if why else [])])
+        why = "; ".join(part for part in (", ".join(words), self.note) if part)
+        return ": ".join(part for part in (self.study, self.state, why) if part)
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
-    """Compare what is recorded of published studies with what it would be today.
+    """Compare the recorded keys of published studies with those of today.
 
     Args:
-        names: of studies, or pipelines by name or path; all that are published in ./results if there are none.
-        overrides: ``root=FOLDER``, where raw files lie elsewhere than ``VEHEST_DATA`` says.
+        names: of studies, or pipelines by name or path; if empty, all studies that are published in ./results.
+        overrides: ``root=FOLDER``, where raw files lie outside ``VEHEST_DATA``.
 
     Raises:
         ConfigurationError: an override that would change what comes out.
@@ -180,15 +174,12 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
     if content_overrides(overrides):
         raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes what comes out, and what is published was made without it")
     pipelines: dict[str, Study | None] = {}
-    for name in names:
-        if find_pipeline(name) is None and (RESULTS / name / PROVENANCE).is_file():
+    for name in names or sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")):
+        if not names or (find_pipeline(name) is None and (RESULTS / name / PROVENANCE).is_file()):
             pipelines[name] = _pipeline_of(name)
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    if not names:
-        studies = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
-        pipelines = {study: _pipeline_of(study) for study in studies}
     if not pipelines:
         raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
     return [_verdict(study, pipeline, overrides) for study, pipeline in pipelines.items()]
@@ -239,15 +230,12 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
 
 
 def _changes(then: Mapping[str, Mapping[str, str]], today: Keys) -> list[Change]:
-    changes = [Change(what, cause) for what in then if what in today for cause in CAUSES if _differs(then[what], today[what], cause)]
+    changes = []
+    for what in (own for own in then if own in today):
+        compared = CAUSES if DATA in today[what] else (CODE, CONFIGURATION)  # raw files that are missing are not compared
+        changes += [Change(what, cause) for cause in compared if then[what].get(cause) != today[what].get(cause)]
     changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
     return changes + [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-
-
-def _differs(then: Mapping[str, str], today: Mapping[str, str], cause: str) -> bool:
-    if cause == DATA and DATA not in today:  # the raw files are not here
-        return False
-    return then.get(cause) != today.get(cause)
 
 
 def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner) -> list[Change]:
@@ -256,14 +244,10 @@ def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner)
         wanted = {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
     else:
         wanted = {part.name: jobs[part.name][0].config for part in study.parts}
+    look: Callable[[Config], object] = plan_ingest if study.datasets else runner.look_for_files
     found = []
     for name in sorted(set(wanted) & set(published.absent)):
-        try:
-            if study.datasets:
-                plan_ingest(wanted[name])
-            else:
-                runner.look_for_files(wanted[name])
-        except MissingError:
-            continue
-        found.append(Change(f"{name}, which was not here", DATA))
+        with suppress(MissingError):
+            look(wanted[name])
+            found.append(Change(f"{name}, which was not here", DATA))
     return found

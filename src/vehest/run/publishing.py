@@ -1,4 +1,7 @@
-"""What of a study is published in results/, and when."""
+"""Publishes a study's report in results/, and reads what is published.
+
+report -> `publish_study` -> results/STUDY, provenance.json with keys -> `published_in`
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from vehest.data.errors import ConfigurationError, VehestError
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import read_json
-from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact
+from vehest.run.artefacts import TIMINGS, Artefact
 from vehest.run.console import Messages
 from vehest.run.locks import Lock, held
 
@@ -23,89 +26,22 @@ PROVENANCE = "provenance.json"
 
 @dataclass(frozen=True)
 class Publication:
-    """A study whose outcome goes to results/<study>.
+    """A study whose report goes to results/<study>.
 
     Args:
         study: its name.
-        absent: name of what the study went on without -> what it is, for people.
-        keys: what determines its outcome (`vehest.run.study_keys`).
+        absent: name of a part or data set that the study went on without -> the same for people.
+        keys: what determines its outcome (`vehest.run.published.keys_of_study`).
     """
 
     study: str
     absent: Mapping[str, str] = field(default_factory=dict)
     keys: dict[str, dict[str, str]] = field(default_factory=dict)
 
-    @property
-    def folder(self) -> Path:
-        """Where it goes."""
-        return RESULTS / self.study
-
-
-def publish_study(publication: Publication | None, report: Artefact, messages: Messages) -> Path | None:
-    """Publish a study, but not without what the published one shows; returns where it is published, if it is.
-
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else.
-    """
-    if publication is None:
-        return None
-    lost = [words for name, words in publication.absent.items() if name in shown_in(publication.folder)]
-    if lost:
-        messages.warn(f"not published: '{publication.folder}' shows {lost[0]}, and this run could not read it")
-        return None
-    output = report.folder.parents[1]
-    with held(Lock(output, "publish", publication.study), lambda: False):
-        changed = publish(report, publication.folder, publication.keys)
-    if changed:
-        messages.line("done", "publish", str(publication.folder))
-    return publication.folder
-
-
-def publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
-    """Copy a report without pages and times to ``folder``; returns whether anything there changed.
-
-    The provenance gets the keys. Where they and every other file are the same, it stays the old one: of the first run that gave these
-    results.
-
-    Args:
-        report: what to publish.
-        folder: where it goes.
-        keys: what determines the outcome (`vehest.run.study_keys`).
-
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else, or is reached through a link.
-    """
-    if any(part.is_symlink() for part in (folder, folder.parent)):
-        raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
-    kept_back = (MANIFEST, TIMINGS)
-    wanted = {name: digest for name, digest in report.outputs.items() if name not in kept_back and not name.endswith(PAGE_ENDING)}
-    if folder.is_dir():
-        present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
-        former = published_in(folder)
-        if former is not None and former.keys == keys and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}:
-            return False
-        if present and PROVENANCE not in present:
-            raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
-    with written_aside(folder, replace_folder=True) as aside:
-        for name in wanted:
-            (aside / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(report.folder / name, aside / name)
-        about = {**read_json(report.folder / PROVENANCE), "keys": {name: dict(key) for name, key in keys.items()}}
-        (aside / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
-    return True
-
-
-def shown_in(folder: Path) -> set[str]:
-    """Data sets and parts that a published study shows; none where nothing is published."""
-    about = published_in(folder)
-    return set() if about is None else {*about.kinds, *about.parts}
-
 
 @dataclass(frozen=True)
 class Published:
-    """Of a published study's provenance.json, what later runs compare.
+    """The part of a published study's provenance.json that later runs compare.
 
     Args:
         kinds: data set -> ``real`` or ``simulated``.
@@ -122,8 +58,58 @@ class Published:
 
 
 def published_in(folder: Path) -> Published | None:
-    """What is recorded of a published study; none where nothing is published, or the record is damaged."""
+    """Read the record of a published study; none where nothing is published, or the record is damaged."""
     try:
         return validated(Published, read_json(folder / PROVENANCE), f"'{folder / PROVENANCE}'")
     except VehestError:
         return None
+
+
+def publish_study(publication: Publication | None, report: Artefact, messages: Messages) -> Path | None:
+    """Publish a study, unless the published one shows data that this run could not read; returns where it is published, if it is.
+
+    Raises:
+        MissingError: it cannot be written.
+        ConfigurationError: the folder holds something else.
+    """
+    if publication is None:
+        return None
+    folder = RESULTS / publication.study
+    former = published_in(folder) or Published()
+    lost = [words for name, words in publication.absent.items() if name in former.kinds or name in former.parts]
+    if lost:
+        messages.warn(f"not published: '{folder}' shows {lost[0]}, and this run could not read it")
+        return None
+    with held(Lock(report.folder.parents[1], "publish", publication.study), lambda: False):
+        changed = publish(report, folder, publication.keys)
+    if changed:
+        messages.line("done", "publish", str(folder))
+    return folder
+
+
+def publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+    """Copy a report without pages and times to ``folder``; returns whether anything there changed.
+
+    The provenance gets the keys. Where they and every other file are the same, it stays that of the first run with these results.
+
+    Raises:
+        MissingError: it cannot be written.
+        ConfigurationError: the folder holds something else, or is reached through a link.
+    """
+    if any(part.is_symlink() for part in (folder, folder.parent)):
+        raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
+    wanted = {name: digest for name, digest in report.outputs.items() if name != TIMINGS and not name.endswith(PAGE_ENDING)}
+    if folder.is_dir():
+        present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
+        former = published_in(folder)
+        if former is not None and former.keys == keys and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}:
+            return False
+        if present and PROVENANCE not in present:
+            raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
+    with written_aside(folder, replace_folder=True) as aside:
+        for name in wanted:
+            (aside / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(report.folder / name, aside / name)
+        about = {**read_json(report.folder / PROVENANCE), "keys": keys}
+        (aside / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
+    return True

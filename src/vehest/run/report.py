@@ -24,7 +24,6 @@ from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.publishing import PROVENANCE
 from vehest.run.study import Part, Study
 from vehest.run.train import read_fit_metrics, recording_file
-from vehest.run.versions import version_of_study
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
@@ -127,7 +126,7 @@ def code_of_report(study: str) -> str:
     Raises:
         ConfigurationError: the name is unknown.
     """
-    return f"report={VERSION} {version_of_study(study)}"
+    return f"report={VERSION} {study}={getattr(study_module(study), 'VERSION', '1')}"
 
 
 def write_report(job: ReportJob, folder: Path) -> None:

@@ -1,10 +1,9 @@
 """Recognises a finished study or sweep without the libraries that made it.
 
-After a run, a record in the output root holds the fingerprint of the command, the names, keys and digests of its artefacts, and the printed
-summary. While the fingerprint, the raw files and all artefacts are the same, the next run prints that summary; otherwise it runs in full,
-where keys decide what is up to date. The record decides nothing that keys do not decide.
+command, files of conf/, pipelines/ and code, environment -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
 
-command, files of conf/, pipelines/ and code, environment -> `RunCache.key` -> `load` -> Finished; outcome -> `save`
+A record in the output root holds a hash of these, stamps of the raw files, the digests of all artefacts and the printed summary. While
+nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide what is up to date.
 """
 
 from __future__ import annotations
@@ -15,11 +14,12 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vehest.data.errors import JobsFailedError, VehestError
 from vehest.data.files import file_name, remove_leftovers, written_aside
@@ -31,93 +31,19 @@ from vehest.run.console import WARNING, Messages
 from vehest.run.launchers.options import LauncherOptions
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.terminal import TerminalSummary
-from vehest.run.tracking import TRACKED_STAGES, Tracker
+
+if TYPE_CHECKING:
+    from vehest.run.runner import Runner
 
 FINISHED = "finished"  # folder of the records in an output root
-FORMAT = 2
-MOST_FILES = 20_000  # below a data set's folder; beyond, looking at each takes longer than a run in full
-ABSENT = "absent"
+FORMAT = 3
 _ENVIRONMENT = re.compile(r"\$\{\s*oc\.env\s*:\s*([A-Za-z_]\w*)")
 _RESOLVERS = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:")
-
-Line = tuple[str, str, str, str]
-
-
-@dataclass(frozen=True)
-class Made:
-    """An artefact of a study: folder relative to the output root, key and digest of its content."""
-
-    folder: str
-    key: str
-    digest: str
-
-
-@dataclass(frozen=True)
-class RawFolder:
-    """Raw files of a data set: their folder as its configuration names it, and the stamp of all files below it (`stamp_of`)."""
-
-    path: str
-    stamp: str
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """A study that was run.
-
-    Args:
-        output: the output root.
-        artefacts: all of them, the report last.
-        lines: that were printed: status, stage, label, detail.
-        summary: printed at the end.
-        publication: what is published of it.
-        tracking: ``tracking`` of the configuration.
-        raw: raw files of each data set, from before they were read; none if they are too many.
-    """
-
-    output: Path
-    artefacts: Sequence[Artefact]
-    lines: Sequence[Line]
-    summary: TerminalSummary
-    publication: Publication | None
-    tracking: Mapping[str, Any]
-    raw: Mapping[str, RawFolder] | None
-
-
-@dataclass(frozen=True)
-class Record:
-    """A finished study as it is kept; see `Outcome`."""
-
-    format: int
-    key: str
-    raw: dict[str, RawFolder]
-    made: tuple[Made, ...]
-    lines: tuple[Line, ...]
-    summary: TerminalSummary
-    publication: Publication | None
-    tracking: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A study that is there whole: its record, and its report."""
-
-    record: Record
-    report: Artefact
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a command that runs stages.
-
-    Args:
-        force: run although artefacts are there.
-        dry_run: print what would run, run nothing.
-        quiet: print warnings and results alone.
-        jobs: processes; none for one a core.
-        track: log runs.
-        minutes: time for everything, report included; none for no limit.
-        launcher: where trainings run; none for this machine.
-    """
+    """Options of a command that runs stages: as `vehest run --help` describes them; no ``jobs`` is one a core, ``track`` logs runs."""
 
     force: bool = False
     dry_run: bool = False
@@ -147,102 +73,123 @@ class Ran:
     failed: JobsFailedError | None = None
 
 
+@dataclass(frozen=True)
+class Record:
+    """A finished study.
+
+    Args:
+        key: of its `RunCache`.
+        raw: folder of raw files -> `stamp_of`.
+        made: folder of an artefact in the output root -> digest; the report last.
+        lines: that the next run in full would print: status, stage, label, detail.
+        summary: printed at the end.
+        publication: what is published.
+        store: MLflow's local store in the output root; empty where there is none.
+    """
+
+    key: str
+    raw: dict[str, str]
+    made: dict[str, str]
+    lines: tuple[tuple[str, str, str, str], ...]
+    summary: TerminalSummary
+    publication: Publication | None
+    store: str
+
+
 class RunCache:
     """The record of one command.
 
     Args:
-        words: of the command that determine the outcome.
-        overrides: among them.
-        pipeline: its name or path; empty for a sweep.
+        command: ``run`` or ``sweep``.
+        name: of the pipeline, or its path; of the sweep, if it was given.
+        overrides: of the command.
 
     Attributes:
+        file: of the record; none where the output root cannot be told from overrides and environment alone.
         key: hash of the command and of all files and variables that determine its meaning, as they were when this was made; empty if files
             alone do not tell.
     """
 
-    def __init__(self, words: Sequence[str], overrides: Sequence[str], pipeline: str = "") -> None:
-        self._words, self._overrides, self._pipeline = tuple(words), tuple(overrides), pipeline
-        self._folder = os.getcwd()
+    def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
+        self._words, self._overrides, self._pipeline = (command, name, *overrides), overrides, name if command == "run" else ""
+        named = [override.removeprefix("output=") for override in overrides if override.lstrip("+~").startswith("output")]
+        root = named[-1] if named else os.environ.get("VEHEST_OUTPUT", "outputs")
+        plain = root and not re.search(r"[\\'\"${},=()\[\]]", root)
+        own = hashlib.sha256(json.dumps(self._words).encode()).hexdigest()[:12]
+        self.file = Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{own}.json") if plain else None
         self.key = self._key()
 
-    @property
-    def output(self) -> Path | None:
-        """The output root, where overrides or the environment name it plainly."""
-        named = [override.removeprefix("output=") for override in self._overrides if override.lstrip("+~").startswith("output")]
-        root = named[-1] if named else os.environ.get("VEHEST_OUTPUT", "outputs")
-        return None if not root or re.search(r"[\\'\"${},=()\[\]]", root) else Path(root)
-
-    @property
-    def file(self) -> Path | None:
-        """Where the record is kept."""
-        if self.output is None:
-            return None
-        name = hashlib.sha256(json.dumps(self._words).encode()).hexdigest()[:12]
-        return self.output / FINISHED / f"{file_name(Path(self._pipeline).stem or 'sweep')}-{name}.json"
-
-    def load(self) -> Finished | None:
+    def load(self) -> Record | None:
         """The finished study, if nothing has changed since and all of it is there."""
-        if self.file is None or not self.file.is_file() or not self.key:
+        if self.file is None or not self.file.is_file():
             return None
-        assert self.output is not None
+        output = self.file.parents[1]
         try:
             record = validated(Record, read_json(self.file), f"'{self.file}'")
-            if (record.format, record.key) != (FORMAT, self.key) or any(stamp_of(raw.path) != raw.stamp for raw in record.raw.values()):
+            if record.key != self.key or any(stamp_of(path) != stamp for path, stamp in record.raw.items()):
                 return None
-            artefacts = [read_artefact(self.output / made.folder) for made in record.made]
+            whole = all(_is_whole(read_artefact(output / folder), digest) for folder, digest in record.made.items())
         except VehestError:
             return None
-        tracker = Tracker(record.tracking, self.output, lambda _: None)
-        for artefact, made in zip(artefacts, record.made, strict=True):
-            if (artefact.key, artefact.digest, artefact.status) != (made.key, made.digest, "complete"):
-                return None
-            if artefact.stage in TRACKED_STAGES and not tracker.is_tracked(artefact):
-                return None
-        return Finished(record, artefacts[-1])
+        return record if whole and (output / record.store).exists() else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
         """The finished study, printed and published as the next run in full would; none where there is no valid record, or under force."""
-        finished = None if options.force else self.load()
-        if finished is None:
+        record = None if options.force else self.load()
+        if record is None or self.file is None:
             return None
         messages = Messages(quiet=options.quiet)
-        messages.again(finished.record.lines)
-        published = None if options.dry_run else publish_study(finished.record.publication, finished.report, messages)
-        return Ran(finished.record.summary, finished.report.folder, True, published)
+        messages.again(record.lines)
+        report = read_artefact(self.file.parents[1] / list(record.made)[-1])
+        published = None if options.dry_run else publish_study(record.publication, report, messages)
+        return Ran(record.summary, report.folder, True, published)
 
-    def save(self, outcome: Outcome, warn: Callable[[str], None]) -> None:
-        """Keep a finished study, unless something changed meanwhile or the next run cannot tell whether it did.
+    def save(
+        self,
+        runner: Runner,
+        report: Artefact,
+        summary: TerminalSummary,
+        raw: Mapping[str, str],
+        publication: Publication | None = None,
+    ) -> None:
+        """Record a finished study, unless runs are left to track or files changed meanwhile.
 
         Args:
-            outcome: of the run.
-            warn: called if the record cannot be written.
+            runner: that made all artefacts.
+            report: the last of them.
+            summary: printed at the end.
+            raw: `stamps_of` the raw files, from before they were read.
+            publication: what is published.
         """
-        if self.file is None or not self.key or outcome.output != self.output or outcome.raw is None or self._key() != self.key:
+        tracker, output = runner.tracker, runner.output
+        if self.file is None or not self.key or output != self.file.parents[1] or self._key() != self.key:
             return
+        if tracker is not None and not tracker.complete:
+            return
+        made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
         record = Record(
-            format=FORMAT,
             key=self.key,
-            raw=dict(outcome.raw),
-            made=tuple(Made(own.folder.relative_to(self.output).as_posix(), own.key, own.digest) for own in outcome.artefacts),
-            lines=tuple(_next_time(outcome)),
-            summary=outcome.summary,
-            publication=outcome.publication,
-            tracking=dict(outcome.tracking),
+            raw=dict(raw),
+            made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
+            lines=tuple(_next_time(runner.messages.said, made)),
+            summary=summary,
+            publication=publication,
+            store=tracker.store if tracker is not None else "",
         )
         try:
             remove_leftovers(self.file.parent)
             with written_aside(self.file) as aside:
                 aside.write_text(json.dumps(asdict(record), indent=1, ensure_ascii=False), encoding="utf-8")
         except VehestError as error:
-            warn(f"{error}; the next run looks at everything again")
+            runner.messages.warn(f"{error}; the next run looks at everything again")
 
     def _key(self) -> str:
-        digest = hashlib.sha256(repr((FORMAT, sys.version_info[:2], self._words, self._folder, library_versions())).encode())
+        digest = hashlib.sha256(repr((FORMAT, sys.version_info[:2], self._words, os.getcwd(), library_versions())).encode())
         texts = list(self._overrides)
         try:
-            for name, file in [*_configuration(self._pipeline), *_code_files()]:
+            for file in [*_configuration(self._pipeline), *_code()]:
                 content = file.read_bytes()
-                digest.update(repr((name, hashlib.sha256(content).hexdigest())).encode("utf-8", "surrogateescape"))
+                digest.update(repr((str(file), hashlib.sha256(content).hexdigest())).encode("utf-8", "surrogateescape"))
                 if file.suffix == ".yaml":
                     texts.append(content.decode("utf-8", "replace"))
         except (OSError, VehestError, ImportError, ValueError):
@@ -254,102 +201,75 @@ class RunCache:
         return digest.hexdigest()
 
 
-def _next_time(outcome: Outcome) -> list[Line]:
-    """The lines that the next run in full would print: artefacts are up to date, notes and warnings stay."""
-    made = {(artefact.stage, artefact.label) for artefact in outcome.artefacts}
-    lines: list[Line] = []
-    for status, stage, label, detail in outcome.lines:
-        if (stage, label) in made and status in ("done", "skip", "note"):
-            lines.append(("skip", stage, label, "up to date"))
-        elif (status in ("note", WARNING) and stage != "calibrate") or stage == "split":
-            lines.append((status, stage, label, detail))
-    return lines
-
-
-def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, RawFolder] | None:
-    """Stamps of the raw files of data sets; none if there are too many of them to look at each time.
+def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Folder of raw files of each data set -> its stamp.
 
     Args:
         datasets: name -> configuration.
     """
-    raw = {}
-    for name, dataset in datasets.items():
-        if "path" not in dataset:
-            continue
-        stamp = stamp_of(str(dataset["path"]))
-        if stamp is None:
-            return None
-        raw[name] = RawFolder(str(dataset["path"]), stamp)
-    return raw
+    return {str(dataset["path"]): stamp_of(str(dataset["path"])) for dataset in datasets.values() if "path" in dataset}
 
 
-def stamp_of(path: str) -> str | None:
-    """Hash of names, sizes, times and inodes of all files below a folder; ``absent`` if there is none, none if there are too many.
+def stamp_of(path: str) -> str:
+    """Hash of names, sizes, times and inodes of all files below a folder, links followed.
 
-    The time of the last change of an inode is in it, so that a file that is replaced by one of the same size and date is seen.
+    The time of the last change of an inode shows that a file was replaced by one of the same size and date.
     """
-    top = Path(path).expanduser()
-    if not top.is_dir():
-        return ABSENT
     entries: list[tuple[str, int, int, int, int]] = []
-    visited: set[tuple[int, int]] = set()
-    waiting = [top]
-    while waiting:
-        folder = waiting.pop()
-        about = folder.stat()
-        if (about.st_dev, about.st_ino) in visited:
+    visited: set[str] = set()
+    for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders.clear()
             continue
-        visited.add((about.st_dev, about.st_ino))
-        try:
-            for entry in os.scandir(folder):
-                if entry.is_dir():
-                    waiting.append(Path(entry.path))
-                found = os.stat(entry.path) if entry.is_file() else entry.stat(follow_symlinks=False)
-                times = (0, 0) if entry.is_dir() else (found.st_mtime_ns, found.st_ctime_ns)
-                entries.append((os.path.relpath(entry.path, top), 0 if entry.is_dir() else found.st_size, *times, found.st_ino))
-        except OSError:
-            return None
-        if len(entries) > MOST_FILES:
-            return None
+        visited.add(real)
+        for file in (os.path.join(folder, name) for name in names):
+            with suppress(OSError):  # a link to nothing
+                about = os.stat(file)
+                entries.append((file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino))
     return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _configuration(pipeline: str) -> list[tuple[str, Path]]:
-    """Name and file of the configuration and of the pipeline, with the one that it is based on.
+def _is_whole(artefact: Artefact, digest: str) -> bool:
+    return artefact.status == "complete" and artefact.digest == digest
+
+
+def _next_time(said: Iterable[tuple[str, str, str, str]], made: Iterable[Artefact]) -> Iterator[tuple[str, str, str, str]]:
+    """The lines that the next run in full would print: artefacts are up to date, notes and warnings stay."""
+    names = {(artefact.stage, artefact.label) for artefact in made}
+    for status, stage, label, detail in said:
+        if (stage, label) in names and status in ("done", "skip", "note"):
+            yield "skip", stage, label, "up to date"
+        elif (status in ("note", WARNING) and stage != "calibrate") or stage == "split":
+            yield status, stage, label, detail
+
+
+def _configuration(pipeline: str) -> Iterator[Path]:
+    """Files of the configuration and of the pipeline, with the one that it is based on.
 
     Raises:
-        VehestError: the pipeline is not there or cannot be read.
+        VehestError: the pipeline cannot be read.
     """
-    files = [
-        (f"{number}/{file.relative_to(folder).as_posix()}", file)
-        for number, folder in enumerate([*conf_folders(), packaged_pipelines()])
-        for file in sorted(folder.rglob("*.yaml"))
-    ]
+    for folder in [*conf_folders(), packaged_pipelines()]:
+        yield from sorted(folder.rglob("*.yaml"))
     own = find_pipeline(pipeline) if pipeline else None
     if own is not None:
-        files.append(("pipeline", own))
+        yield own
         content = read_yaml(own)
-        base = find_pipeline(str(content.get("based_on"))) if isinstance(content, dict) and "based_on" in content else None
+        base = find_pipeline(str(content["based_on"])) if isinstance(content, dict) and "based_on" in content else None
         if base is not None:
-            files.append(("base", base))
-    return files
+            yield base
 
 
-def _code_files() -> list[tuple[str, Path]]:
-    """Name and file of the modules and templates of vehest and of every package that offers it estimators, sources or studies."""
-    packages = {Path(__file__).resolve().parents[1]}
+def _code() -> Iterator[Path]:
+    """Files of vehest and of every package that offers it estimators, sources or studies."""
     found = metadata.entry_points()
-    for group in sorted(group for group in found.groups if group.startswith("vehest.")):
-        for point in found.select(group=group):
-            spec = importlib.util.find_spec(point.module.partition(".")[0])
-            packages |= (
-                {Path(spec.origin).parent if spec.submodule_search_locations else Path(spec.origin)} if spec and spec.origin else set()
-            )
-    files: list[tuple[str, Path]] = []
-    for package in sorted(packages):
-        if package.is_file():
-            files.append((package.name, package))
-        for folder, folders, names in os.walk(package):
-            folders[:] = sorted(name for name in folders if name not in ("__pycache__", "pretrained"))
-            files += [(os.path.relpath(os.path.join(folder, name), package.parent), Path(folder, name)) for name in sorted(names)]
-    return files
+    points = [point for group in found.groups if group.startswith("vehest.") for point in found.select(group=group)]
+    for package in sorted({"vehest", *(point.module.partition(".")[0] for point in points)}):
+        spec = importlib.util.find_spec(package)
+        if spec is not None and spec.origin and not spec.submodule_search_locations:
+            yield Path(spec.origin)
+        for top in (spec and spec.submodule_search_locations) or ():
+            for folder, folders, names in os.walk(top):
+                folders[:] = sorted(name for name in folders if name not in ("__pycache__", "pretrained"))
+                yield from (Path(folder, name) for name in sorted(names))

@@ -33,8 +33,7 @@ from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.locks import Waiting
 from vehest.run.rates import Note
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
-from vehest.run.tracked_runs import log_member, rmse_of_tests
-from vehest.run.tracking import Tracker
+from vehest.run.tracking import Tracker, log_member, rmse_of_tests
 from vehest.run.train import learnt_spans, read_fit_metrics
 from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress

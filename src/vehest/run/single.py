@@ -17,7 +17,7 @@ from vehest.run.group import Evaluation, Group
 from vehest.run.run_cache import RunOptions
 from vehest.run.runner import Runner
 from vehest.run.study_run import open_runner
-from vehest.run.tracked_runs import log_calibration, log_evaluation, test_figures
+from vehest.run.tracking import log_calibration, log_evaluation, test_figures
 from vehest.run.train import TrainJob, read_fit_metrics, trained_rate
 
 

@@ -25,7 +25,7 @@ from vehest.run.launchers.local import default_jobs
 from vehest.run.published import Keys, keys_of_study
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.report import ReportJob, ShownDatasets, absent_dataset, leaderboard, overview, plan_report, verdict, write_report
-from vehest.run.run_cache import Outcome, Ran, RunCache, RunOptions, stamps_of
+from vehest.run.run_cache import Ran, RunCache, RunOptions, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Part, Study, content_overrides, jobs_of, read_study
@@ -116,17 +116,14 @@ def run_study(name: str, overrides: Sequence[str], options: RunOptions, cache: R
         if study.publish and not content_overrides(overrides) and error is None and not unfinished:
             gone = {own.name: f"part '{own.name}'" for own in absent} | {own.name: f"data set '{own.name}'" for own in shown.absent}
             publication = Publication(study.study, gone, _keys(study, jobs, gone, runner))
-        lines = list(runner.messages.said)
-        published = None if runner.dry_run else publish_study(publication, report, runner.messages)
         table = leaderboard(job)
         if table is None:
             summary = summary_of_overview(overview(report), left_out)
         else:
             summary = summary_of_leaderboard(study.title, table, left_out, verdict(job))
         if error is None and not unfinished and not runner.dry_run:
-            made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
-            outcome = Outcome(runner.output, made, lines, summary, publication, first.get("tracking", {}), raw)
-            cache.save(outcome, runner.messages.warn)
+            cache.save(runner, report, summary, raw, publication)
+        published = None if runner.dry_run else publish_study(publication, report, runner.messages)
     return Ran(summary, report.folder, report.skipped, published, error)
 
 
@@ -162,9 +159,7 @@ def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions, c
         summary = summary_of_sweep(swept.artefacts, swept.summary)
         error = None if runner.dry_run else failed_in([compared], runner)
         if error is None and not runner.dry_run:
-            made = [*(own for own in runner.artefacts.values() if own.folder != swept.folder.folder), swept.folder]
-            outcome = Outcome(runner.output, made, list(runner.messages.said), summary, None, first["tracking"], raw)
-            cache.save(outcome, runner.messages.warn)
+            cache.save(runner, swept.folder, summary, raw)
     return Ran(summary, swept.folder.folder, swept.folder.skipped, failed=error)
 
 

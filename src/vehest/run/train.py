@@ -19,7 +19,6 @@ from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
-from vehest.run.versions import version_of_estimator, version_of_training
 from vehest.training.context import FitContext
 
 STAGE = "train"
@@ -114,7 +113,8 @@ def code_of_training(estimator: str) -> str:
     Raises:
         ConfigurationError: the name is unknown.
     """
-    return f"train={VERSION} {version_of_estimator(estimator)} {version_of_training(estimator)}"
+    kind = estimator_class(estimator)
+    return f"train={VERSION} {estimator}={kind.version} training={getattr(kind.training_type, 'version', '1')}"
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
