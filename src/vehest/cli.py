@@ -592,9 +592,9 @@ def sweep(
     cache = RunCache(("sweep", name or "", *words), words)
     ran = cache.repeat(options)
     if ran is None:
-        from vehest.run.study_run import run_sweep
+        from vehest.run.study_run import run_study
 
-        ran = run_sweep(words, name, options, cache)
+        ran = run_study(name, words, options, cache, sweep=True)
     _print_ran(ran, as_json, sweep=True)
 
 
