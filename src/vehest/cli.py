@@ -263,7 +263,7 @@ def train(
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
     from vehest.run.run_cache import RunOptions
-    from vehest.run.single import train_one
+    from vehest.run.study_run import train_one
 
     emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
@@ -291,7 +291,7 @@ def evaluate(
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
     from vehest.run.run_cache import RunOptions
-    from vehest.run.single import evaluate_one
+    from vehest.run.study_run import evaluate_one
 
     emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
 

@@ -24,8 +24,8 @@ from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.needs import lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
-from vehest.run.rates import lower_rate
 from vehest.run.train import new_estimator
 from vehest.run.usable import all_usabilities, usability
 from vehest.training.context import FitContext

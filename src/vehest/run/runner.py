@@ -21,7 +21,7 @@ from vehest.data.store import read_recording
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.compiling import has_to_compile
 from vehest.run.config import Config, compose_config, missing_keys
-from vehest.run.console import Messages
+from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.failures import Failure
@@ -81,8 +81,6 @@ class Runner:
             self._known[key] = make()
         value: Value = self._known[key]
         return value
-
-    # Data
 
     def ingest(self, config: Config) -> Artefact:
         """The recordings of a data set at their native rate.
@@ -194,8 +192,6 @@ class Runner:
         self.artefacts[plan.folder] = found
         return found
 
-    # Trainings
-
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
         """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
 
@@ -209,23 +205,22 @@ class Runner:
             DryRunStop: in a dry run, if anything would have to be made.
         """
         members: dict[str, Member] = {}
-        waiting = self._missing(groups, members)
-        if self.train_first:
-            return members, self._not_made(waiting, members)
+        waiting: list[Group] = []
+        for group in groups:
+            found = existing(group)
+            members |= self._received(group, [member for member in found if member.finished])
+            missing = [member.job for member in found if not member.finished]
+            waiting += [replace(group, jobs=missing)] if missing else []
+        if waiting and self.train_first:
+            return members, self._untrained([job.plan for group in waiting for job in group.jobs], members)
+        if waiting:
+            self._announce(waiting, len(members))
         failures: dict[str, Failure] = {}
         launcher = self.launcher or LocalLauncher(self.jobs)
         while waiting:
             progress, alone = LaunchProgress(len(waiting)), []
             with self.messages.bars() as bars:
-
-                def report(at: int, news: Progress | Waiting | None) -> None:
-                    if isinstance(news, Waiting):
-                        self._print_waiting(news)
-                    else:
-                        progress.runs(at)  # noqa: B023
-                        bars.fit(waiting[at].name, news)  # noqa: B023
-                        bars.count(progress.row(launcher.cores))  # noqa: B023
-
+                report = partial(self._report, waiting, progress, bars, launcher.cores)
                 for done in launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
                     group, outcome = waiting[done.position], done.outcome
                     progress.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
@@ -245,29 +240,8 @@ class Runner:
             waiting = alone
         return members, failures
 
-    def _missing(self, groups: Sequence[Group], members: dict[str, Member]) -> list[Group]:
-        """What is left of groups; members that are there join ``members``.
-
-        Raises:
-            DryRunStop: in a dry run, if anything is left to make.
-        """
-        waiting: list[Group] = []
-        for group in groups:
-            found = existing(group)
-            there = [member for member in found if member.finished]
-            members |= self._received(group, there)
-            for member in there:
-                if not self.dry_run:
-                    drop_finished_checkpoint(member.job)
-            if len(there) < len(found):
-                waiting.append(replace(group, jobs=[member.job for member in found if not member.finished]))
-        if waiting and not self.train_first:
-            self._announce(waiting, len(members))
-        return waiting
-
-    def _not_made(self, waiting: Sequence[Group], members: Mapping[str, Member]) -> dict[str, Failure]:
+    def _untrained(self, missing: Sequence[StagePlan], members: Mapping[str, Member]) -> dict[str, Failure]:
         reason = f"has not been trained and evaluated; run '{self.train_first}' first"
-        missing = [job.plan for group in waiting for job in group.jobs]
         if not members:
             raise MissingError(f"{missing[0].label} {reason}")
         return {plan.key: Failure(reason, exit_code=MissingError.exit_code) for plan in missing}
@@ -305,6 +279,8 @@ class Runner:
         for other in outcome:
             key = other.job.plan.key
             received[key] = member = replace(other, job=planned[key])
+            if member.finished and not self.dry_run:
+                drop_finished_checkpoint(member.job)
             if member.model is None:
                 self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
             for made in (member.model, member.calibration, member.evaluation):
@@ -315,6 +291,17 @@ class Runner:
             if self.tracker is not None:
                 log_member(self.tracker, member, group.evaluation)
         return received
+
+    def _report(
+        self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, cores: int, at: int, news: Progress | Waiting | None
+    ) -> None:
+        """Draw the progress of a group, or print for whom it waits."""
+        if isinstance(news, Waiting):
+            self._print_waiting(news)
+        else:
+            of_all.runs(at)
+            bars.fit(groups[at].name, news)
+            bars.count(of_all.row(cores))
 
     def _print_waiting(self, waiting: Waiting) -> None:
         self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
