@@ -42,10 +42,8 @@ class Comparison:
             study are all evaluated under the faults of all.
 
     Attributes:
-        failures: position of a job -> why it cannot be done, or failed.
         notes: rates that were lowered; none before jobs are checked.
         facts: the budget of each training scheme, how recordings were prepared, and the notes, a line each.
-        trainings: position of a job that can be done -> its training.
         groups: trainings that fit one batch, with their evaluation.
         evaluation: split, references and protocol of all of them.
         data_titles: data set -> title, for people.
@@ -53,37 +51,35 @@ class Comparison:
     """
 
     title: str
-    jobs: list[Job]
-    failures: dict[int, Failure] = field(default_factory=dict)
+    jobs: Sequence[Job]
     notes: list[Note] | None = None
     facts: Sequence[str] = ()
-    trainings: dict[int, TrainJob] = field(default_factory=dict)
     groups: Sequence[Group] = ()
     evaluation: Evaluation = field(init=False)
     data_titles: Mapping[str, str] = field(default_factory=dict)
     found: Mapping[str, Member] = field(default_factory=dict)
 
     @property
-    def usable(self) -> dict[int, Config]:
-        """Position -> configuration of the jobs that have not failed."""
-        return {position: job.config for position, job in enumerate(self.jobs) if position not in self.failures}
+    def usable(self) -> list[Job]:
+        """Jobs that have not failed."""
+        return [job for job in self.jobs if job.failure is None]
 
     @property
     def members(self) -> list[Member]:
         """Trained and evaluated members in the order of the jobs."""
-        keys = dict.fromkeys(training.plan.key for training in self.trainings.values())
+        keys = dict.fromkeys(job.training.plan.key for job in self.jobs if job.training is not None)
         return [self.found[key] for key in keys if key in self.found]
 
     @property
     def unfinished(self) -> list[str]:
         """Trainings for which no time was left, by name."""
-        left = [training.plan for position, training in self.trainings.items() if position not in self.failures]
+        left = [job.training.plan for job in self.usable if job.training is not None]
         return list(dict.fromkeys(plan.label for plan in left if plan.key not in self.found))
 
     @property
     def failed(self) -> dict[str, str]:
         """Name of what is left out -> why."""
-        return {name: failure.message for name, failure in self.named_failures()} | dict.fromkeys(self.unfinished, NO_TIME)
+        return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
 
     def check(self, runner: Runner) -> None:
         """Fit jobs to the recordings of their split, which are ingested for it, and find jobs that lack something; no samples are read.
@@ -93,33 +89,30 @@ class Comparison:
             DataError: no job can be done, or the evaluation is to read estimates more often than recordings are sampled.
             DryRunStop: in a dry run, if recordings would have to be made, after printing what would be trained.
         """
-        refused = {at: Failure(job.refusal, exit_code=ConfigurationError.exit_code) for at, job in enumerate(self.jobs) if job.refusal}
-        self._fail(refused, runner)
         usable = self.usable
-        first = next(iter(usable.values()))
+        self._print_failures([job for job in self.jobs if job not in usable], runner)
         try:
-            split, contents = runner.split(first), runner.contents(first)
+            split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
         except DryRunStop:
-            runner.print_trainings(_names(self.jobs[position] for position in usable), ["evaluate"])
+            runner.print_trainings(_names(usable), ["evaluate"])
             raise
-        limit, notes, lacking = slowest(contents), dict[Note, None](), dict[int, Failure]()
-        for position, given in usable.items():
-            config, lowered = lower_rate(given, "evaluation", limit)
+        limit, notes = slowest(contents), dict[Note, None]()
+        for job in usable:
+            job.config, lowered = lower_rate(job.config, "evaluation", limit)
             try:
-                config, more = lower_rate(config, "estimator", limit)
-                reason = lack(config, split, contents)
+                job.config, more = lower_rate(job.config, "estimator", limit)
+                reason = lack(job.config, split, contents)
                 if reason:
                     raise DataError(reason)
                 notes |= dict.fromkeys([*lowered, *more])
             except DataError as error:
-                lacking[position] = failure_of(error)
-            self.jobs[position] = replace(self.jobs[position], config=config)
-        print_notes(notes, runner)
-        self._fail(lacking, runner)
-        if not self.usable:
-            reasons = "; ".join(dict.fromkeys(failure.message for failure in lacking.values()))
-            raise DataError(f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}")
+                job.failure = failure_of(error)
         self.notes = list(notes)
+        print_notes(notes, runner)
+        self._print_failures(usable, runner)
+        if not self.usable:
+            reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))
+            raise DataError(f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}")
 
     def plan(self, runner: Runner) -> None:
         """Plan the trainings of checked jobs, with the data they need, which are made on the way.
@@ -129,66 +122,62 @@ class Comparison:
             DataError: there are no data for any job.
             DryRunStop: in a dry run, if data would have to be made, after printing what would be trained.
         """
-        usable, failures, names = self.usable, dict[int, Failure](), dict[Any, Any]()
-        first = next(iter(usable.values()))
+        usable, names = self.usable, dict[Any, Any]()
+        first = usable[0].config
         split = runner.split(first)
         if not any(split.tests.values()):
             raise ConfigurationError(f"split '{split.name}' has no test ranges to compare estimators on")
         try:
             self.evaluation = runner.evaluation(first, {})
-            for position, config in usable.items():
+            for job in usable:
                 try:
-                    data = runner.data_for(split, new_estimator(config["estimator"]).settings.rate_hz, config)
-                    training = plan_training(config, split, data)
-                    check_channels(faults_of(config), split, data)
-                    _check_name(self.jobs[position], training, names)
-                    self.trainings[position] = training
+                    data = runner.data_for(split, new_estimator(job.config["estimator"]).settings.rate_hz, job.config)
+                    training = plan_training(job.config, split, data)
+                    check_channels(faults_of(job.config), split, data)
+                    _check_name(job, training, names)
+                    job.training = training
                 except VehestError as error:
-                    if not self.jobs[position].label and not isinstance(error, DataError):
+                    if not job.label and not isinstance(error, DataError):
                         raise
-                    failures[position] = failure_of(error)
+                    job.failure = failure_of(error)
         except DryRunStop:
-            runner.print_trainings(_names(self.jobs[position] for position in usable), ["evaluate"])
+            runner.print_trainings(_names(usable), ["evaluate"])
             raise
-        if not self.trainings:
-            raise DataError("; ".join(dict.fromkeys(failure.message for failure in failures.values())))
-        self._fail(failures, runner)
+        if not self.usable:
+            raise DataError("; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None)))
+        self._print_failures(usable, runner)
         self.groups = self._groups(runner.force)
-        configs, notes = list(usable.values()), [f"{what} {text}" for what, text in self.notes or ()]
+        configs, notes = [job.config for job in usable], [f"{what} {text}" for what, text in self.notes or ()]
         self.facts = [*training_facts(configs), resampling_fact(configs), *notes]
         datasets = {name: runner.dataset_config(name, first)["dataset"] for name in split.datasets}
         self.data_titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
 
     def _groups(self, force: frozenset[str]) -> list[Group]:
         """Trainings that fit one batch; combinations of a sweep that differ in their fault alone share a training."""
-        faults = {position: faults_of(self.jobs[position].config) for position in self.trainings}
-        of_training: dict[str, list[int]] = {}
-        for position, training in self.trainings.items():
-            of_training.setdefault(training.plan.key, []).append(position)
+        of_training: dict[str, list[Job]] = {}
+        for job in self.usable:
+            if job.training is not None:
+                of_training.setdefault(job.training.plan.key, []).append(job)
         groups: dict[tuple[Any, ...], Group] = {}
-        for positions in of_training.values():
-            job, training = self.jobs[positions[0]], self.trainings[positions[0]]
-            own = all_of(faults[position] for position in (positions if job.label else faults))
-            key = (training.group, own, job.batch)
-            how = replace(self.evaluation, data=training.data, faults=own)
-            group = groups.get(key, Group([], how, force, job.batch, how.split))
+        for jobs in of_training.values():
+            label, training = jobs[0].batch, jobs[0].training
+            assert training is not None
+            faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
+            how = replace(self.evaluation, data=training.data, faults=faults)
+            key = (training.group, faults, label)
+            group = groups.get(key, Group([], how, force, label, how.split))
             groups[key] = replace(group, jobs=[*group.jobs, training])
         return list(groups.values())
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
         """Take what became of the trainings: key of each -> its member, or why it failed."""
         self.found = {key: member for key, member in members.items() if member.evaluation is not None}
-        for position, training in self.trainings.items():
-            if training.plan.key in failed:
-                self.failures[position] = failed[training.plan.key]
+        for job in self.usable:
+            if job.training is not None:
+                job.failure = failed.get(job.training.plan.key)
 
-    def named_failures(self) -> list[tuple[str, Failure]]:
-        """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
-        return _named(self.failures, self.jobs)
-
-    def _fail(self, failures: Mapping[int, Failure], runner: Runner) -> None:
-        self.failures |= failures
-        for name, failure in _named(failures, self.jobs) if len(self.jobs) > 1 else ():
+    def _print_failures(self, jobs: Sequence[Job], runner: Runner) -> None:
+        for name, failure in named_failures(jobs) if len(self.jobs) > 1 else ():
             runner.messages.line("fail", "train", name, failure.message)
 
 
@@ -286,10 +275,12 @@ def _check_name(job: Job, training: TrainJob, names: dict[Any, Any]) -> None:
         )
 
 
-def _named(failures: Mapping[int, Failure], jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
+def named_failures(jobs: Sequence[Job]) -> list[tuple[str, Failure]]:
+    """Failures by name; jobs that differ in their seed alone and failed alike have one name."""
     alike: dict[Failure, list[Job]] = {}
-    for position, failure in failures.items():
-        alike.setdefault(failure, []).append(jobs[position])
+    for job in jobs:
+        if job.failure is not None:
+            alike.setdefault(job.failure, []).append(job)
     return [(name, failure) for failure, own in alike.items() for name in _names(own)]
 
 
@@ -308,15 +299,15 @@ def _names(jobs: Iterable[Job]) -> list[str]:
 def failed_in(comparisons: Sequence[Comparison], runner: Runner) -> JobsFailedError | None:
     """Print tracebacks of defects; returns the error of all failures, if there are any."""
     reasons: dict[str, list[str]] = {}
-    for name, failure in (pair for own in comparisons for pair in own.named_failures()):
+    for name, failure in (pair for own in comparisons for pair in named_failures(own.jobs)):
         if failure.detail:
             runner.messages.warn(f"{name}:\n{failure.detail}")
         reasons.setdefault(failure.message, []).append(name)
     if not reasons:
         return None
     listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
-    n_failed, n_jobs = sum(len(own.failures) for own in comparisons), sum(len(own.jobs) for own in comparisons)
-    return JobsFailedError(f"{n_failed} of {n_jobs} jobs failed, the others are kept; {listed}")
+    jobs = [job for own in comparisons for job in own.jobs]
+    return JobsFailedError(f"{sum(job.failure is not None for job in jobs)} of {len(jobs)} jobs failed, the others are kept; {listed}")
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:

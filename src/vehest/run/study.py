@@ -34,8 +34,9 @@ from vehest.run.config import (
     value_of,
 )
 from vehest.run.config_files import GROUPS, find_pipeline, pipeline_names
+from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import faults_of
-from vehest.run.train import new_estimator
+from vehest.run.train import TrainJob, new_estimator
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import is_of_fault, short_names, shown_value
 
@@ -90,17 +91,18 @@ class Part:
     overrides: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Job:
     """One training and its evaluation.
 
     Args:
-        config: as composed for ``train`` or ``eval``.
+        config: as composed for ``train`` or ``eval``; rates may be lowered to those of recordings.
         label: its settings as a sweep names them; empty for the estimator's name and variant.
         batch: the same without its fault, for trainings that are evaluated under several.
         values: keys that a sweep varies -> its own values.
         combination: of these values, counted from 0.
-        refusal: why it cannot be trained; empty if it can.
+        failure: why it cannot be done, or failed; none so far.
+        training: none where it cannot be trained, or is not planned yet.
     """
 
     config: Config
@@ -108,7 +110,8 @@ class Job:
     batch: str = ""
     values: Mapping[str, Value] = field(default_factory=dict)
     combination: int = 0
-    refusal: str = ""
+    failure: Failure | None = None
+    training: TrainJob | None = None
 
 
 Jobs = Mapping[str, Sequence[Job]]
@@ -212,18 +215,17 @@ def _evaluation_override(key: str, value: Any, file: Path) -> str:
     """A key of a pipeline's ``evaluation`` as an override; the faults of an evaluation are a key of their own."""
     if (key == "faults") != isinstance(value, tuple):
         raise ConfigurationError(f"'{file}': evaluation.{key} = {value!r}: faults are a list of faults, and nothing else is a list")
-    if key == "faults":
-        return f"faults=[{','.join(_fault_as_override(fault) for fault in value)}]"
-    return f"evaluation.{key}={_as_override(value)}"
+    return f"{'' if key == 'faults' else 'evaluation.'}{key}={_as_override(value)}"
 
 
-def _fault_as_override(fault: Mapping[str, int | float | str | None]) -> str:
-    """A mapping in Hydra's grammar, its text in quotes: nan would be a number."""
-    values = {name: f"'{value}'" if isinstance(value, str) else _as_override(value) for name, value in fault.items()}
-    return "{" + ",".join(f"{name}:{value}" for name, value in values.items()) + "}"
-
-
-def _as_override(value: int | float | bool | str | None) -> str:
+def _as_override(value: Any) -> str:
+    """A plain value in Hydra's grammar; text in quotes, since nan would be a number."""
+    if isinstance(value, tuple):
+        return f"[{','.join(map(_as_override, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_as_override(own)}" for key, own in value.items()) + "}"
+    if isinstance(value, str):
+        return f"'{value}'"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -367,9 +369,9 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
         seeds = [value_of(own[0]) for own in expand([override for override in overrides if override not in others]) if own]
     refused: dict[str, list[str]] = {}
     for job in found:
-        if job.refusal:
-            refused.setdefault(job.refusal, []).append(job.label)
-    usable = [job.config for job in found if not job.refusal]
+        if job.failure is not None:
+            refused.setdefault(job.failure.message, []).append(job.label)
+    usable = [job.config for job in found if job.failure is None]
     if not usable:
         listed = "; ".join(f"{' and '.join(labels)}: {reason}" for reason, labels in refused.items())
         raise ConfigurationError(next(iter(refused)) if len(refused) == 1 else f"no combination can be trained; {listed}")
@@ -393,7 +395,7 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
         settings_from_config(estimator.training_type, config["training"], "training")
         faults_of(config)
     except ConfigurationError as error:
-        return Job({}, label or "this", "", values, number, str(error))
+        return Job({}, label or "this", "", values, number, failure_of(error))
     trained = _label({key: value for key, value in values.items() if not is_of_fault(key)})
     return Job(config, label or estimator.full_title, trained or estimator.full_title, values, number)
 

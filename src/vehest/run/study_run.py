@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -159,7 +160,7 @@ def _until(minutes: float | None, begun: float) -> float | None:
 
 
 def _first(jobs: Sequence[Job]) -> Config:
-    return next(job.config for job in jobs if not job.refusal)
+    return next(job.config for job in jobs if job.failure is None)
 
 
 def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
@@ -173,7 +174,8 @@ def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
     for part in study.parts:
         try:
             runner.look_for_files(_first(jobs[part.name]))
-            found[part.name] = Comparison(part.title, list(jobs[part.name]))
+            own = [replace(job) for job in jobs[part.name]]  # keys of published results hold rates before they are lowered
+            found[part.name] = Comparison(part.title, own)
         except MissingError as error:
             if not part.optional:
                 raise
@@ -183,7 +185,7 @@ def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
     for comparison in found.values():
         with suppress(DryRunStop):
             comparison.check(runner)
-    lacking = dict.fromkeys(failure.message for own in found.values() for failure in own.failures.values())
+    lacking = dict.fromkeys(job.failure.message for own in found.values() for job in own.jobs if job.failure is not None)
     if lacking and not study.shows_failed:
         raise DataError(f"a study in parts needs all of its jobs; {'; '.join(lacking)}")
     return found

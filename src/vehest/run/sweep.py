@@ -33,7 +33,7 @@ SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Artefact, TerminalSummary]:
     """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
-    evaluation, configs = comparison.evaluation, {job.combination: job.config for job in comparison.jobs if not job.refusal}
+    evaluation, configs = comparison.evaluation, {job.combination: job.config for job in comparison.jobs if "estimator" in job.config}
     conditions = dict.fromkeys(fault.condition for config in configs.values() if (fault := chosen_fault(config)) is not None)
     under = [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"] if conditions else []
     artefacts = SweepArtefacts(
@@ -66,13 +66,12 @@ def _job_table(comparison: Comparison) -> pd.DataFrame:
     split = comparison.evaluation.split
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []
-    for position, job in enumerate(comparison.jobs):
-        failure = comparison.failures.get(position)
-        member = None if failure is not None else comparison.found.get(comparison.trainings[position].plan.key)
-        title = "" if job.refusal else new_estimator(job.config["estimator"]).full_title
+    for job in comparison.jobs:
+        member = None if job.failure is not None or job.training is None else comparison.found.get(job.training.plan.key)
+        title = new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""  # else refused
         row: dict[str, Any] = {"combination": job.combination, "title": title, **job.values, "seed": job.config["seed"]}
-        row |= {"status": DONE if member else FAILED, "error": failure.message if failure is not None else ""}
-        rows.append(row | _figures(member, sets, None if job.refusal else chosen_fault(job.config)))
+        row |= {"status": DONE if member else FAILED, "error": job.failure.message if job.failure is not None else ""}
+        rows.append(row | _figures(member, sets, chosen_fault(job.config)))
     return pd.DataFrame(rows)
 
 
