@@ -189,11 +189,6 @@ def slowest(contents: Mapping[str, Sequence[Contents]]) -> Contents:
 def lower_rate(config: Config, group: str, limit: Contents) -> tuple[Config, list[Note]]:
     """A configuration whose ``GROUP.rate_hz`` is no higher than that of a recording, and a note if it was.
 
-    Args:
-        config: as composed for ``train`` or ``eval``.
-        group: ``estimator`` or ``evaluation``.
-        limit: the recording with the lowest rate.
-
     Raises:
         DataError: an override asks for a higher rate, or a setting makes no sense at that of the recordings.
         ConfigurationError: a setting makes no sense.
@@ -258,11 +253,7 @@ def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Ar
 
 
 def _check_name(job: Job, training: TrainJob, names: dict[Any, Any]) -> None:
-    """Refuse a training that cannot be told from another.
-
-    Raises:
-        ConfigurationError: two combinations of a sweep are one training, or two trainings of a study have one name.
-    """
+    """Refuse a training that cannot be told from another: one of two combinations of a sweep, or of two of one name in a study."""
     key = training.plan.key
     if job.label:
         twin = names.setdefault((key, faults_of(job.config)), job.label)

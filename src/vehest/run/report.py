@@ -53,15 +53,7 @@ def draw_report(
     datasets: Sequence[StoredDataset | AbsentDataset],
     runner: Runner,
 ) -> tuple[Artefact, TerminalSummary]:
-    """Draw a study, unless its report is there, and sum it up for the terminal.
-
-    Args:
-        study: that was run.
-        command: that makes it.
-        comparisons: part -> what was compared in it; a part that is not among them has no recordings here.
-        datasets: of a study of recordings alone.
-        runner: with the artefacts of the study.
-    """
+    """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent."""
     shown = {name: part for name, part in comparisons.items() if part.members}
     left_out = {name: reason for part in shown.values() for name, reason in part.failed.items()}
     artefacts = StudyArtefacts(
@@ -118,10 +110,7 @@ def _plan(
 
 
 def code_of_report(study: str) -> str:
-    """Version of what a report runs.
-
-    Args:
-        study: name of the module that draws it, as `vehest.studies.registry` knows it.
+    """Version of what a report runs, by the name of the module that draws it.
 
     Raises:
         ConfigurationError: the name is unknown.

@@ -159,13 +159,7 @@ class Runner:
         return {name: self.downsample(self._ingested(name, config), rate_hz, config["downsample"]) for name in split.datasets}
 
     def evaluation(self, config: Config, data: Mapping[str, Artefact], faults: tuple[FaultSettings, ...] = ()) -> Evaluation:
-        """How a configuration is evaluated: against references that are resampled like everything, but never filtered further.
-
-        Args:
-            config: as composed for ``eval``.
-            data: data set -> recordings at the estimator's rate.
-            faults: under which it is evaluated too.
-        """
+        """How a configuration is evaluated: against references that are resampled like everything, but never filtered further."""
         split, protocol = self.split(config), protocol_from_config(config["evaluation"])
         references = self.data_for(split, protocol.rate_hz, {**config, "downsample": {**config["downsample"], "transforms": []}})
         kinds = {name: kind_of(self.dataset_config(name, config)["dataset"]) for name in split.datasets}
@@ -247,11 +241,7 @@ class Runner:
         return {plan.key: Failure(reason, exit_code=MissingError.exit_code) for plan in missing}
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
-        """Print what groups are going to do.
-
-        Raises:
-            DryRunStop: in a dry run.
-        """
+        """Print what groups are going to do; a dry run ends here."""
         uncalibrated = [group for group in waiting if group.split is not None and not group.split.validation]
         if self.dry_run:
             for group in waiting:

@@ -342,11 +342,7 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
     """A study with one sweep: all combinations of overrides over their seeds, in the order of the command.
 
-    A combination that its estimator refuses stays in the list with the reason.
-
-    Args:
-        overrides: several values allowed.
-        name: of the study; none for the estimators and the split.
+    A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
 
     Raises:
         ConfigurationError: a key is named twice, a key takes several values that cannot, the name is none for files, or no combination can

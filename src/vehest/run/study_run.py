@@ -52,14 +52,7 @@ STUDY_STAGES = frozenset({"ingest", "downsample", "train", "calibrate", "evaluat
 
 @contextmanager
 def open_runner(config: Config, options: RunOptions, stages: Collection[str], study: str = "") -> Iterator[Runner]:
-    """A runner that listens to signals.
-
-    Args:
-        config: of any command; its output root, limits and tracking count.
-        options: of the command.
-        stages: that are run anew under ``options.force``.
-        study: that runs are logged under; empty if none.
-    """
+    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested, study) if options.track or study else None
     forced = frozenset(stages if options.force else ())
@@ -84,7 +77,7 @@ def run_study(
         overrides: for all jobs that have their key; of a sweep, with several values.
         options: of the command.
         cache: keeps the finished study.
-        sweep: whether overrides are those of a sweep.
+        sweep: whether the overrides make a sweep.
         only_report: draw the report from what is there, train and evaluate nothing.
 
     Raises:
@@ -146,11 +139,7 @@ def run_study(
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
-    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time.
-
-    Raises:
-        ConfigurationError: no positive time.
-    """
+    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time."""
     if minutes is None:
         return None
     if not minutes > 0:
@@ -164,12 +153,7 @@ def _first(jobs: Sequence[Job]) -> Config:
 
 
 def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
-    """Part -> its checked jobs, before anything is trained; optional parts whose raw files are missing are left out.
-
-    Raises:
-        MissingError: raw files of a part that is not optional, or of all parts, are missing.
-        DataError: a study in parts lacks a job.
-    """
+    """Part -> its checked jobs, before anything is trained; optional parts whose raw files are missing are left out."""
     found: dict[str, Comparison] = {}
     for part in study.parts:
         try:
@@ -192,12 +176,7 @@ def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
 
 
 def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
-    """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing.
-
-    Raises:
-        MissingError: raw files are missing, or recordings are not there where a command has to be run first.
-        DryRunStop: in a dry run, if it would have to be ingested.
-    """
+    """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
     own = config["dataset"]
     title, licence, citation = (" ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation"))
     try:
@@ -215,12 +194,7 @@ def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | Ab
 
 
 def _error_of(study: Study, comparisons: Sequence[Comparison], runner: Runner) -> JobsFailedError | None:
-    """The error that a study ends with after its report.
-
-    Raises:
-        JobsFailedError: the report cannot do without what failed.
-        DataError: nothing was done in time.
-    """
+    """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
     error, nothing = failed_in(comparisons, runner), bool(study.parts) and not any(own.members for own in comparisons)
     if error is not None and (nothing or not study.shows_failed):
         raise error
@@ -265,13 +239,7 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
 
 
 def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]) -> dict[str, Any]:
-    """Evaluate one model on the tests of a split.
-
-    Args:
-        overrides: of ``eval``.
-        model: folder or start of its name; none for the one that the overrides train.
-        options: of the command.
-        note: takes remarks on how the model was found.
+    """Evaluate a model by folder or start of its name, or the one that the overrides train, on the tests of a split.
 
     Raises:
         MissingError: the model is not there.
@@ -320,11 +288,7 @@ def _training(config: Config, runner: Runner) -> tuple[Config, TrainJob]:
 
 
 def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner) -> Artefact | None:
-    """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for.
-
-    Raises:
-        DryRunStop: in a dry run, if it would have to be made.
-    """
+    """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
     learnt, found = learnt_spans(model), None
     if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
         job = plan_calibrate(model, split, data, runner.output)
