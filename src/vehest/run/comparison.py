@@ -194,7 +194,7 @@ def lower_rate(config: Config, group: str, limit: Contents) -> tuple[Config, lis
         ConfigurationError: a setting makes no sense.
     """
     rate, key, lowest = config.get(group, {}).get("rate_hz"), f"{group}.rate_hz", limit.rate_hz
-    if not isinstance(rate, int | float) or isinstance(rate, bool) or rate <= lowest * (1.0 + TOLERANCE):
+    if not isinstance(rate, int | float) or isinstance(rate, bool) or not rate > lowest * (1.0 + TOLERANCE):
         return config, []
     name = group if group == "evaluation" else new_estimator(config["estimator"]).name
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
