@@ -10,6 +10,7 @@ import json
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -278,13 +279,7 @@ def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
     if study.datasets:
         jobs: Jobs = {"": [_ingest_job(name, overrides, used) for name in (*study.datasets, *study.optional_datasets)]}
     else:
-        composed: dict[tuple[str, ...], Config] = {}
-
-        def compose(own: tuple[str, ...]) -> Config:
-            if own not in composed:
-                composed[own] = compose_config("eval", own)
-            return composed[own]
-
+        compose = cache(partial(compose_config, "eval"))
         sweeps = [sweep for part in study.parts for sweep in part.sweeps]
         with use_limits(limits_of([*(override for sweep in sweeps for override in sweep), *overrides])):
             check_jobs(sum(count(sweep) for sweep in sweeps), f"the sweeps of '{study.file.name}' stand")
