@@ -38,7 +38,7 @@ from vehest.run.config_files import GROUPS, find_pipeline, pipeline_names
 from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import faults_of
 from vehest.run.train import TrainJob, new_estimator
-from vehest.studies.registry import study_module
+from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import is_of_fault, short_names, shown_value
 
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
@@ -254,6 +254,8 @@ def _folds_of(part: Part, file: Path) -> tuple[Part, ...]:
 
 def _check_module(name: str, form: str, file: Path) -> bool:
     """Whether a module draws a study of this form; True where it needs a split's folds as parts."""
+    if name not in study_names():
+        raise ConfigurationError(f"'{file}': there is no study module '{name}'; there are: {', '.join(study_names())}")
     takes = str(getattr(study_module(name), "TAKES", "something else"))
     if (takes, form) == ("folds", "split"):
         return True
