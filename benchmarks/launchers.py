@@ -28,15 +28,14 @@ from vehest.data.files import remove_leftovers
 from vehest.run.comparison import plan_training
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
-from vehest.run.evaluate import protocol_from_config
 from vehest.run.failures import Failure
-from vehest.run.group import Evaluation, Group
+from vehest.run.group import Group
 from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.launchers.on_ray import RayLauncher
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.sweep import plan_sweep
+from vehest.run.study import sweep_of
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "launchers.json"
 CORES = 2
@@ -50,10 +49,8 @@ def groups_of(output: Path, number: int) -> list[Group]:
     runner = Runner(output, QUIET, StopSignals())
     split = runner.split(config)
     data = runner.data_for(split, float(config["estimator"]["rate_hz"]), config)
-    protocol = protocol_from_config(config["evaluation"])
-    references = runner.references_for(split, protocol.rate_hz, config)
-    evaluation = Evaluation(split, data, references, runner.kinds_of(split, config), protocol, output)
-    return [Group([plan_training({**config, "seed": seed}, split, data)], evaluation) for seed in range(number)]
+    evaluation = runner.evaluation(config, data)
+    return [Group([plan_training({**config, "seed": seed}, split, data)], evaluation, split=split) for seed in range(number)]
 
 
 def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:
@@ -190,7 +187,7 @@ def planning(number: int) -> dict[str, float]:
     """What planning a sweep takes before anything is trained, a combination, of processor time [s]."""
     rates = ",".join(f"{1e-3 + 1e-6 * k:g}" for k in range(number))
     begun = time.process_time()
-    plan_sweep(["split=quickstart", "estimator=ksnn", f"training.learning_rate={rates}", "tracking=none"])
+    sweep_of(["split=quickstart", "estimator=ksnn", f"training.learning_rate={rates}", "tracking=none"])
     return {"combinations": number, "seconds_a_combination": round((time.process_time() - begun) / number, 5)}
 
 

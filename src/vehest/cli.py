@@ -263,7 +263,7 @@ def train(
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
     from vehest.run.run_cache import RunOptions
-    from vehest.run.single import train_one
+    from vehest.run.study_run import train_one
 
     emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
@@ -291,7 +291,7 @@ def evaluate(
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
     from vehest.run.run_cache import RunOptions
-    from vehest.run.single import evaluate_one
+    from vehest.run.study_run import evaluate_one
 
     emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
 
@@ -592,9 +592,9 @@ def sweep(
     cache = RunCache("sweep", name or "", words)
     ran = cache.repeat(options)
     if ran is None:
-        from vehest.run.study_run import run_sweep
+        from vehest.run.study_run import run_study
 
-        ran = run_sweep(words, name, options, cache)
+        ran = run_study(name, words, options, cache, sweep=True)
     _print_ran(ran, as_json, sweep=True)
 
 

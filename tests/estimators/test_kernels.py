@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -208,8 +209,10 @@ def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest
     def threads() -> list[int]:
         return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
-    monkeypatch.setattr(group, "existing", lambda _: seen.extend(threads()) or [])
+    job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train"))
+    monkeypatch.setattr(group, "find", lambda _: seen.extend(threads()) or job)
+    monkeypatch.setattr(group, "_member", lambda *_: None)
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with
-        group.Group([], None, frozenset()).run(lambda: False, lambda progress: None)
+        group.Group([job]).run(lambda: False, lambda progress: None)
         assert set(seen) == {1}
         assert set(threads()) == {2}

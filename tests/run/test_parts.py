@@ -203,7 +203,7 @@ def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_stati
     ("change", "message"),
     [
         ({"split": "forth", "sweeps": CANDIDATES}, "it needs study, report and one of"),
-        ({"parts": {}}, "parts must be names"),
+        ({"parts": {}}, "it needs study, report and one of"),
         ({"parts": ["forth"]}, "'pipelines/both.yaml': parts must be a mapping from names to what each has, not ['forth']"),
         ({"parts": {"one": {"split": "forth"}}}, "part 'one' needs split and sweeps"),
         (

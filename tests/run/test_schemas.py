@@ -449,7 +449,7 @@ PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps":
         ({"datasets": "a"}, "datasets must be a list"),
         ({"title": __import__("datetime").date(2026, 1, 1)}, "title is no plain value but a date"),
         ({"unknown": 1}, "unknown key 'unknown'"),
-        ({"split": ...}, "it needs study, report and one of"),
+        ({"split": ...}, "it needs split and sweeps"),
         ({"based_on": 3}, "based_on must be text"),
     ],
 )

@@ -19,7 +19,7 @@ from vehest.evaluation.metrics import Protocol
 from vehest.report.heat_map import Panel, heat_map
 from vehest.run.artefacts import StagePlan
 from vehest.run.completion import complete_override
-from vehest.run.sweep import plan_sweep
+from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of
 
@@ -253,7 +253,7 @@ def test_dry_run_tells_and_makes_nothing(place):
 )
 def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
     with pytest.raises(ConfigurationError) as caught:
-        plan_sweep(["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides])
+        sweep_of(["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides])
     assert message in str(caught.value)
 
 

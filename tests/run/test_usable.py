@@ -24,8 +24,8 @@ from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.needs import lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
-from vehest.run.rates import at_estimator_rate, at_evaluation_rate
 from vehest.run.train import new_estimator
 from vehest.run.usable import all_usabilities, usability
 from vehest.training.context import FitContext
@@ -449,17 +449,17 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
 
 def test_rates_that_recordings_have_are_left_alone():
     config, limit = compose_config("eval", ["estimator=luenberger"]), Contents("lap", 100.0, frozenset())
-    assert at_estimator_rate(config, limit) == (config, ())
-    assert at_evaluation_rate(config, limit) == (config, ())
+    for group in ("estimator", "evaluation"):
+        assert lower_rate(config, group, limit) == (config, [])
 
 
 def test_setting_that_makes_no_sense_at_the_lower_rate_is_told_with_it():
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
     with pytest.raises(DataError, match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window"):
-        at_estimator_rate(config, Contents("lap", 20.0, frozenset()))
+        lower_rate(config, "estimator", Contents("lap", 20.0, frozenset()))
 
 
 def test_lengths_that_a_training_counts_in_samples_are_told():
     config = compose_config("eval", ["estimator=velocity_gru"])
-    _, (note,) = at_estimator_rate(config, Contents("lap", 50.0, frozenset()))
-    assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in note.text
+    _, ((_, text),) = lower_rate(config, "estimator", Contents("lap", 50.0, frozenset()))
+    assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text

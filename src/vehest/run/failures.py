@@ -1,4 +1,4 @@
-"""What a failure is told as: one line, the exit code, and the traceback where it is a defect."""
+"""Turns exceptions into one line, an exit code and, for a defect, its traceback."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Failure:
 
     Args:
         message: one line.
-        detail: traceback, where it was a defect rather than an expected error.
-        exit_code: what a command that runs this job alone leaves with.
+        detail: traceback of a defect; empty for an expected error.
+        exit_code: of a command that runs this job alone.
     """
 
     message: str
@@ -26,24 +26,25 @@ class Failure:
 
 
 def failure_of(error: Exception) -> Failure:
-    """How to tell of an error: what the user or the machine can change in words, anything else as a defect."""
+    """The failure behind an exception; a defect unless the user or the machine can change it."""
     known = error if isinstance(error, VehestError) else _of_machine(error)
     if known is not None:
         return Failure(str(known), exit_code=known.exit_code)
-    message = f"{type(error).__name__}: {error}"
-    if isinstance(error, RecursionError):
-        message += "; something that was read nests too deeply: make it flatter"
-    return Failure(message, detail="".join(traceback.format_exception(error)))
+    deep = "; something that was read nests too deeply: make it flatter" if isinstance(error, RecursionError) else ""
+    return Failure(f"{type(error).__name__}: {error}{deep}", "".join(traceback.format_exception(error)))
 
 
-def _of_machine(error: Exception) -> VehestError | None:
-    """The error as what it is where the machine is short of something, or a file cannot be reached."""
+def _of_machine(error: Exception) -> MissingError | None:
+    """The error in words where the machine is short of something or a file cannot be reached."""
     full = no_room(error)
     if full is not None:
         where = f"'{full.filename}'" if full.filename else "where results and temporary files go"
         return MissingError(f"no room left to write {where} ({full.strerror}); free some space and run again")
-    if isinstance(error, FileNotFoundError) and not _has_working_folder():
-        return MissingError("the working folder has been removed; change to another")
+    if isinstance(error, FileNotFoundError):
+        try:
+            os.getcwd()
+        except OSError:
+            return MissingError("the working folder has been removed; change to another")
     if isinstance(error, OSError) and error.filename is not None:
         return MissingError(f"'{error.filename}' cannot be used: {error.strerror}; check the file, its folder and their permissions")
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
@@ -51,11 +52,3 @@ def _of_machine(error: Exception) -> VehestError | None:
             "out of memory; close other programs, or ask for less at a time: --jobs 1, shorter recordings, smaller networks"
         )
     return None
-
-
-def _has_working_folder() -> bool:
-    try:
-        os.getcwd()
-    except OSError:
-        return False
-    return True

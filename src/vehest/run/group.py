@@ -1,4 +1,4 @@
-"""The work of one process: members of a group are trained together, then each is calibrated and evaluated.
+"""Trains the members of a group together, then calibrates and evaluates each, in one process.
 
 Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluation -> Member
 """
@@ -17,7 +17,7 @@ from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
-from vehest.run.calibrate import CalibrateJob, plan_calibrate, write_calibration
+from vehest.run.calibrate import plan_calibrate, write_calibration
 from vehest.run.evaluate import plan_evaluate
 from vehest.run.evaluate_faults import FaultedJob, write_faulted
 from vehest.run.faults import FaultSettings
@@ -25,6 +25,8 @@ from vehest.run.locks import Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
+
+Report = Callable[[Progress | Waiting], None]
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,21 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class Member:
+    """A training with its model, calibration and evaluation, as far as they exist.
+
+    Args:
+        finished: whether nothing of it is missing.
+    """
+
+    job: TrainJob
+    model: Artefact | None = None
+    evaluation: Artefact | None = None
+    calibration: Artefact | None = None
+    finished: bool = False
+
+
+@dataclass(frozen=True)
 class Group:
     """Members that fit one batch, and what is to be done with them.
 
@@ -64,7 +81,7 @@ class Group:
         evaluation: none if they are trained only.
         force: stages to run although their artefacts are there.
         label: what its members have in common, for people; the estimator and its variant if empty.
-        split: that members are calibrated on where they are trained only; none if they are not.
+        split: whose validation range members are calibrated on; none if they are not calibrated.
     """
 
     jobs: Sequence[TrainJob]
@@ -78,23 +95,24 @@ class Group:
         """For people."""
         seeds = [str(job.seed) for job in self.jobs]
         label = self.label or self.jobs[0].plan.label.rsplit("-seed", 1)[0]
-        return f"{label} seed {seeds[0]}" if len(seeds) == 1 else f"{label} seeds {', '.join(seeds)}"
+        return f"{label} seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}"
 
-    @property
-    def split_of_bands(self) -> Split | None:
-        """Whose validation range members are calibrated on."""
-        return self.split if self.evaluation is None else self.evaluation.split
-
-    def run(self, should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Member]:
+    def run(self, should_stop: Callable[[], bool], on_progress: Report) -> list[Member]:
         """Train, calibrate and evaluate what is missing; a stopped training leaves its best so far, marked as interrupted.
 
         An artefact that another process is making is taken from it once it is done; those that no process makes come first.
 
         On one thread, that of matrix products included: recursions over small states gain nothing from more, and groups run side by side.
         """
+
+        def made(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
+            if should_stop():
+                return None
+            return self.existing(plan) or ensured(plan, write, plan.stage in self.force, should_stop, on_progress)
+
         torch.set_num_threads(1)
         with one_blas_thread():
-            models = {member.job.plan.key: member.model for member in existing(self)}
+            models = {job.plan.key: self.existing(job.plan) for job in self.jobs}
             waiting = [job for job in self.jobs if models[job.plan.key] is None]
             while waiting and not should_stop():
                 with _held(waiting, should_stop, on_progress) as jobs:
@@ -102,57 +120,44 @@ class Group:
                         if STAGE in self.force:
                             drop_checkpoint(job.plan.checkpoint_folder)
                         else:
-                            models[job.plan.key] = find(job.plan)  # whoever held the lock may have made it
+                            models[job.plan.key] = find(job.plan)  # another process may have made it meanwhile
                     for together in _together([job for job in jobs if models[job.plan.key] is None]):
                         if should_stop():
                             break
                         models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
                 waiting = [job for job in waiting if job not in jobs]
-            return [_followed_up(self, job, models[job.plan.key], should_stop, on_progress) for job in self.jobs]
+            return [_member(self, job, models[job.plan.key], made) for job in self.jobs]
 
-
-@dataclass(frozen=True)
-class Member:
-    """What became of one member: its model, its calibration and its evaluation, where they are there."""
-
-    job: TrainJob
-    model: Artefact | None = None
-    evaluation: Artefact | None = None
-    calibration: Artefact | None = None
+    def existing(self, plan: StagePlan) -> Artefact | None:
+        """The artefact of a plan, if it is there and not to be made anew."""
+        return None if plan.stage in self.force else find(plan)
 
 
 def existing(group: Group) -> list[Member]:
-    """The artefacts of a group that are there already."""
-    members = []
-    for job in group.jobs:
-        model, calibration, evaluation = _found(group, job.plan), None, None
-        if model is not None:
-            calibrating = calibration_job(group, job, model)
-            calibration = None if calibrating is None else _found(group, calibrating.plan)
-            if group.evaluation is not None and (calibrating is None or calibration is not None):
-                evaluation = _found(group, group.evaluation.of(model, calibration).plan)
-        members.append(Member(job, model, evaluation, calibration))
-    return members
+    """The members of a group with the artefacts that are there already."""
+    return [_member(group, job, group.existing(job.plan), lambda plan, _: group.existing(plan)) for job in group.jobs]
 
 
-def _found(group: Group, plan: StagePlan) -> Artefact | None:
-    return None if plan.stage in group.force else find(plan)
-
-
-def is_finished(group: Group, member: Member) -> bool:
-    """Whether nothing is left to do for a member."""
-    if member.model is None or (group.evaluation is not None and member.evaluation is None):
-        return False
-    return member.calibration is not None or calibration_job(group, member.job, member.model) is None
-
-
-def is_calibrated(group: Group) -> bool:
-    """Whether there is anything to calibrate the members of a group by."""
-    return group.split_of_bands is not None and bool(group.split_of_bands.validation)
+def _member(
+    group: Group, job: TrainJob, model: Artefact | None, made: Callable[[StagePlan, Callable[[Path], None]], Artefact | None]
+) -> Member:
+    """A member whose model is calibrated, then evaluated, as far as ``made`` gives artefacts."""
+    if model is None or model.status != "complete":
+        return Member(job, model)
+    calibration = evaluation = None
+    calibrating = None if group.split is None else plan_calibrate(model, group.split, job.data, job.plan.output)
+    if calibrating is not None:
+        calibration = made(calibrating.plan, partial(write_calibration, calibrating))
+        if calibration is None:
+            return Member(job, model)
+    if group.evaluation is not None:
+        scoring = group.evaluation.of(model, calibration)
+        evaluation = made(scoring.plan, partial(write_faulted, scoring))
+    return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
 
 
 def drop_finished_checkpoint(job: TrainJob) -> None:
-    """Remove the checkpoint of a model that is there, which a killed process left; not while somebody trains it."""
+    """Remove the checkpoint of a model that is there, which a killed process left, unless another process holds the training."""
     if job.plan.checkpoint_folder.exists():
         with held(job.plan.lock) as free:
             if free:
@@ -160,14 +165,14 @@ def drop_finished_checkpoint(job: TrainJob) -> None:
 
 
 @contextmanager
-def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], say: Callable[[Waiting], None]) -> Iterator[list[TrainJob]]:
-    """Hold the locks of those trainings that nobody is at; where somebody is at all of them, wait for the first.
+def _held(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_waiting: Callable[[Waiting], None]) -> Iterator[list[TrainJob]]:
+    """Hold the locks of those trainings that are free; where none is, wait for the first.
 
-    Whoever waits holds no other training, so that two processes never wait for each other.
+    A process that waits holds no other training, so that two never wait for each other.
     """
     with ExitStack() as stack:
         free = [job for job in jobs if stack.enter_context(held(job.plan.lock))]
-        if not free and stack.enter_context(held(jobs[0].plan.lock, should_stop, say)):
+        if not free and stack.enter_context(held(jobs[0].plan.lock, should_stop, on_waiting)):
             free = [jobs[0]]
         yield free
 
@@ -180,7 +185,7 @@ def _together(jobs: Sequence[TrainJob]) -> list[list[TrainJob]]:
     return list(batches.values())
 
 
-def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Callable[[Progress | Waiting], None]) -> list[Artefact]:
+def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progress: Report) -> list[Artefact]:
     folders = [job.plan.checkpoint_folder for job in jobs]
     context = FitContext(checkpoint_folders=folders, should_stop=should_stop, on_progress=on_progress)
     artefacts = []
@@ -196,28 +201,3 @@ def _train(jobs: Sequence[TrainJob], should_stop: Callable[[], bool], on_progres
         if not record.interrupted:
             drop_checkpoint(job.plan.checkpoint_folder)
     return artefacts
-
-
-def calibration_job(group: Group, job: TrainJob, model: Artefact) -> CalibrateJob | None:
-    """How a model is calibrated; none where it is not, or its split has no validation range."""
-    split = group.split_of_bands
-    return None if split is None else plan_calibrate(model, split, job.data, job.plan.output)
-
-
-def _followed_up(
-    group: Group, job: TrainJob, model: Artefact | None, should_stop: Callable[[], bool], say: Callable[[Waiting], None]
-) -> Member:
-    """The member of a model, calibrated and evaluated unless the training or the waiting for another process was stopped."""
-
-    def made(plan: StagePlan, write: Callable[[Path], None]) -> Artefact | None:
-        return _found(group, plan) or ensured(plan, write, plan.stage in group.force, should_stop, say)
-
-    calibration = evaluation = None
-    if model is not None and model.status == "complete" and not should_stop():
-        calibrating = calibration_job(group, job, model)
-        if calibrating is not None:
-            calibration = made(calibrating.plan, partial(write_calibration, calibrating))
-        if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
-            scoring = group.evaluation.of(model, calibration)
-            evaluation = made(scoring.plan, partial(write_faulted, scoring))
-    return Member(job, model, evaluation, calibration)

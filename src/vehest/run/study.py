@@ -1,29 +1,49 @@
-"""Studies: what a file in pipelines/, or the overrides of a sweep, ask for, as jobs.
+"""Reads what a study compares, from a file or from a command's overrides, and composes its jobs.
 
-pipelines/*.yaml -> Study -> parts -> jobs, each a configuration; `study_run` runs them, `sweep` makes a study of a command's overrides.
+pipelines/*.yaml -> `read_study` -> Study -> `jobs_of` -> part -> jobs, each a configuration; a sweep's overrides -> `sweep_of` -> both
 """
 
 from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.folds import FoldsFile
 from vehest.data.limits import use_limits
-from vehest.data.schema import validated
+from vehest.data.schema import settings_from_config, validated
 from vehest.data.splits import check_name
 from vehest.data.text_files import read_yaml
-from vehest.run.config import GIVEN, Config, check_jobs, compose_config, count, expand, has_key, key_of, limits_of, option_hint, value_of
+from vehest.run.config import (
+    GIVEN,
+    Config,
+    check_jobs,
+    compose_config,
+    count,
+    expand,
+    has_key,
+    key_of,
+    limits_of,
+    option_hint,
+    parse,
+    value_of,
+)
 from vehest.run.config_files import GROUPS, find_pipeline, pipeline_names
+from vehest.run.failures import Failure, failure_of
+from vehest.run.faults import faults_of
+from vehest.run.train import TrainJob, new_estimator
 from vehest.studies.registry import study_module, study_names
+from vehest.studies.sweep import is_of_fault, short_names, shown_value
 
-FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets"
+FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
 SAME_IN_A_PART = ("split", "evaluation", "downsample")
+ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "limits")
 
 Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
 Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
@@ -33,7 +53,7 @@ Value = bool | int | float | str
 
 @dataclass(frozen=True)
 class PartFile:
-    """A part as a pipeline's file names it; a part on top of another pipeline's leaves what is None to that one."""
+    """A part as a pipeline's file names it; docs/cli.md says what the keys mean."""
 
     split: str | None = None
     sweeps: Sweeps | None = None
@@ -62,42 +82,37 @@ class PipelineFile:
 
 @dataclass(frozen=True)
 class Part:
-    """One comparison of a study: sweeps of trainings on one split.
-
-    Args:
-        name: short, ``""`` where it is the only one.
-        title: for people.
-        split: name in conf/split.
-        sweeps: overrides of each sweep, several values allowed.
-        optional: whether the study goes on without it where its raw files are missing.
-        overrides: of all its jobs, before those of the sweeps.
-    """
+    """One comparison of a study: sweeps of trainings on one split; its name is empty where it is the only one."""
 
     name: str
     title: str
     split: str
-    sweeps: tuple[tuple[str, ...], ...]
+    sweeps: Sweeps
     optional: bool = False
     overrides: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Job:
     """One training and its evaluation.
 
     Args:
-        config: as composed for ``train`` or ``eval``.
+        config: as composed for ``train`` or ``eval``; rates may be lowered to those of recordings.
         label: its settings as a sweep names them; empty for the estimator's name and variant.
         batch: the same without its fault, for trainings that are evaluated under several.
         values: keys that a sweep varies -> its own values.
-        refusal: why it cannot be trained; empty if it can.
+        combination: of these values, counted from 0.
+        failure: why it cannot be done, or failed; none so far.
+        training: none where it cannot be trained, or is not planned yet.
     """
 
     config: Config
     label: str = ""
     batch: str = ""
     values: Mapping[str, Value] = field(default_factory=dict)
-    refusal: str = ""
+    combination: int = 0
+    failure: Failure | None = None
+    training: TrainJob | None = None
 
 
 Jobs = Mapping[str, Sequence[Job]]
@@ -110,15 +125,14 @@ class Study:
 
     Args:
         study: its name.
-        title: for people.
-        about: a paragraph on what is compared and why.
-        report: module that draws it, by its name in `vehest.studies.registry`; empty for a sweep.
+        report: module that draws it, by its name in `vehest.studies.registry`.
         parts: what is compared; none where it shows recordings alone.
         evaluation: overrides of conf/eval.yaml's ``evaluation``.
         publish: whether its outcome also goes to results/<study>.
-        file: where it was read from; none for a sweep.
+        file: where it was read from.
         datasets: conf/dataset whose recordings it shows, where it compares no estimators.
         optional_datasets: further ones, left out where their raw files are missing.
+        command: of a sweep, without where data come from and results go.
     """
 
     study: str
@@ -126,11 +140,12 @@ class Study:
     about: str
     report: str
     parts: tuple[Part, ...]
-    evaluation: tuple[str, ...]
-    publish: bool
-    file: Path
-    datasets: tuple[str, ...] = ()
-    optional_datasets: tuple[str, ...] = ()
+    evaluation: tuple[str, ...] = ()
+    publish: bool = False
+    file: Path = Path()
+    datasets: Names = ()
+    optional_datasets: Names = ()
+    command: str = ""
 
     @property
     def shows_failed(self) -> bool:
@@ -147,29 +162,26 @@ def read_study(name: str) -> Study:
         ConfigurationError: the file is not a pipeline.
     """
     file, content = _content_of(name)
-    described = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
-    form = _form_of(described, file)
-    assert described.study is not None
-    assert described.report is not None
-    datasets, optional = described.datasets or (), described.optional_datasets or ()
-    if form == "datasets" and (not datasets or len({*datasets, *optional}) != len(datasets) + len(optional)):
-        raise ConfigurationError(f"'{file}': datasets must name some, and none of them twice")
-    parts: Mapping[str, PartFile | None] = described.parts or {}
-    if form == "parts" and not parts:
-        raise ConfigurationError(f"'{file}': parts must be names, each with its split and sweeps")
-    if form == "split":
-        parts = {"": PartFile(described.split, described.sweeps)}
-    check_name(described.study, f"'{file}': study")
-    folded = _check_module(described.report, form, file)
+    read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
+    datasets, optional = read.datasets or (), read.optional_datasets or ()
+    given = {"split": read.split or read.sweeps is not None, "parts": read.parts, "datasets": datasets or optional}
+    forms = [form for form, keys in given.items() if keys]
+    shown = [*datasets, *optional]
+    odd = len(set(shown)) < len(shown) or (optional and not datasets) or (shown and read.evaluation)
+    if not read.study or not read.report or len(forms) != 1 or odd:
+        raise ConfigurationError(f"'{file}' is not a pipeline: {FORMS}")
+    check_name(read.study, f"'{file}': study")
+    folded = _check_module(read.report, forms[0], file)
+    parts = {"": PartFile(read.split, read.sweeps)} if forms == ["split"] else read.parts or {}
     made = tuple(_part(own, part, file) for own, part in parts.items())
     return Study(
-        study=described.study,
-        title=" ".join((described.title or described.study).split()),
-        about=" ".join((described.about or "").split()),
-        report=described.report,
+        study=read.study,
+        title=" ".join((read.title or read.study).split()),
+        about=" ".join((read.about or "").split()),
+        report=read.report,
         parts=_folds_of(made[0], file) if folded else made,
-        evaluation=tuple(_evaluation_override(key, value, file) for key, value in (described.evaluation or {}).items()),
-        publish=described.publish,
+        evaluation=tuple(_evaluation_override(key, value, file) for key, value in (read.evaluation or {}).items()),
+        publish=read.publish,
         file=file,
         datasets=datasets,
         optional_datasets=optional,
@@ -187,68 +199,44 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
         content = read_yaml(file)
     except DataError as error:
         raise ConfigurationError(str(error)) from None
-    if not isinstance(content, dict):
-        raise ConfigurationError(f"'{file}' is not a pipeline: it holds no keys")
     own = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     if own.based_on is None:
         return file, content
     if as_base:
         raise ConfigurationError(f"'{file}' is based on another pipeline itself; base on '{own.based_on}'")
     _, base = _content_of(own.based_on, as_base=True)
-    changes, parts = content.get("parts") or {}, base.get("parts") or {}
+    changes, parts = content.pop("parts", None) or {}, base.get("parts") or {}
     if set(changes) - set(parts):
         raise ConfigurationError(f"'{file}': '{own.based_on}' has no part '{min(set(changes) - set(parts))}'")
-    merged = {**base, **{key: value for key, value in content.items() if key != "based_on"}}
     kept = {key: {**(part or {}), **(changes.get(key) or {})} for key, part in parts.items() if changes.get(key, part) is not None}
-    return file, merged | ({"parts": kept} if parts else {})
+    return file, {**base, **content, "based_on": None, "parts": kept}
 
 
 def _evaluation_override(key: str, value: Any, file: Path) -> str:
     """A key of a pipeline's ``evaluation`` as an override; the faults of an evaluation are a key of their own."""
-    if key == "faults":
-        if not isinstance(value or (), tuple):
-            raise ConfigurationError(f"'{file}': evaluation.faults must be a list of faults, not {value!r}")
-        return f"faults=[{','.join(_fault_as_override(fault) for fault in value or ())}]"
+    if (key == "faults") != isinstance(value, tuple):
+        raise ConfigurationError(f"'{file}': evaluation.{key} = {value!r}: faults are a list of faults, and nothing else is a list")
+    return f"{'' if key == 'faults' else 'evaluation.'}{key}={_as_override(value)}"
+
+
+def _as_override(value: Any) -> str:
+    """A plain value in Hydra's grammar; text in quotes, since nan would be a number."""
     if isinstance(value, tuple):
-        raise ConfigurationError(f"'{file}': evaluation.{key} takes one value; a list of faults is called faults")
-    return f"evaluation.{key}={_as_override(value)}"
-
-
-def _fault_as_override(fault: Mapping[str, int | float | str | None]) -> str:
-    """A mapping in Hydra's grammar, its text in quotes: nan would be a number."""
-    values = {name: f"'{value}'" if isinstance(value, str) else _as_override(value) for name, value in fault.items()}
-    return "{" + ",".join(f"{name}:{value}" for name, value in values.items()) + "}"
-
-
-def _as_override(value: int | float | bool | str | None) -> str:
+        return f"[{','.join(map(_as_override, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_as_override(own)}" for key, own in value.items()) + "}"
+    if isinstance(value, str):
+        return f"'{value}'"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _form_of(described: PipelineFile, file: Path) -> str:
-    """Which of the three forms a pipeline has, by the key that tells: ``split``, ``parts`` or ``datasets``."""
-    named = {
-        "split": described.split is not None or described.sweeps is not None,
-        "parts": described.parts is not None,
-        "datasets": described.datasets is not None or described.optional_datasets is not None,
-    }
-    forms = [form for form, present in named.items() if present]
-    whole = described.study is not None and described.report is not None and len(forms) == 1
-    whole = whole and (forms != ["split"] or (described.split is not None and described.sweeps is not None))
-    if not whole or (forms == ["datasets"] and (described.datasets is None or described.evaluation is not None)):
-        raise ConfigurationError(f"'{file}' is not a pipeline: {FORMS}")
-    return forms[0]
-
-
 def _part(name: str, part: PartFile | None, file: Path) -> Part:
-    where = f"'{file}': part '{name}'" if name else f"'{file}'"
-    if part is None or part.split is None or part.sweeps is None:
-        raise ConfigurationError(f"{where} needs split and sweeps, and may have title, optional and overrides")
+    if part is None or part.split is None or not part.sweeps or not all(part.sweeps):
+        where = f"part '{name}'" if name else "it"
+        raise ConfigurationError(f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides")
     if name:
         check_name(name, f"'{file}': part")
-    if not part.sweeps or not all(part.sweeps):
-        raise ConfigurationError(f"{where}: sweeps must be a list of lists of overrides")
-    title = " ".join((part.title or name).split())
-    return Part(name=name, title=title, split=part.split, sweeps=part.sweeps, optional=part.optional, overrides=part.overrides)
+    return Part(name, " ".join((part.title or name).split()), part.split, part.sweeps, part.optional, part.overrides)
 
 
 def _folds_of(part: Part, file: Path) -> tuple[Part, ...]:
@@ -268,78 +256,69 @@ def _check_module(name: str, form: str, file: Path) -> bool:
     """Whether a module draws a study of this form; True where it needs a split's folds as parts."""
     if name not in study_names():
         raise ConfigurationError(f"'{file}': there is no study module '{name}'; there are: {', '.join(study_names())}")
-    takes = getattr(study_module(name), "TAKES", None)
-    if takes == "folds" and form == "split":
+    takes = str(getattr(study_module(name), "TAKES", "something else"))
+    if (takes, form) == ("folds", "split"):
         return True
     if takes != form:
-        draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(
-            str(takes), takes or "something else"
-        )
+        draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(takes, takes)
         raise ConfigurationError(f"'{file}': the study module '{name}' draws its report from {draws}")
     return False
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a study; further overrides apply to the sweeps, or data sets, that have their key.
+    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key.
 
     Raises:
         ConfigurationError: an override that suits none of them, or jobs of a part that differ in split, evaluation or downsampling.
     """
-    used = {override for override in overrides if study.datasets and key_of(override).split(".")[0] == "tracking"}
     what, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if any(key_of(override) == fixed for override in overrides):
         belongs = "data sets belong" if study.datasets else "split belongs"
         raise ConfigurationError(
             f"the {belongs} to the study; copy '{study.file.name}' to pipelines/ under another name and change that there"
         )
+    used = {override for override in overrides if study.datasets and key_of(override).split(".")[0] == "tracking"}
     if study.datasets:
         jobs: Jobs = {"": [_ingest_job(name, overrides, used) for name in (*study.datasets, *study.optional_datasets)]}
     else:
-        composed: dict[tuple[str, ...], Config] = {}
+        compose = cache(partial(compose_config, "eval"))
         sweeps = [sweep for part in study.parts for sweep in part.sweeps]
         with use_limits(limits_of([*(override for sweep in sweeps for override in sweep), *overrides])):
             check_jobs(sum(count(sweep) for sweep in sweeps), f"the sweeps of '{study.file.name}' stand")
-            jobs = {part.name: _part_jobs(part, study.evaluation, overrides, used, composed) for part in study.parts}
+            jobs = {part.name: _part_jobs(part, study.evaluation, overrides, used, compose) for part in study.parts}
     for override in overrides:
         if override not in used:
-            key = key_of(override)
-            hint = option_hint(key) or f": none has an option '{key}'"
+            hint = option_hint(key_of(override)) or f": none has an option '{key_of(override)}'"
             raise ConfigurationError(f"'{override}' suits no {what} of '{study.file.name}'{hint}")
     return jobs
 
 
 def _part_jobs(
-    part: Part, evaluation: Sequence[str], overrides: Sequence[str], used: set[str], composed: dict[tuple[str, ...], Config]
+    part: Part, evaluation: Sequence[str], overrides: Sequence[str], used: set[str], compose: Callable[[tuple[str, ...]], Config]
 ) -> list[Job]:
-    """The jobs of a part; overrides that suit any of them join ``used``, composed configurations join ``composed``."""
+    """The jobs of a part; overrides that suit any of them join ``used``."""
 
-    def config_of(job: tuple[str, ...]) -> Config:
+    def config_of(job: Sequence[str]) -> Config:
         """Composed without its split, which other jobs share, as other parts share the rest."""
         own = tuple(override for override in job if key_of(override).split(".")[0] == "split")
-        rest = tuple(override for override in job if override not in own)
-        for overrides_of in (own, rest):
-            if overrides_of not in composed:
-                composed[overrides_of] = compose_config("eval", overrides_of)
-        return {**composed[rest], "split": composed[own]["split"]}
+        return {**compose(tuple(override for override in job if override not in own)), "split": compose(own)["split"]}
 
     configs: dict[str, Config] = {}
     for sweep in part.sweeps:
         for job in expand([f"split={part.split}", *part.overrides, *evaluation, *sweep]):
             seeds = [override for override in job if key_of(override) == "seed"]
-            shared = tuple(override for override in job if override not in seeds)
-            base = config_of((*shared, *(override for override in overrides if key_of(override) == "fault")))  # which has further keys
+            shared = [override for override in job if override not in seeds]
+            base = config_of([*shared, *(override for override in overrides if key_of(override) == "fault")])  # which has further keys
             suiting = [override for override in overrides if key_of(override) in GROUPS or has_key(base, key_of(override))]
             used.update(suiting)
-            config = dict(config_of((*shared, *suiting)))
-            own_seed = any(key_of(override) == "seed" for override in suiting)
-            if seeds and not own_seed:
+            config = config_of([*shared, *suiting])
+            if seeds and not any(key_of(override) == "seed" for override in suiting):
                 config["seed"] = value_of(seeds[-1])
             configs.setdefault(json.dumps({key: value for key, value in config.items() if key != GIVEN}, sort_keys=True), config)
     jobs = [Job(config) for config in configs.values()]
-    for other in jobs:
-        for key in SAME_IN_A_PART:
-            if other.config[key] != jobs[0].config[key]:
-                raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
+    for key in SAME_IN_A_PART:
+        if any(job.config[key] != jobs[0].config[key] for job in jobs):
+            raise ConfigurationError(f"the sweeps of a study must agree in '{key}'; put what differs into a pipeline of its own")
     return jobs
 
 
@@ -353,3 +332,72 @@ def _ingest_job(name: str, overrides: Sequence[str], used: set[str]) -> Job:
 def content_overrides(overrides: Sequence[str]) -> list[str]:
     """Those overrides that change what comes out: not where data come from, where results go, or tracking."""
     return [override for override in overrides if key_of(override).split(".")[0] not in {"root", "output", "tracking"}]
+
+
+def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
+    """A study with one sweep: all combinations of overrides over their seeds, in the order of the command.
+
+    A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
+
+    Raises:
+        ConfigurationError: a key is named twice, a key takes several values that cannot, the name is none for files, or no combination can
+            be trained.
+    """
+    with use_limits(limits_of(overrides)):
+        check_jobs(count(overrides), "these overrides stand")
+        keys = [key_of(override) for override in overrides]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise ConfigurationError(f"'{key}' is named twice; give all its values at once: {key}=1,2")
+        swept = [str(one.key_or_group) for one in parse(overrides) if one.is_sweep_override()]
+        for key in swept:
+            if key.split(".")[0] in ONE_VALUE:
+                raise ConfigurationError(
+                    f"'{key}' takes one value in a sweep, whose combinations are compared with each other; run one sweep a value"
+                )
+        others = [override for override in overrides if key_of(override) != "seed"]
+        found = [_combination(own, swept, number) for number, own in enumerate(expand(others))]
+        seeds = [value_of(own[0]) for own in expand([override for override in overrides if override not in others]) if own]
+    refused: dict[str, list[str]] = {}
+    for job in found:
+        if job.failure is not None:
+            refused.setdefault(job.failure.message, []).append(job.label)
+    usable = [job.config for job in found if job.failure is None]
+    if not usable:
+        listed = "; ".join(f"{' and '.join(labels)}: {reason}" for reason, labels in refused.items())
+        raise ConfigurationError(next(iter(refused)) if len(refused) == 1 else f"no combination can be trained; {listed}")
+    split = str(usable[0]["split"]["name"])
+    study = name or f"{'_'.join(dict.fromkeys(str(config['estimator']['name']) for config in usable))}-{split}"
+    check_name(study, "--name")
+    words = [*map(shlex.quote, content_overrides(overrides)), *(["--name", study] if name else [])]
+    of_jobs = {repr(seed): seed for seed in seeds or [usable[0]["seed"]]}.values()
+    jobs = [replace(job, config={**job.config, "seed": seed}) for job in found for seed in of_jobs]
+    part = Part("", "", split, (tuple(overrides),))
+    return Study(study, study, "", "sweep", (part,), command=" ".join(["vehest sweep", *words])), {"": jobs}
+
+
+def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
+    """A combination of values; the seed is each job's own."""
+    values = {key_of(override): _value(override) for override in overrides if key_of(override) in swept}
+    label = _label(values)
+    try:
+        config = compose_config("eval", overrides)
+        estimator = new_estimator(config["estimator"])
+        settings_from_config(estimator.training_type, config["training"], "training")
+        faults_of(config)
+    except ConfigurationError as error:
+        return Job({}, label or "this", "", values, number, failure_of(error))
+    trained = _label({key: value for key, value in values.items() if not is_of_fault(key)})
+    return Job(config, label or estimator.full_title, trained or estimator.full_title, values, number)
+
+
+def _label(values: Mapping[str, Value]) -> str:
+    """Settings for people, ``n_local=2, bias=true``."""
+    names = short_names(list(values))
+    return ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
+
+
+def _value(override: str) -> Value:
+    """A plain value, or the text of any other."""
+    value = value_of(override)
+    return value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]

@@ -1,56 +1,60 @@
-"""Runs studies and sweeps, from a command's overrides to what is printed and published.
+"""Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is printed and published.
 
-jobs (`study`, `sweep`) -> `comparison.check`, `plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
+jobs (`study`) -> `Comparison.check`, `plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.split_files import dataset_names
+from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
-from vehest.run.comparison import NO_TIME, CheckedJobs, Compared, check, collect, failed_in, only_there, plan
-from vehest.run.config import Config
+from vehest.run.calibrate import calibration_of, plan_calibrate, write_calibration
+from vehest.run.comparison import Comparison, failed_in, lower_rate, plan_training, print_notes, slowest
+from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.console import Messages
-from vehest.run.failures import Failure
+from vehest.run.estimate import find_model, model_artefact, preparation_of
+from vehest.run.evaluate_faults import fault_figures, write_faulted
+from vehest.run.faults import check_channels, faults_of
+from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import chosen_launcher
 from vehest.run.launchers.local import default_jobs
-from vehest.run.published import Keys, keys_of_study
+from vehest.run.published import keys_of_study
 from vehest.run.publishing import Publication, publish_study
-from vehest.run.report import ReportJob, ShownDatasets, absent_dataset, leaderboard, overview, plan_report, verdict, write_report
+from vehest.run.report import STAGE as REPORT
+from vehest.run.report import draw_report
 from vehest.run.run_cache import Ran, RunCache, RunOptions, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
-from vehest.run.study import Job, Jobs, Part, Study, content_overrides, jobs_of, read_study
+from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.sweep import STAGE as SWEEP
-from vehest.run.sweep import draw_sweep, plan_sweep
-from vehest.run.terminal import summary_of_leaderboard, summary_of_overview, summary_of_sweep
-from vehest.run.tracking import Tracker
-from vehest.studies.artefacts import AbsentDataset
+from vehest.run.sweep import draw_sweep
+from vehest.run.tracking import Tracker, log_calibration, log_evaluation, test_figures
+from vehest.run.train import TrainJob, learnt_spans, read_fit_metrics, trained_rate
+from vehest.sources.base import kind_of
+from vehest.studies.artefacts import AbsentDataset, StoredDataset
 
-STUDY_STAGES = frozenset({"ingest", "downsample", "train", "calibrate", "evaluate", "report"})
 SWEEP_STAGES = frozenset({"train", "calibrate", "evaluate", SWEEP})
+STUDY_STAGES = frozenset({"ingest", "downsample", "train", "calibrate", "evaluate", REPORT})
 
 
 @contextmanager
-def open_runner(config: Config, options: RunOptions, stages: frozenset[str] = frozenset()) -> Iterator[Runner]:
-    """A runner that listens to signals.
-
-    Args:
-        config: of any command; its output root, limits and tracking count.
-        options: of the command.
-        stages: that are run anew under ``options.force``.
-    """
+def open_runner(config: Config, options: RunOptions, stages: Collection[str], study: str = "") -> Iterator[Runner]:
+    """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
-    tracker = Tracker(config["tracking"], output, messages.warn, stop.requested) if options.track else None
-    forced = stages if options.force else frozenset()
+    tracker = Tracker(config["tracking"], output, messages.warn, stop.requested, study) if options.track or study else None
+    forced = frozenset(stages if options.force else ())
     runner = Runner(output, messages, stop, options.jobs or default_jobs(), forced, options.dry_run, tracker)
     if options.launcher is not None:
         runner.launcher = chosen_launcher(options.launcher, options.jobs, output, messages)
@@ -62,113 +66,76 @@ def open_runner(config: Config, options: RunOptions, stages: frozenset[str] = fr
             runner.launcher.close()
 
 
-def run_study(name: str, overrides: Sequence[str], options: RunOptions, cache: RunCache, *, only_report: bool = False) -> Ran:
-    """Run every stage of a pipeline; what is there is skipped. A study that overrides changed is not published.
+def run_study(
+    name: str | None, overrides: Sequence[str], options: RunOptions, cache: RunCache, *, sweep: bool = False, only_report: bool = False
+) -> Ran:
+    """Run every stage of a pipeline, or of a sweep; what is there is skipped. A study that overrides changed is not published.
 
     Args:
-        name: of the pipeline, or its path.
-        overrides: for all jobs that have their key.
+        name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
+        overrides: for all jobs that have their key; of a sweep, with several values.
         options: of the command.
         cache: keeps the finished study.
+        sweep: whether the overrides make a sweep.
         only_report: draw the report from what is there, train and evaluate nothing.
 
     Raises:
-        ConfigurationError: an override that suits no job.
+        ConfigurationError: an override that suits no job, or overrides that make no sweep.
         JobsFailedError: some jobs of a study in parts, or all of another, failed; finished artefacts are kept.
         DataError: recordings lack what some job of a study in parts, or all of another, needs; nothing was trained.
         MissingError: raw files are missing, or ``only_report`` and a training is.
         DryRunStop: in a dry run.
-        Stopped: a signal came.
-    """
-    begun = time.monotonic()
-    study = read_study(name)
-    jobs = jobs_of(study, overrides)
-    first = next(iter(jobs.values()))[0].config
-    with open_runner(first, options, frozenset({"report"}) if only_report else STUDY_STAGES) as runner:
-        runner.until = _until(options.minutes, begun)
-        if study.parts:
-            runner.tracker = Tracker(first["tracking"], runner.output, runner.messages.warn, runner.stop.requested, study.study)
-        raw = stamps_of(_datasets_of(study, jobs, runner))
-        shown = _ingest_all(study, jobs[""], runner, only_report=only_report) if study.datasets else ShownDatasets()
-        absent, checked = _check_parts(study, jobs, runner)
-        compared: dict[str, Compared] = {}
-        waits = len(checked) < len(study.parts) - len(absent)
-        for part in study.parts:
-            if part.name in checked:
-                try:
-                    planned, missing = plan(checked[part.name], runner), dict[str, Failure]()
-                    if only_report:
-                        planned, missing = only_there(planned, f"vehest run {study.file}")
-                    found, failed = runner.run(planned.groups)
-                    compared[part.name] = collect(part.title, planned, found, failed | missing, runner)
-                except DryRunStop:
-                    waits = True
-        if waits:
-            runner.messages.line("plan", "report", study.study)
-            raise DryRunStop
-        error = _error_of(study, list(compared.values()), runner)
-        command = " ".join([f"vehest run pipelines/{study.file.name}", *content_overrides(overrides)])
-        job = ReportJob(study, command, {key: own for key, own in compared.items() if own.members}, absent, shown)
-        report = runner.ensure(plan_report(job, runner.output), lambda folder: write_report(job, folder))
-        left_out = {key: reason for own in job.parts.values() for key, reason in own.failed.items()}
-        unfinished = NO_TIME in left_out.values()
-        publication = None
-        if study.publish and not content_overrides(overrides) and error is None and not unfinished:
-            gone = {own.name: f"part '{own.name}'" for own in absent} | {own.name: f"data set '{own.name}'" for own in shown.absent}
-            publication = Publication(study.study, gone, _keys(study, jobs, gone, runner))
-        table = leaderboard(job)
-        if table is None:
-            summary = summary_of_overview(overview(report), left_out)
-        else:
-            summary = summary_of_leaderboard(study.title, table, left_out, verdict(job))
-        if error is None and not unfinished and not runner.dry_run:
-            cache.save(runner, report, summary, raw, publication)
-        published = None if runner.dry_run else publish_study(publication, report, runner.messages)
-    return Ran(summary, report.folder, report.skipped, published, error)
-
-
-def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions, cache: RunCache) -> Ran:
-    """Run a study with one sweep: train and evaluate every job, draw tables and heat maps; a failed job stops no other.
-
-    Args:
-        overrides: several values allowed.
-        name: start of the folder's name; none for the estimators and the split.
-        options: of the command.
-        cache: keeps the finished sweep.
-
-    Raises:
-        ConfigurationError: overrides that make no sweep, or a split without test ranges.
-        JobsFailedError: every job failed.
-        DataError: recordings lack what every job needs.
-        DryRunStop: in a dry run.
         Stopped: a signal came; finished artefacts stay.
     """
-    sweep = plan_sweep(overrides, name)
-    first = next(job.config for job in sweep.jobs if not job.refusal)
-    with open_runner(first, replace(options, track=False), SWEEP_STAGES) as runner:
-        runner.tracker = Tracker(first["tracking"], runner.output, runner.messages.warn, runner.stop.requested, sweep.name)
-        raw = stamps_of(runner.datasets_of(first))
-        try:
-            planned = plan(check(sweep.jobs, runner), runner, sweep=True)
-            found, failed = runner.run(planned.groups)
-        except DryRunStop:
-            runner.messages.line("plan", SWEEP, sweep.name)
-            raise
-        compared = collect("", planned, found, failed, runner)
-        swept = draw_sweep(sweep, compared, runner)
-        summary = summary_of_sweep(swept.artefacts, swept.summary)
-        error = None if runner.dry_run else failed_in([compared], runner)
-        if error is None and not runner.dry_run:
-            cache.save(runner, swept.folder, summary, raw)
-    return Ran(summary, swept.folder.folder, swept.folder.skipped, failed=error)
+    begun = time.monotonic()
+    if sweep:
+        study, jobs = sweep_of(overrides, name)
+        command = study.command
+    else:
+        study = read_study(str(name))
+        jobs = jobs_of(study, overrides)
+        command = " ".join([f"vehest run pipelines/{study.file.name}", *content_overrides(overrides)])
+    first = _first(next(iter(jobs.values())))
+    stages = {REPORT} if only_report else SWEEP_STAGES if sweep else STUDY_STAGES
+    with open_runner(first, options, stages, study.study if study.parts else "") as runner:
+        runner.until = _until(options.minutes, begun)
+        runner.train_first = f"vehest run {study.file}" if only_report else ""
+        configs = {str(own["dataset"]["name"]): own["dataset"] for own in (job.config for job in jobs.get("", ())) if study.datasets}
+        for part in study.parts:
+            configs |= runner.datasets_of(_first(jobs[part.name]))
+        raw = stamps_of(configs)
+        datasets: list[StoredDataset | AbsentDataset] = []
+        for job in jobs[""] if study.datasets else ():
+            with suppress(DryRunStop):
+                datasets.append(_dataset(job.config, study, runner))
+        comparisons = _checked(study, jobs, runner)
+        done = 0
+        for comparison in comparisons.values():
+            if comparison.notes is not None:
+                with suppress(DryRunStop):
+                    comparison.plan(runner)
+                    comparison.collect(*runner.run(comparison.groups))
+                    done += 1
+        if done < len(comparisons) or len(datasets) < len(study.datasets) + len(study.optional_datasets):
+            runner.messages.line("plan", SWEEP if sweep else REPORT, study.study)
+            raise DryRunStop
+        error = _error_of(study, list(comparisons.values()), runner)
+        if sweep:
+            report, summary = draw_sweep(study, comparisons[""], runner)
+        else:
+            report, summary = draw_report(study, command, comparisons, datasets, runner)
+        complete = error is None and not any(own.unfinished for own in comparisons.values())
+        publication = None
+        if study.publish and complete and not content_overrides(overrides):
+            publication = _publication(study, jobs, comparisons, datasets, runner)
+        if complete and not runner.dry_run:
+            cache.save(runner, report, summary, raw, publication)
+        published = None if runner.dry_run else publish_study(publication, report, runner.messages)
+    return Ran(summary, report.folder, report.skipped, published, None if sweep and runner.dry_run else error)
 
 
 def _until(minutes: float | None, begun: float) -> float | None:
-    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time.
-
-    Raises:
-        ConfigurationError: no positive time.
-    """
+    """Reading of ``time.monotonic`` at which trainings have to end, so that the report is drawn in time."""
     if minutes is None:
         return None
     if not minutes > 0:
@@ -177,93 +144,154 @@ def _until(minutes: float | None, begun: float) -> float | None:
     return begun + seconds - min(max(30.0, 0.06 * seconds), 0.5 * seconds)
 
 
-def _check_parts(study: Study, jobs: Jobs, runner: Runner) -> tuple[list[Part], dict[str, CheckedJobs]]:
-    """Parts that are left out since their raw files are missing, and the checked jobs of all others, before anything is trained.
+def _first(jobs: Sequence[Job]) -> Config:
+    return next(job.config for job in jobs if job.failure is None)
 
-    Raises:
-        MissingError: raw files of a part that is not optional, or of all parts, are missing.
-        DataError: a study in parts lacks a job.
-    """
-    absent: list[Part] = []
+
+def _checked(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
+    """Part -> its checked jobs, before anything is trained; optional parts whose raw files are missing are left out."""
+    found: dict[str, Comparison] = {}
     for part in study.parts:
         try:
-            runner.look_for_files(jobs[part.name][0].config)
+            runner.look_for_files(_first(jobs[part.name]))
+            own = [replace(job) for job in jobs[part.name]]  # keys of published results hold rates before they are lowered
+            found[part.name] = Comparison(part.title, own)
         except MissingError as error:
             if not part.optional:
                 raise
             runner.messages.warn(f"{error}; the study goes on without part '{part.name}'")
-            absent.append(part)
-    if study.parts and len(absent) == len(study.parts):
+    if study.parts and not found:
         raise MissingError(f"nothing that '{study.file.name}' compares is here; set VEHEST_DATA, or give root=FOLDER")
-    checked: dict[str, CheckedJobs] = {}
-    for part in study.parts:
-        if part not in absent:
-            with suppress(DryRunStop):
-                checked[part.name] = check(jobs[part.name], runner)
-    lacking = [failure.message for own in checked.values() for failure in own.failures.values()]
-    if lacking and not study.shows_failed:
-        raise DataError(f"a study in parts needs all of its jobs; {'; '.join(dict.fromkeys(lacking))}")
-    return absent, checked
-
-
-def _error_of(study: Study, compared: Sequence[Compared], runner: Runner) -> JobsFailedError | None:
-    """The error that a study ends with after its report.
-
-    Raises:
-        JobsFailedError: the report cannot do without what failed.
-        DataError: nothing was done in time.
-    """
-    error = failed_in(compared, runner)
-    if not study.parts or any(own.members for own in compared):
-        if error is not None and not study.shows_failed:
-            raise error
-        return error
-    if error is not None:
-        raise error
-    left = [name for own in compared for name in own.unfinished]
-    raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(left)}")
-
-
-def _datasets_of(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Config]:
-    """The configuration of every data set of a study, by its name."""
-    if study.datasets:
-        return {str(job.config["dataset"]["name"]): job.config["dataset"] for job in jobs[""]}
-    return {name: own for part in jobs.values() for name, own in runner.datasets_of(part[0].config).items()}
-
-
-def _ingest_all(study: Study, jobs: Sequence[Job], runner: Runner, *, only_report: bool) -> ShownDatasets:
-    """Ingest the data sets of a study of recordings alone; optional ones are left out where their raw files are missing.
-
-    Raises:
-        MissingError: raw files are missing, or ``only_report`` and recordings are not there.
-        DryRunStop: in a dry run, after all were looked at.
-        Stopped: a signal came; finished ingests stay.
-    """
-    here: list[Config] = []
-    ingested: list[Artefact] = []
-    absent: list[AbsentDataset] = []
-    for job in jobs:
-        dataset = job.config["dataset"]
-        try:
-            planned = plan_ingest(job.config)
-        except MissingError as error:
-            if dataset["name"] not in study.optional_datasets:
-                raise
-            runner.messages.warn(f"{error}; the study goes on without it")
-            absent.append(absent_dataset(dataset))
-            continue
-        if only_report and find(planned) is None:
-            raise MissingError(f"data set '{planned.label}' has not been ingested; run 'vehest run' first")
-        here.append(job.config)
+    for comparison in found.values():
         with suppress(DryRunStop):
-            ingested.append(runner.ingest(job.config))
-    if len(ingested) < len(here):
-        runner.messages.line("plan", "report", study.study)
-        raise DryRunStop
-    return ShownDatasets(here, ingested, absent)
+            comparison.check(runner)
+    lacking = dict.fromkeys(job.failure.message for own in found.values() for job in own.jobs if job.failure is not None)
+    if lacking and not study.shows_failed:
+        raise DataError(f"a study in parts needs all of its jobs; {'; '.join(lacking)}")
+    return found
 
 
-def _keys(study: Study, jobs: Jobs, absent: Mapping[str, str], runner: Runner) -> Keys:
-    """What determined the results: raw files as they were ingested."""
+def _dataset(config: Config, study: Study, runner: Runner) -> StoredDataset | AbsentDataset:
+    """An ingested data set of a study of recordings alone, or an optional one whose raw files are missing."""
+    own = config["dataset"]
+    title, licence, citation = (" ".join(str(own.get(key, own["name"])).split()) for key in ("title", "licence", "citation"))
+    try:
+        planned = plan_ingest(config)
+    except MissingError as error:
+        if own["name"] not in study.optional_datasets:
+            raise
+        runner.messages.warn(f"{error}; the study goes on without it")
+        return AbsentDataset(own["name"], title, licence, citation)
+    if runner.train_first and find(planned) is None:
+        raise MissingError(f"data set '{planned.label}' has not been ingested; run '{runner.train_first}' first")
+    made = runner.ingest(config)
+    files = {Path(name).stem: made.folder / name for name in made.outputs}
+    return StoredDataset(own["name"], title, kind_of(own), made.config, files, licence, citation)
+
+
+def _error_of(study: Study, comparisons: Sequence[Comparison], runner: Runner) -> JobsFailedError | None:
+    """The error that a study ends with after its report; raised at once where there is nothing to report, or not without what failed."""
+    error, nothing = failed_in(comparisons, runner), bool(study.parts) and not any(own.members for own in comparisons)
+    if error is not None and (nothing or not study.shows_failed):
+        raise error
+    if nothing:
+        left = [name for own in comparisons for name in own.unfinished]
+        raise DataError(f"no estimator was done in this time; the same command goes on with: {', '.join(left)}")
+    return error
+
+
+def _publication(
+    study: Study, jobs: Jobs, comparisons: Collection[str], datasets: Sequence[StoredDataset | AbsentDataset], runner: Runner
+) -> Publication:
+    """What is published, with what determined it: raw files as they were ingested."""
+    gone = {part.name: f"part '{part.name}'" for part in study.parts if part.name not in comparisons}
+    gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
     inputs = {artefact.label: artefact.inputs for artefact in runner.artefacts.values() if artefact.stage == INGEST}
-    return keys_of_study(study, jobs, absent, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])
+    keys = keys_of_study(study, jobs, gone, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])
+    return Publication(study.study, gone, keys)
+
+
+def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
+    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over.
+
+    Raises:
+        VehestError: the training failed, in its own words.
+        DryRunStop: in a dry run.
+    """
+    config = compose_config("train", overrides)
+    with open_runner(config, options, ("train", "calibrate")) as runner:
+        config, job = _training(config, runner)
+        members, failures = runner.run([Group([job], None, runner.force, split=runner.split(config))])
+        for failure in failures.values():
+            if failure.detail:
+                runner.messages.warn(failure.detail)
+            error = VehestError(failure.message)
+            error.exit_code = failure.exit_code
+            raise error
+    model = next((member.model for member in members.values()), None)
+    if model is None:
+        return {}
+    return {"model": str(model.folder), "status": model.status, "skipped": model.skipped, **read_fit_metrics(model.folder)}
+
+
+def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]) -> dict[str, Any]:
+    """Evaluate a model by folder or start of its name, or the one that the overrides train, on the tests of a split.
+
+    Raises:
+        MissingError: the model is not there.
+        DryRunStop: in a dry run.
+    """
+    config = compose_config("eval", overrides)
+    faults = faults_of(config)
+    with open_runner(config, options, ("calibrate", "evaluate")) as runner:
+        split = runner.split(config)
+        if model is not None:
+            config, notes = lower_rate(config, "evaluation", slowest(runner.contents(config)))
+            print_notes(notes, runner)
+            trained = model_artefact(find_model(model, runner.output, note))
+            rate = trained_rate(trained)
+            if not any(key_of(override).split(".")[0] == "downsample" for override in overrides):
+                config["downsample"] = preparation_of(trained.folder)
+        else:
+            config, job = _training(config, runner)
+            found, rate = find(job.plan), float(config["estimator"]["rate_hz"])
+            if found is None:
+                raise MissingError(f"{job.plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first")
+            trained = found
+        how = runner.evaluation(config, runner.data_for(split, rate, config), faults)
+        check_channels(faults, split, how.data)
+        calibration = _calibration(trained, split, how.data, runner)
+        scoring = how.of(trained, calibration)
+        artefact = runner.ensure(scoring.plan, partial(write_faulted, scoring))
+        if runner.tracker is not None:
+            if calibration is not None:
+                log_calibration(runner.tracker, calibration)
+            log_evaluation(runner.tracker, artefact, trained, how)
+    return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact), **fault_figures(artefact.folder)}
+
+
+def _training(config: Config, runner: Runner) -> tuple[Config, TrainJob]:
+    """The configuration at a rate that the recordings have, and its training."""
+    positive_rate(config["estimator"].get("rate_hz"), "estimator.rate_hz")
+    split, comparison = runner.split(config), Comparison("", [Job(config)])
+    try:
+        comparison.check(runner)
+    except DataError as error:
+        names = ", ".join(f"'vehest data usable {name}'" for name in dataset_names(config["split"]))
+        raise DataError(f"{error}; {names} says what each estimator needs") from None
+    config = comparison.jobs[0].config
+    return config, plan_training(config, split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config))
+
+
+def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner) -> Artefact | None:
+    """The calibration of a model: made on the split that it is evaluated on if it was trained there, else looked for."""
+    learnt, found = learnt_spans(model), None
+    if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
+        job = plan_calibrate(model, split, data, runner.output)
+        if job is not None:
+            found = runner.ensure(job.plan, partial(write_calibration, job))
+    elif learnt:  # one of a model that learns nothing may have seen these tests
+        found = calibration_of(model.folder, runner.output)
+    if found is None:
+        runner.messages.line("note", "calibrate", model.label, "has no calibration, so its estimates have no bands")
+    return found
