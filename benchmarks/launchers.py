@@ -28,9 +28,9 @@ from vehest.data.files import remove_leftovers
 from vehest.run.comparison import plan_training
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
-from vehest.run.evaluate import protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.failures import Failure
-from vehest.run.group import Evaluation, Group
+from vehest.run.group import Group
 from vehest.run.launchers import on_ray
 from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher

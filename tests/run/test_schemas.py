@@ -536,7 +536,9 @@ def test_wrong_values_on_the_command_line_name_their_keys() -> None:
             compose_config("train", [override])
 
 
-@pytest.mark.parametrize("override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"])
+@pytest.mark.parametrize(
+    "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
+)
 def test_no_override_reaches_hydra_itself(override: str) -> None:
     with pytest.raises(ConfigurationError, match="is an option of Hydra itself"):
         compose_config("train", [override])

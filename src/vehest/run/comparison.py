@@ -16,10 +16,10 @@ from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact
 from vehest.run.config import Config
 from vehest.run.estimate import find_model, model_artefact
-from vehest.run.evaluate import protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import all_of, check_channels, faults_of
-from vehest.run.group import Evaluation, Group, Member, existing, is_finished
+from vehest.run.group import Group, Member, existing, is_finished
 from vehest.run.rates import Note, at_estimator_rate, at_evaluation_rate, slowest
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop

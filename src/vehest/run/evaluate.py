@@ -1,11 +1,15 @@
-"""Fifth stage: fitted estimators to estimates and metrics, all read on one grid of times."""
+"""Evaluates fitted estimators: estimates and metrics, all read on one grid of times.
+
+model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate -> metrics.csv, timings.csv, blocks.csv
+"""
 
 from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +23,9 @@ from vehest.data.schema import settings_from_config
 from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_estimate, read_recording, write_estimate
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import About, load_model, read_description
+from vehest.estimators.model_files import load_model, read_description
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
-from vehest.evaluation.blocks import Segments, segments_of, write_segments
+from vehest.evaluation.blocks import segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
@@ -38,6 +42,7 @@ from vehest.evaluation.metrics import (
 )
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
+from vehest.run.faults import FaultSettings
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
 from vehest.run.versions import version_of_estimator
 from vehest.studies.artefacts import read_frame
@@ -46,6 +51,7 @@ from vehest.trust.record import read_trust
 
 STAGE = "evaluate"
 VERSION = "1"
+VERSION_OF_FAULTS = "1"
 METRICS = "metrics.csv"
 BLOCKS = "blocks.csv"
 TIMES = ("train_seconds", "step_seconds")
@@ -53,53 +59,8 @@ TIMED_STEPS = 200
 FIT_FIGURES = ("n_parameters", "epochs", "train_seconds")
 TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
-COLUMNS = (
-    "estimator",
-    "variant",
-    "trained_on",
-    "dataset",
-    "kind",
-    "test_set",
-    "subset",
-    "condition",
-    "rate_hz",
-    "mode",
-    "seed",
-    "metric",
-    "value",
-    "unit",
-    "low",
-    "high",
-)
-
-
-@dataclass(frozen=True)
-class EvaluateJob:
-    """One model to evaluate.
-
-    Args:
-        plan: the artefact it becomes.
-        model: what the train stage made.
-        split: its validation range and tests are scored.
-        data: data set -> recordings at the estimator's rate.
-        references: data set -> recordings at the evaluation rate.
-        kinds: data set -> ``real`` or ``simulated``.
-        protocol: how estimates are scored.
-        calibration: how far the model's estimates can be trusted, where that was learnt.
-    """
-
-    plan: StagePlan
-    model: Artefact
-    split: Split
-    data: Mapping[str, Artefact]
-    references: Mapping[str, Artefact]
-    kinds: Mapping[str, str]
-    protocol: Protocol
-    calibration: Artefact | None = None
-
-    def reference(self, span: Span) -> Recording:
-        """The recording of a range at the evaluation rate, references included."""
-        return read_recording(recording_file(self.references[span.dataset], span))
+HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
+COLUMNS = (*HEAD, "metric", "value", "unit", "low", "high")
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
@@ -120,58 +81,95 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
             )
     if protocol.initial_state and protocol.warm_up_seconds > 0:
         raise ConfigurationError(
-            f"evaluation.initial_state hands over the state at the first sample of a {protocol.piece}, so estimates cannot start "
+            f"evaluation.initial_state gives the state at the first sample of a {protocol.piece}, so estimates cannot start "
             f"{protocol.warm_up_seconds:g} s earlier; set evaluation.warm_up_seconds=0"
         )
     return protocol
 
 
-def plan_evaluate(
-    model: Artefact,
-    split: Split,
-    data: Mapping[str, Artefact],
-    references: Mapping[str, Artefact],
-    kinds: Mapping[str, str],
-    protocol: Protocol,
-    output: Path,
-    calibration: Artefact | None = None,
-) -> EvaluateJob:
-    """What an evaluation would make.
+@dataclass(frozen=True)
+class Evaluation:
+    """How models are evaluated.
 
-    Raises:
-        DataError: the split names a recording that the data set does not have.
-        ConfigurationError: a test range was used for training.
+    Args:
+        split: its validation range and tests are scored.
+        data: data set -> recordings at the estimator's rate.
+        references: data set -> recordings at the evaluation rate.
+        kinds: data set -> ``real`` or ``simulated``.
+        protocol: of the scores.
+        output: the output root.
+        faults: further conditions.
     """
-    estimator = read_description(model.folder).estimator
-    for name, spans in split.tests.items():
-        for span in spans:
+
+    split: Split
+    data: Mapping[str, Artefact]
+    references: Mapping[str, Artefact]
+    kinds: Mapping[str, str]
+    protocol: Protocol
+    output: Path
+    faults: tuple[FaultSettings, ...] = ()
+
+    def of(self, model: Artefact, calibration: Artefact | None) -> EvaluateJob:
+        """The evaluation of a model, calibrated or not."""
+        return EvaluateJob(self, model, calibration)
+
+
+@dataclass(frozen=True)
+class EvaluateJob:
+    """The evaluation of one model."""
+
+    how: Evaluation
+    model: Artefact
+    calibration: Artefact | None = None
+
+    @cached_property
+    def plan(self) -> StagePlan:
+        """The artefact that it becomes.
+
+        Raises:
+            DataError: the split names a recording that the data set does not have.
+            ConfigurationError: a test range was used for training.
+        """
+        how, model = self.how, self.model
+        for name, spans in how.split.tests.items():
             for learnt in learnt_spans(model):
-                if span.overlaps(learnt):
+                if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
-                        f"test set '{name}' shares samples with what {model.label} was trained or chosen on ({learnt.describe()}); "
-                        f"test it on something else"
+                        f"test set '{name}' shares samples with the ranges that {model.label} was trained or chosen on "
+                        f"({learnt.describe()}); test it on something else"
                     )
-    inputs = {"model": model.digest} | ({} if calibration is None else {"calibration": calibration.digest})
-    for span in scored_spans(split):
-        inputs[f"{span.dataset}/{span.recording}"] = file_digest(data[span.dataset], span)
-        inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
-    for span in learnt_spans(model, "train"):
-        if span.dataset in references:
-            inputs[f"reference of {span.dataset}/{span.recording}"] = file_digest(references[span.dataset], span)
-    sets = {name: [str(span) for span in spans] for name, spans in test_sets(split).items()}
-    plan = StagePlan(
-        stage=STAGE,
-        label=f"{model.label}-on-{split.name}",
-        config={"sets": sets, "protocol": asdict(protocol), "kinds": dict(kinds), "split": split.name},
-        inputs=inputs,
-        code=code_of_evaluation(estimator),
-        output=output,
-    )
-    return EvaluateJob(plan, model, split, data, references, kinds, protocol, calibration)
+        inputs = {"model": model.digest} | ({} if self.calibration is None else {"calibration": self.calibration.digest})
+        scored = scored_spans(how.split)
+        inputs |= {f"{span.dataset}/{span.recording}": file_digest(how.data[span.dataset], span) for span in scored}
+        compared = [*scored, *(span for span in learnt_spans(model, "train") if span.dataset in how.references)]
+        inputs |= {f"reference of {span.dataset}/{span.recording}": file_digest(how.references[span.dataset], span) for span in compared}
+        config: dict[str, Any] = {
+            "sets": {name: [str(span) for span in spans] for name, spans in test_sets(how.split).items()},
+            "protocol": asdict(how.protocol),
+            "kinds": dict(how.kinds),
+            "split": how.split.name,
+        }
+        code = code_of_evaluation(read_description(model.folder).estimator)
+        if how.faults:
+            config["faults"], code = [asdict(fault) for fault in how.faults], code_under_faults(code)
+        return StagePlan(STAGE, f"{model.label}-on-{how.split.name}", config, inputs, code, how.output)
+
+    def reference(self, span: Span) -> Recording:
+        """The recording of a range at the evaluation rate, references included."""
+        return read_recording(recording_file(self.how.references[span.dataset], span))
+
+    def measured(self, span: Span) -> Recording:
+        """A range as the estimator sees it: no references, and a warm-up before it."""
+        recording = read_recording(recording_file(self.how.data[span.dataset], span))
+        return recording.cut(span.start - self.how.protocol.warm_up_seconds, span.stop).without_references()
+
+    def state(self, piece: Span) -> dict[str, float] | None:
+        """The state that the protocol passes to an estimator at the start of a piece, if any."""
+        return reference_state(self.reference(piece), piece) if self.how.protocol.initial_state else None
 
 
 def code_of_evaluation(estimator: str) -> str:
-    """Version of what an evaluation of an estimator runs.
+    """Version of an evaluation of an estimator.
 
     Raises:
         ConfigurationError: the name is unknown.
@@ -179,115 +177,131 @@ def code_of_evaluation(estimator: str) -> str:
     return f"evaluate={VERSION} {version_of_estimator(estimator)}"
 
 
+def code_under_faults(code: str) -> str:
+    """Version of an evaluation under faults, from that without them."""
+    return f"{code} faults={VERSION_OF_FAULTS}"
+
+
+def test_sets(split: Split) -> dict[str, Sequence[Span]]:
+    """Everything that is scored: the tests, and the validation range, on which seeds are chosen."""
+    return {**({VALIDATION: split.validation} if split.validation else {}), **split.tests}
+
+
+def scored_spans(split: Split) -> list[Span]:
+    """The ranges of all test sets."""
+    return [span for spans in test_sets(split).values() for span in spans]
+
+
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     """Estimate and score every range; write estimates, metrics and, in a file of their own, times into ``folder``."""
-    estimator = load_model(job.model.folder)
-    about = read_description(job.model.folder).about
+    estimator, protocol = load_model(job.model.folder), job.how.protocol
     fit = _fit_of(job.model, estimator)
-    if not set(FIT_FIGURES) <= set(fit):
-        raise DataError(f"'{job.model.folder}' does not say {', '.join(sorted(set(FIT_FIGURES) - set(fit)))} of its fit; train it again")
-    bands = _bands_of(job)
-    rows: list[tuple[Any, ...]] = []
-    blocks: dict[str, Segments] = {}
-    for name, spans in test_sets(job.split).items():
-        pieces = sequences(spans, job.reference, job.protocol)
-        estimates = _with_bands(_estimates(estimator, job, pieces), job, pieces, bands, name)
+    bands = None if job.calibration is None else read_trust(job.calibration.folder).bands
+    rows: list[dict[str, Any]] = []
+    blocks = {}
+    for name, spans in test_sets(job.how.split).items():
+        head = head_of(job, estimator, name, spans)
+        pieces = sequences(spans, job.reference, protocol)
+        estimates = _estimates(estimator, job, pieces)
+        if bands is not None:
+            estimates = [_with_bands(*pair, bands, job, name) for pair in zip(estimates, pieces, strict=True)]
         for position, estimate in enumerate(estimates):
             write_estimate(estimate, folder / name / f"{position}.parquet")
-        scored = score_all(estimates.__getitem__, spans, job.reference, job.protocol)
-        blocks[name] = segments_of(scored, job.protocol.rate_hz)
+        scored = score_all(estimates.__getitem__, spans, job.reference, protocol)
+        parts = pieces_of(spans, job.reference, protocol)
+        masks = [regimes_of(reference, piece, protocol) for reference, piece in parts]
+        blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
-        if job.protocol.sequence_seconds is not None:
+        if protocol.sequence_seconds is not None:
             figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
             figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, job, spans)
             if estimator.causal:
-                figures["step_seconds"] = _step_seconds(estimator, measured_range(job, pieces[0]))
-        rows += _rows(estimator, about, job, name, spans, figures, figure_intervals(blocks[name]))
-        with_lever = lever_arm_figures(scored, pieces_of(spans, job.reference, job.protocol), job.protocol)
-        rows += _rows(estimator, about, job, name, spans, with_lever, {}, condition=CONDITION)
+                figures["step_seconds"] = _step_seconds(estimator, job.measured(pieces[0]))
+        rows += rows_of(head, figures, figure_intervals(blocks[name]))
+        rows += rows_of(head, lever_arm_figures(scored, parts, protocol), condition=CONDITION)
         if name != VALIDATION:
-            masks = [regimes_of(reference, piece, job.protocol) for reference, piece in pieces_of(spans, job.reference, job.protocol)]
-            for regime, own in errors_by_regime(scored, masks, job.protocol.rate_hz).items():
-                rows += _rows(estimator, about, job, name, spans, own, {}, subset=regime)
+            for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
+                rows += rows_of(head, own, subset=regime)
         if bands is not None:
-            rows += _band_rows(estimator, about, job, name, spans, scored, bands)
-    rows += _training_rows(estimator, about, job)
+            own_bands = banded(scored, bands)
+            turns = [
+                reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None
+                for reference, piece in parts
+            ]
+            intervals = coverage_intervals(own_bands, scored, protocol.rate_hz)
+            rows += rows_of(head, band_figures(own_bands, scored, turns, protocol.rate_hz), intervals)
+            for regime, inside in figures_by_regime(own_bands, masks, protocol.rate_hz).items():
+                rows += rows_of(head, inside, subset=regime)
+    rows += _training_rows(estimator, job)
     write_segments(folder / BLOCKS, blocks)
-    for file, timed in ((METRICS, False), (TIMINGS, True)):
-        with open(folder / file, "w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream, lineterminator="\n")
-            writer.writerow(COLUMNS)
-            writer.writerows(row for row in rows if (row[COLUMNS.index("metric")] in TIMES) is timed)
+    write_rows(folder / METRICS, (row for row in rows if row["metric"] not in TIMES))
+    write_rows(folder / TIMINGS, (row for row in rows if row["metric"] in TIMES))
 
 
-def _rows(
-    estimator: Estimator,
-    about: About,
-    job: EvaluateJob,
-    name: str,
-    spans: Sequence[Span],
-    figures: Mapping[str, float],
-    intervals: Mapping[str, tuple[float, float]],
-    subset: str = "all",
-    condition: str = "nominal",
-) -> list[tuple[Any, ...]]:
-    """Rows of `COLUMNS` for one set of ranges, for the samples of it that lie in a regime, or under another condition."""
-    trained_on = "+".join(about.datasets)
-    datasets = "+".join(dict.fromkeys(span.dataset for span in spans))
-    kinds = "+".join(dict.fromkeys(job.kinds[span.dataset] for span in spans))
+def head_of(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
+    """The columns that rows of one test set have in common."""
+    about = read_description(job.model.folder).about
+    datasets = dict.fromkeys(span.dataset for span in spans)
+    kinds = dict.fromkeys(job.how.kinds[name] for name in datasets)
     mode = "causal" if estimator.causal else "offline"
-    head = (estimator.name, estimator.variant, trained_on, datasets, kinds, name, subset, condition, job.protocol.rate_hz, mode)
+    model = (estimator.name, estimator.variant, "+".join(about.datasets))
+    test = ("+".join(datasets), "+".join(kinds), name, "all", "nominal", job.how.protocol.rate_hz, mode, about.seed)
+    return dict(zip(HEAD, (*model, *test), strict=True))
+
+
+def rows_of(
+    head: Mapping[str, Any],
+    figures: Mapping[str, float],
+    intervals: Mapping[str, tuple[float, float]] | None = None,
+    units: Mapping[str, str] = UNITS,
+    **columns: str,
+) -> list[dict[str, Any]]:
+    """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
     rows = []
     for metric, value in figures.items():
-        ends = [repr(float(end)) for end in intervals[metric]] if metric in intervals else ["", ""]
-        rows.append((*head, about.seed, metric, repr(float(value)), UNITS[metric], *ends))
+        low, high = (repr(float(end)) for end in intervals[metric]) if intervals and metric in intervals else ("", "")
+        row = {"metric": metric, "value": repr(float(value)), "unit": units[metric], "low": low, "high": high}
+        rows.append({**head, **columns, **row})
     return rows
 
 
+def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write rows of `COLUMNS`, behind those of an existing file."""
+    with open(path, "a", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+        if not stream.tell():
+            writer.writeheader()
+        writer.writerows(rows)
+
+
 def _fit_of(model: Artefact, estimator: Estimator) -> dict[str, float]:
-    """Figures of a fit; of a model that came without those its number of parameters, and no epochs."""
+    """Figures of a fit; a model without them has its number of parameters and no epochs."""
     if model.outputs and FIT_METRICS not in model.outputs:
         return dict.fromkeys(FIT_FIGURES, 0.0) | {"n_parameters": float(estimator.n_parameters)}
     return read_fit_metrics(model.folder)
 
 
-def _bands_of(job: EvaluateJob) -> Bands | None:
-    """The model's calibrated bands, where there are any."""
-    return None if job.calibration is None else read_trust(job.calibration.folder).bands
+def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -> list[Estimate]:
+    """An estimate each; sequences in one go, since a method may then take them all at once."""
+    batches = [pieces] if job.how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
+    estimates: list[Estimate] = []
+    for batch in batches:
+        states = [state for piece in batch if (state := job.state(piece)) is not None]
+        estimates += estimator.estimate([job.measured(piece) for piece in batch], states or None)
+    return estimates
 
 
-def _with_bands(estimates: list[Estimate], job: EvaluateJob, pieces: Sequence[Span], bands: Bands | None, test_set: str) -> list[Estimate]:
-    """Estimates with their 90 % bands, wider on vehicles that bands were not calibrated on and on test sets that the protocol names."""
-    if bands is None:
-        return estimates
-    found = []
-    for estimate, piece in zip(estimates, pieces, strict=True):
-        measured = measured_range(job, piece)
-        elsewhere = measured.vehicle not in bands.vehicles or test_set in job.protocol.sets_elsewhere
-        found.append(with_bands(estimate, measured, bands, elsewhere=elsewhere))
-    return found
-
-
-def _band_rows(
-    estimator: Estimator, about: About, job: EvaluateJob, name: str, spans: Sequence[Span], scored: Sequence[Scored], bands: Bands
-) -> list[tuple[Any, ...]]:
-    """What bands are worth on a test set, and there by lateral acceleration."""
-    rate, own = job.protocol.rate_hz, banded(scored, bands)
-    turns, masks = [], []
-    for reference, piece in pieces_of(spans, job.reference, job.protocol):
-        turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, job.protocol))] if "yaw_rate" in reference else None)
-        masks.append(regimes_of(reference, piece, job.protocol))
-    figures = band_figures(own, scored, turns, rate)
-    rows = _rows(estimator, about, job, name, spans, figures, coverage_intervals(own, scored, rate))
-    for regime, inside in figures_by_regime(own, masks, rate).items():
-        rows += _rows(estimator, about, job, name, spans, inside, {}, subset=regime)
-    return rows
+def _with_bands(estimate: Estimate, piece: Span, bands: Bands, job: EvaluateJob, test_set: str) -> Estimate:
+    """An estimate with its 90 % bands, wider on vehicles without calibration and on test sets that the protocol names."""
+    measured = job.measured(piece)
+    other_vehicle = measured.vehicle not in bands.vehicles or test_set in job.how.protocol.sets_elsewhere
+    return with_bands(estimate, measured, bands, elsewhere=other_vehicle)
 
 
 def _floors(estimator: Estimator, job: EvaluateJob, spans: Sequence[Span]) -> dict[str, float]:
-    """The noise of the reference, and the bound for the inputs of a causal estimator; nothing where there is none."""
-    drives = drives_of(spans, job.reference, job.protocol)
+    """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
+    drives = drives_of(spans, job.reference, job.how.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
     floors = {
         "floor_reference": reference_floor(drives),
@@ -300,18 +314,31 @@ def _floors(estimator: Estimator, job: EvaluateJob, spans: Sequence[Span]) -> di
     return figures
 
 
-def _training_rows(estimator: Estimator, about: About, job: EvaluateJob) -> list[tuple[Any, ...]]:
-    """Errors on what the model learnt from; none where the reference has gaps there or nothing was learnt."""
-    spans = [span for span in learnt_spans(job.model, "train") if span.dataset in job.data]
+def _step_seconds(estimator: Estimator, recording: Recording) -> float:
+    """Median time of one online step on this machine [s]."""
+    stepper = estimator.online()
+    columns = {name: recording[name] for name in estimator.channels}
+    times = np.empty(min(TIMED_STEPS, len(recording)))
+    for k in range(len(times)):
+        sample = {name: float(samples[k]) for name, samples in columns.items()}
+        started = time.perf_counter()
+        stepper.step(sample)
+        times[k] = time.perf_counter() - started
+    return float(np.median(times))
+
+
+def _training_rows(estimator: Estimator, job: EvaluateJob) -> list[dict[str, Any]]:
+    """Errors on the training ranges; none where the reference has gaps there or nothing was learnt."""
+    spans = [span for span in learnt_spans(job.model, "train") if span.dataset in job.how.data]
     try:
-        pieces = sequences(spans, job.reference, job.protocol) if spans else []
+        pieces = sequences(spans, job.reference, job.how.protocol) if spans else []
         if not pieces:
             return []
         estimates = _estimates(estimator, job, pieces)
-        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.protocol))
+        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.how.protocol))
     except DataError:
         return []
-    return _rows(estimator, about, job, TRAINING, spans, {name: figures[name] for name in TRAINING_METRICS}, {})
+    return rows_of(head_of(job, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
 
 
 def read_metrics(folder: Path) -> pd.DataFrame:
@@ -333,45 +360,3 @@ def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Art
         lambda span: read_recording(recording_file(references[span.dataset], span)),
         protocol,
     )
-
-
-def test_sets(split: Split) -> dict[str, Sequence[Span]]:
-    """Everything that is scored; the validation range too, where there is one, since seeds are chosen on it."""
-    return {**({VALIDATION: split.validation} if split.validation else {}), **split.tests}
-
-
-def scored_spans(split: Split) -> list[Span]:
-    """The ranges of all test sets."""
-    return [span for spans in test_sets(split).values() for span in spans]
-
-
-def measured_range(job: EvaluateJob, span: Span) -> Recording:
-    """What the estimator may see of a range: no references, and a warm-up before it."""
-    recording = read_recording(recording_file(job.data[span.dataset], span))
-    return recording.cut(span.start - job.protocol.warm_up_seconds, span.stop).without_references()
-
-
-def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -> list[Estimate]:
-    """An estimate each; those of a protocol that cuts ranges in one go, since a method may then take them all at once."""
-    states: Sequence[Mapping[str, float]] | None = None
-    if job.protocol.initial_state:
-        states = [reference_state(job.reference(piece), piece) for piece in pieces]
-    if job.protocol.sequence_seconds is not None:
-        return estimator.estimate([measured_range(job, piece) for piece in pieces], states)
-    return [
-        estimator.estimate([measured_range(job, piece)], states[position] if states is not None else None)[0]
-        for position, piece in enumerate(pieces)
-    ]
-
-
-def _step_seconds(estimator: Estimator, recording: Recording) -> float:
-    """Median time of one online step on this machine [s]."""
-    stepper = estimator.online()
-    columns = {name: recording[name] for name in estimator.channels}
-    times = np.empty(min(TIMED_STEPS, len(recording)))
-    for k in range(len(times)):
-        sample = {name: float(samples[k]) for name, samples in columns.items()}
-        started = time.perf_counter()
-        stepper.step(sample)
-        times[k] = time.perf_counter() - started
-    return float(np.median(times))

@@ -10,10 +10,10 @@ from vehest.run.artefacts import find
 from vehest.run.comparison import check_evaluation, check_job, plan_training
 from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.evaluate_faults import fault_figures, write_faulted
 from vehest.run.faults import check_channels, faults_of
-from vehest.run.group import Evaluation, Group
+from vehest.run.group import Group
 from vehest.run.run_cache import RunOptions
 from vehest.run.runner import Runner
 from vehest.run.study_run import open_runner

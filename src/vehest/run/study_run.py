@@ -116,7 +116,7 @@ def run_study(name: str, overrides: Sequence[str], options: RunOptions, cache: R
         if study.publish and not content_overrides(overrides) and error is None and not unfinished:
             gone = {own.name: f"part '{own.name}'" for own in absent} | {own.name: f"data set '{own.name}'" for own in shown.absent}
             publication = Publication(study.study, gone, _keys(study, jobs, gone, runner))
-        lines = list(runner.messages.said)
+        lines = list(runner.messages.printed)
         published = None if runner.dry_run else publish_study(publication, report, runner.messages)
         table = leaderboard(job)
         if table is None:
@@ -163,7 +163,7 @@ def run_sweep(overrides: Sequence[str], name: str | None, options: RunOptions, c
         error = None if runner.dry_run else failed_in([compared], runner)
         if error is None and not runner.dry_run:
             made = [*(own for own in runner.artefacts.values() if own.folder != swept.folder.folder), swept.folder]
-            outcome = Outcome(runner.output, made, list(runner.messages.said), summary, None, first["tracking"], raw)
+            outcome = Outcome(runner.output, made, list(runner.messages.printed), summary, None, first["tracking"], raw)
             cache.save(outcome, runner.messages.warn)
     return Ran(summary, swept.folder.folder, swept.folder.skipped, failed=error)
 

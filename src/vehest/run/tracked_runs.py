@@ -11,8 +11,8 @@ from vehest.data.splits import TRAINING, VALIDATION
 from vehest.estimators.model_files import read_description
 from vehest.run.artefacts import Artefact
 from vehest.run.calibrate import calibration_figures
-from vehest.run.evaluate import read_metrics, read_scored
-from vehest.run.group import Evaluation, Member
+from vehest.run.evaluate import Evaluation, read_metrics, read_scored
+from vehest.run.group import Member
 from vehest.run.tracking import Tracker
 from vehest.run.train import HISTORY, read_fit_metrics
 from vehest.studies.artefacts import read_frame
