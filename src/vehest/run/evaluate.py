@@ -208,8 +208,6 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         for position, estimate in enumerate(estimates):
             write_estimate(estimate, folder / name / f"{position}.parquet")
         scored = score_all(estimates.__getitem__, spans, job.reference, protocol)
-        parts = pieces_of(spans, job.reference, protocol)
-        masks = [regimes_of(reference, piece, protocol) for reference, piece in parts]
         blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
         if protocol.sequence_seconds is not None:
@@ -219,16 +217,16 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
             if estimator.causal:
                 figures["step_seconds"] = _step_seconds(estimator, job.measured(pieces[0]))
         rows += rows_of(head, figures, figure_intervals(blocks[name]))
-        rows += rows_of(head, lever_arm_figures(scored, parts, protocol), condition=CONDITION)
+        rows += rows_of(head, lever_arm_figures(scored, pieces_of(spans, job.reference, protocol), protocol), condition=CONDITION)
+        masks, turns = [], []
+        for reference, piece in pieces_of(spans, job.reference, protocol):
+            masks.append(regimes_of(reference, piece, protocol))
+            turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None)
         if name != VALIDATION:
             for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
                 rows += rows_of(head, own, subset=regime)
         if bands is not None:
             own_bands = banded(scored, bands)
-            turns = [
-                reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None
-                for reference, piece in parts
-            ]
             intervals = coverage_intervals(own_bands, scored, protocol.rate_hz)
             rows += rows_of(head, band_figures(own_bands, scored, turns, protocol.rate_hz), intervals)
             for regime, inside in figures_by_regime(own_bands, masks, protocol.rate_hz).items():

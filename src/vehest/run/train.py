@@ -1,10 +1,13 @@
-"""Third stage: recordings to fitted estimators; members that fit one batch are trained together."""
+"""Third stage: recordings to fitted estimators; members that fit one batch are trained together.
+
+configuration, split, recordings -> TrainJob -> `fit_jobs` -> estimator and record -> `write_model`
+"""
 
 from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,9 +39,9 @@ class TrainJob:
         plan: the artefact it becomes.
         estimator: configuration of the estimator.
         training: configuration of its training.
-        split: what it learns from.
+        split: its training and validation ranges.
         seed: its seed.
-        data: data set -> recordings at the estimator's rate (what the downsample stage made).
+        data: data set -> recordings at the estimator's rate.
     """
 
     plan: StagePlan
@@ -57,7 +60,7 @@ class TrainJob:
 
 
 def new_estimator(config: Mapping[str, Any]) -> Estimator:
-    """An estimator that is not fitted yet.
+    """An estimator before its fit.
 
     Raises:
         ConfigurationError: an unknown name or setting.
@@ -66,7 +69,7 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """What a training would make.
+    """A training and its artefact.
 
     Args:
         config: as composed for ``train``.
@@ -77,9 +80,8 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         ConfigurationError: a setting that makes no sense, a training that does not suit the estimator, or nothing to learn from.
         DataError: the split names a recording that the data set does not have.
     """
-    estimator = new_estimator(config["estimator"])
+    estimator, seed = new_estimator(config["estimator"]), config["seed"]
     settings_from_config(estimator.training_type, config["training"], "training")
-    seed = config["seed"]
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ConfigurationError(f"seed must be a whole number from 0 to 2^63 - 1, not {seed!r}")
     if not estimator.learns:
@@ -88,28 +90,26 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
         raise ConfigurationError(
             f"split '{split.name}' has nothing to train on, and estimator '{estimator.name}' learns; take another split"
         )
-    spans = [*split.train, *split.validation]
-    inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in spans}
-    plan = StagePlan(
-        stage=STAGE,
-        label=f"{estimator.name}-{estimator.variant}-seed{seed}",
-        config={
-            "estimator": dict(config["estimator"]),
-            "training": {key: value for key, value in config["training"].items() if key != "checkpoint_seconds"},
-            "train": [_plain(span) for span in split.train],
-            "validation": [_plain(span) for span in split.validation],
-            "seed": seed,
-            **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
-        },
-        inputs=inputs,
-        code=code_of_training(estimator.name),
-        output=Path(config["output"]),
-    )
+    content = {
+        "estimator": dict(config["estimator"]),
+        "training": {key: value for key, value in config["training"].items() if key != "checkpoint_seconds"},
+        **{role: [_plain(span) for span in spans] for role, spans in (("train", split.train), ("validation", split.validation))},
+        "seed": seed,
+        **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
+    }
+    inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in (*split.train, *split.validation)}
+    label = f"{estimator.name}-{estimator.variant}-seed{seed}"
+    plan = StagePlan(STAGE, label, content, inputs, code_of_training(estimator.name), Path(config["output"]))
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
 
 
+def _plain(span: Span) -> dict[str, str]:
+    """A range as plain text, since JSON has no infinity."""
+    return {"dataset": span.dataset, "recording": span.recording, "start": str(span.start), "stop": str(span.stop)}
+
+
 def code_of_training(estimator: str) -> str:
-    """Version of what a training of an estimator runs.
+    """Version of a training of an estimator.
 
     Raises:
         ConfigurationError: the name is unknown.
@@ -123,18 +123,17 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
     Raises:
         DataError: the recordings do not fit the estimator.
     """
-    first = jobs[0]
-    members = []
-    for job in jobs:
-        member = new_estimator(job.estimator)
+    first, members = jobs[0], [new_estimator(job.estimator) for job in jobs]
+    for member, job in zip(members, jobs, strict=True):
         member.seed(job.seed)
-        members.append(member)
     training: Any = settings_from_config(members[0].training_type, first.training, "training")
-    fit_data = FitData(
-        [load_span(first.data, span) for span in first.split.train], [load_span(first.data, s) for s in first.split.validation]
-    )
-    records = type(members[0]).fit_members(members, fit_data, training, context)
+    train, validation = ([_load(first.data, span) for span in spans] for spans in (first.split.train, first.split.validation))
+    records = type(members[0]).fit_members(members, FitData(train, validation), training, context)
     return list(zip(members, records, strict=True))
+
+
+def _load(data: Mapping[str, Artefact], span: Span) -> Recording:
+    return read_recording(recording_file(data[span.dataset], span)).cut(span.start, span.stop)
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
@@ -156,10 +155,30 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
         _write_csv(folder / file, ["metric", "value"], [item for item in metrics.items() if item[0].endswith("_seconds") is timed])
 
 
+def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
+    """Method and transforms of the recordings, as in ``downsample`` of the configuration."""
+    config = next(iter(data.values())).config  # the same for all data sets of a job
+    return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    with open(path, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+
+
+def read_fit_metrics(folder: Path) -> dict[str, float]:
+    """Figures of a fit, such as ``epochs``, and its times.
+
+    Raises:
+        MissingError: they are not there.
+        DataError: they are damaged.
+    """
+    paths = (folder / FIT_METRICS, folder / TIMINGS)
+    return {row["metric"]: number_in(row, "value", path) for path in paths for row in read_rows(path, ("metric", "value"))}
+
+
 @dataclass(frozen=True)
 class _Range:
-    """A range as the manifest of a model names it; times as text, since JSON knows no infinity."""
-
     dataset: str
     recording: str
     start: str
@@ -184,7 +203,7 @@ def trained_rate(model: Artefact) -> float:
     """The rate that a model works at [Hz].
 
     Raises:
-        DataError: its manifest does not tell.
+        DataError: its manifest lacks it.
     """
     return _trained(model).estimator.rate_hz
 
@@ -193,10 +212,10 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
     """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles.
 
     Raises:
-        DataError: its manifest does not tell.
+        DataError: its manifest lacks them.
     """
-    told = _trained(model)
-    ranges = [own for role in roles or ("train", "validation") for own in getattr(told, role)]
+    trained = _trained(model)
+    ranges = [own for role in roles or ("train", "validation") for own in getattr(trained, role)]
     try:
         return [Span(r.dataset, r.recording, float(r.start), float(r.stop)) for r in ranges]
     except (ValueError, ConfigurationError) as error:
@@ -207,28 +226,8 @@ def _trained(model: Artefact) -> _Trained:
     return validated(_Trained, dict(model.config), f"'{model.folder / MANIFEST}'", group="config")
 
 
-def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
-    """How the recordings were brought to the estimator's rate, as ``downsample`` of the configuration says it."""
-    config = next(iter(data.values())).config  # the same for all data sets of a job
-    return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
-
-
-def read_fit_metrics(folder: Path) -> dict[str, float]:
-    """Figures of a fit, such as ``epochs``, and its times.
-
-    Raises:
-        MissingError: they are not there.
-        DataError: they are damaged.
-    """
-    return {
-        row["metric"]: number_in(row, "value", path)
-        for path in (folder / FIT_METRICS, folder / TIMINGS)
-        for row in read_rows(path, ("metric", "value"))
-    }
-
-
 def recording_file(data: Artefact, span: Span) -> Path:
-    """Where the recording of a span is stored.
+    """The stored recording of a span.
 
     Raises:
         DataError: the data set does not have it.
@@ -248,19 +247,3 @@ def file_digest(data: Artefact, span: Span) -> str:
         known = ", ".join(sorted(Path(file).stem for file in data.outputs))
         raise DataError(f"data set '{span.dataset}' has no recording '{span.recording}' (it has {known}); correct the split")
     return data.outputs[name]
-
-
-def load_span(data: Mapping[str, Artefact], span: Span) -> Recording:
-    """The samples of a span."""
-    return read_recording(recording_file(data[span.dataset], span)).cut(span.start, span.stop)
-
-
-def _plain(span: Span) -> dict[str, Any]:
-    return {"dataset": span.dataset, "recording": span.recording, "start": str(span.start), "stop": str(span.stop)}
-
-
-def _write_csv(path: Path, header: Sequence[str], rows: Any) -> None:
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)
