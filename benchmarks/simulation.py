@@ -85,7 +85,7 @@ def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
         started = time.perf_counter()
         artefact = Runner(Path(folder), Messages(quiet=True), StopSignals(), jobs).ingest(config)
         seconds = time.perf_counter() - started
-        n_drives = outcome_of(artefact).drives
+        n_drives = outcome_of(artefact)["drives"]
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return seconds, peak * 1024 / 1e6, n_drives
 

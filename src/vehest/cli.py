@@ -223,7 +223,7 @@ def simulate(
     config = simulation_config(dataset, overrides or [])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
         artefact = runner.ingest(config)
-    outcome = outcome_of(artefact).as_plain()
+    outcome = outcome_of(artefact)
     if not as_json:
         outcome |= {name: counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
     emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})

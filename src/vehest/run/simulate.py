@@ -1,9 +1,8 @@
-"""Simulated data sets: how they are asked for, and how their drives went."""
+"""Simulated data sets: their configuration, and how their drives ended."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
@@ -11,29 +10,6 @@ from vehest.data.store import read_recording
 from vehest.run.artefacts import Artefact
 from vehest.run.config import Config, compose_config, key_of
 from vehest.sources.base import SIMULATED
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How the drives of one data set went.
-
-    Args:
-        drives: how many there are.
-        hours: of them all.
-        spun: names of those in which the car span.
-        left_road: names of those in which it left the road.
-        not_completed: names of those that ended before their manoeuvre did, for whatever reason.
-    """
-
-    drives: int
-    hours: float
-    spun: Sequence[str]
-    left_road: Sequence[str]
-    not_completed: Sequence[str]
-
-    def as_plain(self) -> dict[str, Any]:
-        """As JSON knows it."""
-        return asdict(self)
 
 
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
@@ -49,20 +25,19 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
     return config
 
 
-def outcome_of(ingested: Artefact) -> Outcome:
-    """How the drives went, from what their recordings say of it.
+def outcome_of(ingested: Artefact) -> dict[str, Any]:
+    """Number and hours of the drives, and the names of those that span, left the road or ended before their manoeuvre did.
 
     Raises:
         DataError: a recording is damaged.
     """
-    hours, names = 0.0, []
+    hours = 0.0
     flagged: dict[str, list[str]] = {"spun": [], "left_road": [], "not_completed": []}
     for name in sorted(ingested.outputs):
         recording = read_recording(ingested.folder / name, ["vx"])
         flags: Mapping[str, Any] = recording.provenance.get("flags", {})
         hours += len(recording) / recording.rate_hz / 3600.0
-        names.append(recording.id)
         for flag, holds in (("spun", flags.get("spun")), ("left_road", flags.get("left_road")), ("not_completed", not flags["completed"])):
             if holds:
                 flagged[flag].append(recording.id)
-    return Outcome(len(names), hours, **flagged)
+    return {"drives": len(ingested.outputs), "hours": hours, **flagged}
