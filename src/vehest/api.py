@@ -76,7 +76,7 @@ def train(
         train: recordings to learn from, with ``vy_ref``, at any rate from the estimator's upwards.
         validation: recordings that decide when to stop, of the same kind; may be the same objects where the method does not stop early.
         overrides: as of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``.
-        seed: of whatever is random.
+        seed: of all random numbers.
 
     Raises:
         ConfigurationError: an unknown name or setting.

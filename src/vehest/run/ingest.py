@@ -92,7 +92,11 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
     tasks = [Task(recording_id, partial(_make_part, dict(config["dataset"]), recording_id, parts)) for recording_id in missing]
     done, failures = len(ids) - len(missing), []
-    for end in launch(tasks, jobs, stop, lambda at, _: report(done, len(ids), tasks[at].name)):
+
+    def begun(at: int, _: object) -> None:
+        report(done, len(ids), tasks[at].name)
+
+    for end in launch(tasks, jobs, stop, begun):
         if isinstance(end.outcome, Failure):
             failures.append(end.outcome)
         else:
