@@ -519,8 +519,8 @@ def report(
         bool,
         typer.Option(
             "--check",
-            help="Draw nothing; list published results in ./results, of all or the named studies, that differ from today's code, configuration "
-            "and data.",
+            help="Draw nothing; list published results in ./results, of all or the named studies, that differ from today's code, "
+            "configuration and data.",
         ),
     ] = False,
     dry_run: DryRun = False,
@@ -628,7 +628,7 @@ def prune(
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
     found = unnamed(Path(str(config["output"])))
     total = sum(one.size for one in found)
-    shown = [TerminalTable("", ("no present key names", "size", "age", "since"), [one.in_words() for one in found])] if found else []
+    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), [one.in_words() for one in found])] if found else []
     emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {size_in_words(total)}" if found else "nothing to remove"])
     removed: list[str] = []
     if found and not dry_run:

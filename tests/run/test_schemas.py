@@ -251,13 +251,13 @@ def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
 
 def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path: Path) -> None:
     artefact = made(tmp_path)
-    with pytest.raises(DataError, match=r"manifest\.json': config\.estimator is missing"):
+    with pytest.raises(DataError, match=r"manifest\.json': config describes no training \('train'\)"):
         learnt_spans(artefact)
     entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
     config = {"estimator": {"rate_hz": 20}, "train": [entry], "validation": []}
     told = Artefact(**{**artefact.__dict__, "config": config})
     assert trained_rate(told) == 20.0
-    with pytest.raises(DataError, match="name no ranges"):
+    with pytest.raises(DataError, match="describes no training"):
         learnt_spans(told)
 
 

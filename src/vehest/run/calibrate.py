@@ -36,14 +36,7 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 @dataclass(frozen=True)
 class CalibrateJob:
-    """One model to calibrate on the training and validation ranges of a split.
-
-    Args:
-        plan: the artefact it becomes.
-        model: of the train stage.
-        split: with a validation range.
-        data: data set -> recordings at the model's rate, references included.
-    """
+    """One model to calibrate on the training and validation ranges of a split."""
 
     plan: StagePlan
     model: Artefact
@@ -53,12 +46,6 @@ class CalibrateJob:
 
 def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path) -> CalibrateJob | None:
     """The calibration of a model; none where a split has no validation range.
-
-    Args:
-        model: of the train stage.
-        split: that the model was trained on; of a model that learns nothing, any.
-        data: data set -> recordings at the model's rate.
-        output: the output root.
 
     Raises:
         DataError: the split names a recording that the data set does not have.

@@ -74,11 +74,6 @@ class ComparedFiles:
 def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
     """Score estimates of other tools, and models, on one recording.
 
-    Args:
-        recording: file with its reference.
-        words: tables of estimates and overrides of conf/estimate.yaml.
-        models: to run on it; one that was trained on it gets a warning.
-
     Raises:
         ConfigurationError: two estimates have the same name.
         MissingError: a file or model is not there.
@@ -106,10 +101,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
 
     Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
     β is there, v = u tan β with the recording's u.
-
-    Args:
-        file: table with a column of time, on the recording's clock.
-        vx: the recording.
 
     Raises:
         MissingError: there is no such file.
@@ -158,14 +149,9 @@ def _unit_in(name: str) -> str | None:
 
 
 def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_hz: float = 20.0) -> ComparedFiles:
-    """Score estimates where all of them have values, beside v = 0 and a static map.
+    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
-
-    Args:
-        drive: with ``vx``, ``vy_ref`` and, for the map, ``yaw_rate``.
-        estimates: name -> estimate on the clock of ``drive``.
-        rate_hz: at which all are read.
 
     Raises:
         DataError: no reference, too little in common, or gaps within what is in common.
@@ -190,10 +176,10 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
     for words in ("**", " over its seeds", " and over seeds"):
         verdict = verdict.replace(words, "")
     rows = []
-    for name in ranking.order:
-        errors = accuracy([scored[name]])
+    for ranked in ranking.order:
+        errors = accuracy([scored[ranked]])
         figures = {key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}
-        rows.append({"estimate": name[0], **figures, **standing_columns(ranking, name)})
+        rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
     return ComparedFiles(rows, verdict, start, stop, reference.rate_hz)
 
 

@@ -14,11 +14,6 @@ def complete_override(command: str, given: list[str], incomplete: str) -> list[t
     """Candidates for the word being typed, each with a line of help.
 
     Shells that break words at ``=`` (bash) pass ``estimator``, ``=``, ``gru`` as three words; they get the value alone.
-
-    Args:
-        command: whose configuration is overridden, for example ``train``.
-        given: words before, of the overrides.
-        incomplete: the word being typed.
     """
     groups, options = _content(command, given)
 

@@ -14,10 +14,6 @@ from vehest.sources.download import Outcome, download_of
 def download_files(config: Config, runner: Runner) -> None:
     """Fetch missing files of a data set, and record or compare the checksums of the others.
 
-    Args:
-        config: as composed for ``ingest``.
-        runner: its messages and dry run apply.
-
     Raises:
         ConfigurationError: the data set names no source of its files.
         DataError: a file has other bytes than recorded.

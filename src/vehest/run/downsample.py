@@ -19,12 +19,6 @@ VERSION = "1"
 def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
     """The artefact of a downsampling.
 
-    Args:
-        ingested: of the ingest stage.
-        rate_hz: new rate [Hz].
-        options: ``downsample`` of the configuration.
-        output: the output root.
-
     Raises:
         ConfigurationError: a rate, method or transform that makes no sense.
     """

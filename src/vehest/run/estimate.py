@@ -58,10 +58,7 @@ def pretrained_note() -> str:
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
 
-    Args:
-        name: path or start of the name.
-        output: the output root.
-        say: called with a remark if several models fit, of which the newest is taken.
+    Of several models the newest is taken, with a remark to ``say``.
 
     Raises:
         MissingError: there is none.
@@ -170,11 +167,6 @@ def preparation_of(model_folder: Path) -> dict[str, Any]:
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
     """Read a recording from its file, a table unless the data set says otherwise, as conf/estimate.yaml and overrides describe it.
 
-    Args:
-        path: the file.
-        overrides: of conf/estimate.yaml.
-        references: whether reference channels that the data set declares are read.
-
     Raises:
         MissingError: there is no such file.
         DataError: it cannot be used as it is.
@@ -219,11 +211,6 @@ def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -
 
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`).
-
-    Args:
-        model: fitted.
-        recording: with the channels that the model reads, at any rate from the model's upwards.
-        trust: of the model; without it there is neither band nor health of channels.
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.

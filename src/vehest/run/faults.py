@@ -59,13 +59,7 @@ class FaultSettings:
         return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
 
     def within(self, start: float, length: float, position: int) -> Fault:
-        """The fault in one of the ranges, or sequences, of a test set; random numbers differ between them.
-
-        Args:
-            start: of the range, after the first sample that the estimator gets [s].
-            length: of the range [s].
-            position: of the range among those of its test set.
-        """
+        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length`` [s] long; each draws anew."""
         drawn = np.random.default_rng([self.seed, position])
         own_start = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
         if own_start < 0:

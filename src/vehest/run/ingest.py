@@ -28,16 +28,14 @@ from vehest.training.context import Progress
 
 STAGE = "ingest"
 VERSION = "1"
+PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
-Report = Callable[[int, int, str], None]
+Report = Callable[[int, int, str], None]  # recordings done, recordings in all, name of one that was begun
 PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; samples do not depend on it
 
 
 def plan_ingest(config: Config) -> StagePlan:
     """The artefact of an ingest.
-
-    Args:
-        config: as composed for ``ingest``.
 
     Raises:
         MissingError: the raw files are not there.
@@ -66,14 +64,6 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     """Read every recording, check it, and write it into ``folder``.
 
     Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
-
-    Args:
-        config: as composed for ``ingest``.
-        plan: of this ingest.
-        folder: empty.
-        jobs: processes.
-        stop: no recording is begun after a signal.
-        report: called with (recordings done, recordings in all, name of one that was begun).
 
     Raises:
         DataError: a recording cannot be used as it is.
@@ -151,7 +141,7 @@ def drop_parts(plan: StagePlan) -> None:
 
 
 def _parts_of(plan: StagePlan) -> Path:
-    return plan.folder.with_name(f".parts-{plan.folder.name}")
+    return plan.folder.with_name(f"{PARTS_PREFIX}{plan.folder.name}")
 
 
 def recording_file(recording_id: str) -> str:

@@ -49,12 +49,6 @@ def replay_log(
 ) -> dict[str, Any]:
     """Replay a log and let a model estimate; returns its figures.
 
-    Args:
-        words: options of the command.
-        overrides: of conf/estimate.yaml.
-        stopped: whether to end early.
-        say: called with a remark if several models have the name.
-
     Raises:
         ConfigurationError: words that make no sense together.
         MissingError: log, DBC, model, bus or a package is not there.

@@ -29,12 +29,7 @@ class TerminalSummary:
 
 
 def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
-    """The overview of a study in parts, or of recordings alone.
-
-    Args:
-        overview: as the report shows it.
-        left_out: name of a failed or unfinished job -> why.
-    """
+    """The overview of a study in parts, or of recordings alone."""
     rows = tuple(tuple(_cell(value) for value in row) for row in overview.itertuples(index=False))
     table = TerminalTable("", tuple(str(name) for name in overview.columns), rows)
     figures = {"overview": _records(overview)} | _failed(left_out)
@@ -42,14 +37,7 @@ def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> 
 
 
 def summary_of_leaderboard(title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]) -> TerminalSummary:
-    """The leaderboard of a study, a table a test set, with the study's verdict.
-
-    Args:
-        title: of the study.
-        board: one row an estimator and test set.
-        left_out: name of a failed or unfinished job -> why.
-        verdict: a line each.
-    """
+    """The leaderboard of a study, a table a test set, with the study's verdict."""
     header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
     tables, notes = [], []
     for test_set, rows in board.groupby("test_set", sort=False):

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.data.schema import FURTHER_KEYS, settings_from_config, validated
+from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
-from vehest.data.text_files import number_in, read_rows
+from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
@@ -29,6 +29,8 @@ STAGE = "train"
 VERSION = "1"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -70,11 +72,6 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
     """A training and its artefact.
-
-    Args:
-        config: as composed for ``train``.
-        split: ranges to learn from; not recorded for an estimator that learns nothing.
-        data: data set -> recordings at the estimator's rate.
 
     Raises:
         ConfigurationError: a setting that makes no sense, a training that does not suit the estimator, or nothing to learn from.
@@ -177,35 +174,13 @@ def read_fit_metrics(folder: Path) -> dict[str, float]:
     return {row["metric"]: number_in(row, "value", path) for path in paths for row in read_rows(path, ("metric", "value"))}
 
 
-@dataclass(frozen=True)
-class _Range:
-    dataset: str
-    recording: str
-    start: str
-    stop: str
-
-
-@dataclass(frozen=True)
-class _Rate:
-    __pydantic_config__ = FURTHER_KEYS
-    rate_hz: float
-
-
-@dataclass(frozen=True)
-class _Trained:
-    __pydantic_config__ = FURTHER_KEYS
-    estimator: _Rate
-    train: tuple[_Range, ...]
-    validation: tuple[_Range, ...]
-
-
 def trained_rate(model: Artefact) -> float:
     """The rate that a model works at [Hz].
 
     Raises:
         DataError: its manifest lacks it.
     """
-    return _trained(model).estimator.rate_hz
+    return _from_manifest(model, lambda config: float(config["estimator"]["rate_hz"]))
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
@@ -214,16 +189,19 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
     Raises:
         DataError: its manifest lacks them.
     """
-    trained = _trained(model)
-    ranges = [own for role in roles or ("train", "validation") for own in getattr(trained, role)]
+
+    def ranges(config: Mapping[str, Any]) -> list[Span]:
+        named = [own for role in roles or ("train", "validation") for own in config[role]]
+        return [Span(str(own["dataset"]), str(own["recording"]), float(own["start"]), float(own["stop"])) for own in named]
+
+    return _from_manifest(model, ranges)
+
+
+def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T:
     try:
-        return [Span(r.dataset, r.recording, float(r.start), float(r.stop)) for r in ranges]
-    except (ValueError, ConfigurationError) as error:
-        raise DataError(f"'{model.folder / MANIFEST}': config.train and config.validation name no ranges ({error})") from None
-
-
-def _trained(model: Artefact) -> _Trained:
-    return validated(_Trained, dict(model.config), f"'{model.folder / MANIFEST}'", group="config")
+        return read(model.config)
+    except (LookupError, TypeError, ValueError, ConfigurationError) as error:
+        raise DataError(f"'{model.folder / MANIFEST}': config describes no training ({first_line(error)})") from None
 
 
 def recording_file(data: Artefact, span: Span) -> Path:
