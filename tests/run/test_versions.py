@@ -11,7 +11,8 @@ from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.calibrate import code_of_calibration
 from vehest.run.downsample import code_of_downsampling
-from vehest.run.evaluate import code_of_evaluation, code_under_faults
+from vehest.run.evaluate import code_of_evaluation
+from vehest.run.evaluate_faults import code_under_faults
 from vehest.run.ingest import code_of_ingest
 from vehest.run.report import code_of_report
 from vehest.run.sweep import code_of_sweep

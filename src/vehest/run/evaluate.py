@@ -1,13 +1,15 @@
 """Evaluates fitted estimators: estimates and metrics, all read on one grid of times.
 
 model, calibration, recordings -> estimates of each test set -> scored at the evaluation rate -> metrics.csv, timings.csv, blocks.csv
+
+Every fault adds rows under a condition of its own; without faults, key and files are those of an evaluation that knows none.
 """
 
 from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -41,17 +43,19 @@ from vehest.evaluation.metrics import (
     sequences,
 )
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
+from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
+from vehest.run.evaluate_faults import code_under_faults, errors_and_flags, guarded_estimates, infinite_from
 from vehest.run.faults import FaultSettings
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
 from vehest.run.versions import version_of_estimator
 from vehest.studies.artefacts import read_frame
 from vehest.trust.bands import Bands, with_bands
-from vehest.trust.record import read_trust
+from vehest.trust.faults import is_fault
+from vehest.trust.record import Trust, read_trust
 
 STAGE = "evaluate"
 VERSION = "1"
-VERSION_OF_FAULTS = "1"
 METRICS = "metrics.csv"
 BLOCKS = "blocks.csv"
 TIMES = ("train_seconds", "step_seconds")
@@ -167,6 +171,10 @@ class EvaluateJob:
         """The state that the protocol passes to an estimator at the start of a piece, if any."""
         return reference_state(self.reference(piece), piece) if self.how.protocol.initial_state else None
 
+    def score(self, spans: Sequence[Span], estimates: Sequence[Estimate]) -> list[Scored]:
+        """Estimates of a test set beside the reference."""
+        return score_all(estimates.__getitem__, spans, self.reference, self.how.protocol)
+
 
 def code_of_evaluation(estimator: str) -> str:
     """Version of an evaluation of an estimator.
@@ -175,11 +183,6 @@ def code_of_evaluation(estimator: str) -> str:
         ConfigurationError: the name is unknown.
     """
     return f"evaluate={VERSION} {version_of_estimator(estimator)}"
-
-
-def code_under_faults(code: str) -> str:
-    """Version of an evaluation under faults, from that without them."""
-    return f"{code} faults={VERSION_OF_FAULTS}"
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:
@@ -193,21 +196,23 @@ def scored_spans(split: Split) -> list[Span]:
 
 
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
-    """Estimate and score every range; write estimates, metrics and, in a file of their own, times into ``folder``."""
+    """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
     estimator, protocol = load_model(job.model.folder), job.how.protocol
     fit = _fit_of(job.model, estimator)
-    bands = None if job.calibration is None else read_trust(job.calibration.folder).bands
+    trust = None if job.calibration is None else read_trust(job.calibration.folder)
+    bands = None if trust is None else trust.bands
     rows: list[dict[str, Any]] = []
+    under_faults: list[dict[str, Any]] = []
     blocks = {}
     for name, spans in test_sets(job.how.split).items():
-        head = head_of(job, estimator, name, spans)
+        head = _head(job, estimator, name, spans)
         pieces = sequences(spans, job.reference, protocol)
         estimates = _estimates(estimator, job, pieces)
         if bands is not None:
             estimates = [_with_bands(*pair, bands, job, name) for pair in zip(estimates, pieces, strict=True)]
         for position, estimate in enumerate(estimates):
             write_estimate(estimate, folder / name / f"{position}.parquet")
-        scored = score_all(estimates.__getitem__, spans, job.reference, protocol)
+        scored = job.score(spans, estimates)
         blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
         if protocol.sequence_seconds is not None:
@@ -216,28 +221,58 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
             figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, job, spans)
             if estimator.causal:
                 figures["step_seconds"] = _step_seconds(estimator, job.measured(pieces[0]))
-        rows += rows_of(head, figures, figure_intervals(blocks[name]))
-        rows += rows_of(head, lever_arm_figures(scored, pieces_of(spans, job.reference, protocol), protocol), condition=CONDITION)
-        masks, turns = [], []
-        for reference, piece in pieces_of(spans, job.reference, protocol):
-            masks.append(regimes_of(reference, piece, protocol))
-            turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None)
-        if name != VALIDATION:
-            for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
-                rows += rows_of(head, own, subset=regime)
-        if bands is not None:
-            own_bands = banded(scored, bands)
-            intervals = coverage_intervals(own_bands, scored, protocol.rate_hz)
-            rows += rows_of(head, band_figures(own_bands, scored, turns, protocol.rate_hz), intervals)
-            for regime, inside in figures_by_regime(own_bands, masks, protocol.rate_hz).items():
-                rows += rows_of(head, inside, subset=regime)
+        rows += _rows(head, figures, figure_intervals(blocks[name]))
+        rows += _rows_of_parts(job, head, spans, scored, bands)
+        under_faults += _rows_under_faults(estimator, job, head, spans, scored, trust)
     rows += _training_rows(estimator, job)
     write_segments(folder / BLOCKS, blocks)
-    write_rows(folder / METRICS, (row for row in rows if row["metric"] not in TIMES))
-    write_rows(folder / TIMINGS, (row for row in rows if row["metric"] in TIMES))
+    for file, timed in ((METRICS, False), (TIMINGS, True)):
+        with open(folder / file, "w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(row for row in rows + under_faults if (row["metric"] in TIMES) is timed)
 
 
-def head_of(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
+def _rows_of_parts(
+    job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], scored: Sequence[Scored], bands: Bands | None
+) -> list[dict[str, Any]]:
+    """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
+    protocol, masks, turns = job.how.protocol, [], []
+    for reference, piece in pieces_of(spans, job.reference, protocol):
+        masks.append(regimes_of(reference, piece, protocol))
+        turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None)
+    rows = _rows(head, lever_arm_figures(scored, pieces_of(spans, job.reference, protocol), protocol), condition=CONDITION)
+    if head["test_set"] != VALIDATION:
+        for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
+            rows += _rows(head, own, subset=regime)
+    if bands is not None:
+        within = banded(scored, bands)
+        intervals = coverage_intervals(within, scored, protocol.rate_hz)
+        rows += _rows(head, band_figures(within, scored, turns, protocol.rate_hz), intervals)
+        for regime, own in figures_by_regime(within, masks, protocol.rate_hz).items():
+            rows += _rows(head, own, subset=regime)
+    return rows
+
+
+def _rows_under_faults(
+    estimator: Estimator, job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
+) -> list[dict[str, Any]]:
+    """Rows of one test set under each fault."""
+    if not job.how.faults:
+        return []
+    rows: list[dict[str, Any]] = []
+    pieces = [(piece, job.measured(piece), job.state(piece)) for piece in sequences(spans, job.reference, job.how.protocol)]
+    other_vehicle = head["test_set"] in job.how.protocol.sets_elsewhere
+    for fault in job.how.faults:
+        guarded, windows = guarded_estimates(fault, estimator, pieces, trust, other_vehicle=other_vehicle)
+        scored = job.score(spans, infinite_from(windows, guarded))
+        errors = errors_and_flags(scored, nominal, guarded, windows, job.how.protocol.rate_hz, flagged=trust is not None)
+        for subset, own in errors.items():
+            rows += _rows(head, own, units=UNITS_UNDER_FAULT, subset=subset, condition=fault.condition)
+    return rows
+
+
+def _head(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
     """The columns that rows of one test set have in common."""
     about = read_description(job.model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
@@ -248,7 +283,7 @@ def head_of(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[S
     return dict(zip(HEAD, (*model, *test), strict=True))
 
 
-def rows_of(
+def _rows(
     head: Mapping[str, Any],
     figures: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]] | None = None,
@@ -262,15 +297,6 @@ def rows_of(
         row = {"metric": metric, "value": repr(float(value)), "unit": units[metric], "low": low, "high": high}
         rows.append({**head, **columns, **row})
     return rows
-
-
-def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows of `COLUMNS`, behind those of an existing file."""
-    with open(path, "a", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        if not stream.tell():
-            writer.writeheader()
-        writer.writerows(rows)
 
 
 def _fit_of(model: Artefact, estimator: Estimator) -> dict[str, float]:
@@ -333,10 +359,10 @@ def _training_rows(estimator: Estimator, job: EvaluateJob) -> list[dict[str, Any
         if not pieces:
             return []
         estimates = _estimates(estimator, job, pieces)
-        figures = accuracy(score_all(estimates.__getitem__, spans, job.reference, job.how.protocol))
+        figures = accuracy(job.score(spans, estimates))
     except DataError:
         return []
-    return rows_of(head_of(job, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
+    return _rows(_head(job, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
 
 
 def read_metrics(folder: Path) -> pd.DataFrame:
@@ -348,6 +374,13 @@ def read_metrics(folder: Path) -> pd.DataFrame:
     """
     tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
     return pd.concat([table for table in tables if len(table)], ignore_index=True)
+
+
+def fault_figures(folder: Path) -> dict[str, float]:
+    """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` -> value."""
+    rows = read_frame(folder / METRICS, COLUMNS, numbers=("value",)).to_dict("records")
+    shown = [row for row in rows if is_fault(row["condition"]) and row["test_set"] != VALIDATION]
+    return {".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): float(row["value"]) for row in shown}
 
 
 def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:

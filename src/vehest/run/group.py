@@ -17,8 +17,7 @@ from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
 from vehest.run.calibrate import CalibrateJob, plan_calibrate, write_calibration
-from vehest.run.evaluate import Evaluation
-from vehest.run.evaluate_faults import write_faulted
+from vehest.run.evaluate import Evaluation, write_evaluation
 from vehest.run.locks import Waiting, held, held_at_once
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
@@ -189,5 +188,5 @@ def _followed_up(
             calibration = made(calibrating.plan, partial(write_calibration, calibrating))
         if group.evaluation is not None and (calibrating is None or calibration is not None) and not should_stop():
             scoring = group.evaluation.of(model, calibration)
-            evaluation = made(scoring.plan, partial(write_faulted, scoring))
+            evaluation = made(scoring.plan, partial(write_evaluation, scoring))
     return Member(job, model, evaluation, calibration)

@@ -22,7 +22,7 @@ from typing import Any
 from vehest.data.errors import VehestError
 from vehest.data.files import ASIDE_PREFIX, aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
-from vehest.run import calibrate, downsample, evaluate, ingest, report, sweep, train
+from vehest.run import calibrate, downsample, evaluate, evaluate_faults, ingest, report, sweep, train
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.run_cache import FINISHED
 
@@ -161,7 +161,7 @@ def _code_of(artefact: Artefact, models: Sequence[Artefact]) -> str | None:
             if artefact.stage == calibrate.STAGE:
                 return calibrate.code_of_calibration(estimator)
             code = evaluate.code_of_evaluation(estimator)
-            return evaluate.code_under_faults(code) if "faults" in config else code
+            return evaluate_faults.code_under_faults(code) if "faults" in config else code
         if artefact.stage == sweep.STAGE:
             return sweep.code_of_sweep()
         return report.code_of_report(str(config["module"]))

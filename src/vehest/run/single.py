@@ -10,8 +10,7 @@ from vehest.run.artefacts import find
 from vehest.run.comparison import check_evaluation, check_job, plan_training
 from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import Evaluation, protocol_from_config
-from vehest.run.evaluate_faults import fault_figures, write_faulted
+from vehest.run.evaluate import Evaluation, fault_figures, protocol_from_config, write_evaluation
 from vehest.run.faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.run_cache import RunOptions
@@ -79,7 +78,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         calibration = runner.calibration(trained, split, data)
         how = Evaluation(split, data, references, runner.kinds_of(split, config), protocol, runner.output, faults)
         scoring = how.of(trained, calibration)
-        artefact = runner.ensure(scoring.plan, lambda folder: write_faulted(scoring, folder))
+        artefact = runner.ensure(scoring.plan, lambda folder: write_evaluation(scoring, folder))
         if runner.tracker is not None:
             if calibration is not None:
                 log_calibration(runner.tracker, calibration)
