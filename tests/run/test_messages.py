@@ -197,8 +197,8 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
         ("range(nan,5)", "cannot be read"),
         ("range(0)", "stands for no value"),
         ("choice()", "cannot be read"),
-        ("interval(0,1)", "an interval cannot be counted"),
-        ("glob(*)", "list the values of an option"),
+        ("interval(0,1)", "cannot be read"),
+        ("glob(*)", "stands for no value"),
         ("9" * 5000, "cannot be read"),
     ],
 )

@@ -78,19 +78,12 @@ def write_calibration(job: CalibrateJob, folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A range to learn from, with the part of its recording before it.
+    """A range to learn from, with the part of its recording before it."""
 
-    Args:
-        recording: at the model's rate, from `WARM_UP_SECONDS` before the range if it is that long, references included.
-        start: of the range [s].
-        dataset: of the recording; may be empty.
-        name: of the range, for people.
-    """
-
-    recording: Recording
-    start: float
-    dataset: str
-    name: str
+    recording: Recording  # at the model's rate, from `WARM_UP_SECONDS` before the range if it is that long, references included
+    start: float  # of the range [s]
+    dataset: str  # of the recording; may be empty
+    name: str  # for people
 
     @property
     def range(self) -> Recording:

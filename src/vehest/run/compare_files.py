@@ -49,18 +49,11 @@ LEAST_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class ComparedFiles:
-    """Estimates of one recording, ranked.
+    """Estimates of one recording, ranked."""
 
-    Args:
-        rows: one an estimate, the lowest RMSE(β) first: name, metrics and ranking.
-        verdict: a sentence.
-        start, stop: of the scored part [s].
-        rate_hz: of the scored samples.
-    """
-
-    rows: Sequence[Mapping[str, Any]]
+    rows: Sequence[Mapping[str, Any]]  # one an estimate, the lowest RMSE(β) first: name, metrics and ranking
     verdict: str
-    start: float
+    start: float  # of the scored part [s]
     stop: float
     rate_hz: float
 

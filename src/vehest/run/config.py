@@ -201,10 +201,6 @@ def _values(override: Override) -> list[str]:
     if not override.is_sweep_override():
         return [str(override.input_line)]
     text, value = _shortened(override.input_line), override.value()
-    if override.is_interval_sweep():
-        raise ConfigurationError(f"'{text}': an interval cannot be counted; list values, or use range(…)")
-    if isinstance(value, Glob) and override.key_or_group not in GROUPS:
-        raise ConfigurationError(f"'{text}': glob is for {', '.join(GROUPS)}; list the values of an option")
     try:
         found = value.filter(choices(override.key_or_group)) if isinstance(value, Glob) else override.sweep_string_iterator()
         values = list(islice(found, current_limits().jobs + 1))

@@ -6,7 +6,6 @@ import importlib.util
 import os
 import platform
 import shutil
-import sysconfig
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,7 +40,7 @@ def examine() -> list[Item]:
 
 
 def _installation() -> Iterator[Item]:
-    """Libraries, configuration, compilers and extras."""
+    """Libraries, configuration and extras."""
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
     missing = [folder for folder in (packaged_conf(), packaged_pipelines()) if not folder.is_dir()]
@@ -56,13 +55,6 @@ def _installation() -> Iterator[Item]:
     (value * value).sum().backward()
     yield Item("ok", "torch", f"{torch.__version__}, autograd works")
     yield _kernels()
-    compiler = next((path for name in ("c++", "g++", "clang++") if (path := shutil.which(name))), None)
-    if compiler is None:
-        yield Item("warning", "C++ compiler", "none found; torch.compile is not available, the eager path is used")
-    elif not (Path(sysconfig.get_paths()["include"]) / "Python.h").is_file():
-        yield Item("warning", "C++ compiler", f"{compiler}, but Python's headers are missing; torch.compile is not available")
-    else:
-        yield Item("ok", "C++ compiler", compiler)
     absent = [f"{use} need 'vehest[{extra}]'" for extra, (package, use) in EXTRAS.items() if importlib.util.find_spec(package) is None]
     if absent:
         yield Item("warning", "extras", f"{'; '.join(absent)}: pip install it where you need it")

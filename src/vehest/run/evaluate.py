@@ -93,22 +93,12 @@ def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How models are evaluated.
-
-    Args:
-        split: its validation range and tests are scored.
-        data: data set -> recordings at the estimator's rate.
-        references: data set -> recordings at the evaluation rate.
-        kinds: data set -> ``real`` or ``simulated``.
-        protocol: of the scores.
-        output: the output root.
-        faults: further conditions.
-    """
+    """How models are evaluated: on which validation range and tests, and under which faults too."""
 
     split: Split
-    data: Mapping[str, Artefact]
-    references: Mapping[str, Artefact]
-    kinds: Mapping[str, str]
+    data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
+    references: Mapping[str, Artefact]  # data set -> recordings at the evaluation rate
+    kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
     protocol: Protocol
     output: Path
     faults: tuple[FaultSettings, ...] = ()

@@ -26,24 +26,14 @@ DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 
 @dataclass(frozen=True)
 class FaultSettings:
-    """One choice of ``fault``.
-
-    Args:
-        name: kind of the fault.
-        channel: the faulty one.
-        severity: of its size.
-        size: instead of the severity's.
-        start: after the start of each range [s]; None: drawn, within `DRAWN_START`.
-        duration: [s]; None: to the end of the range.
-        seed: of all random numbers.
-    """
+    """One choice of ``fault``; conf/fault explains its keys."""
 
     name: str
     channel: str
     severity: Annotated[Severity, "mild, medium or severe"]
-    size: float | None = None
-    start: float | None = None
-    duration: float | None = None
+    size: float | None = None  # instead of the severity's
+    start: float | None = None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    duration: float | None = None  # [s]; None: to the end of the range
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -35,23 +35,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TrainJob:
-    """One member to train.
-
-    Args:
-        plan: the artefact it becomes.
-        estimator: configuration of the estimator.
-        training: configuration of its training.
-        split: its training and validation ranges.
-        seed: its seed.
-        data: data set -> recordings at the estimator's rate.
-    """
+    """One member to train, and the artefact it becomes."""
 
     plan: StagePlan
     estimator: Mapping[str, Any]
     training: Mapping[str, Any]
     split: Split
     seed: int
-    data: Mapping[str, Artefact]
+    data: Mapping[str, Artefact]  # data set -> recordings at the estimator's rate
 
     @property
     def group(self) -> tuple[Any, ...]:
