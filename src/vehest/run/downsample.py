@@ -49,7 +49,7 @@ def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, An
         DataError: it is sampled more slowly.
     """
     if recording.rate_hz < rate_hz * (1 - 1e-9):
-        raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below {rate_hz:g} Hz")
+        raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed")
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)
     return recording
