@@ -76,9 +76,9 @@ def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
     """Seconds, peak memory of the largest process [MB], and how many drives there are."""
     from vehest.run.config import compose_config
     from vehest.run.console import Messages
+    from vehest.run.ingest import outcome_of
     from vehest.run.runner import Runner
     from vehest.run.signals import StopSignals
-    from vehest.run.simulate import outcome_of
 
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         config = compose_config("ingest", [f"dataset={name}", f"output={folder}"])

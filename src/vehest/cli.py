@@ -216,8 +216,8 @@ def simulate(
     The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
+    from vehest.run.ingest import outcome_of, simulation_config
     from vehest.run.run_cache import RunOptions
-    from vehest.run.simulate import outcome_of, simulation_config
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,15 @@ from typing import Any
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove, remove_leftovers, sha256_of
-from vehest.data.store import write_recording
-from vehest.run.artefacts import StagePlan
-from vehest.run.config import Config, missing_keys
+from vehest.data.store import read_recording, write_recording
+from vehest.run.artefacts import Artefact, StagePlan
+from vehest.run.config import Config, compose_config, key_of, missing_keys
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import Task, launch
 from vehest.run.locks import held_at_once
 from vehest.run.signals import StopSignals
 from vehest.run.versions import version_of_source
-from vehest.sources.base import Source, open_source
+from vehest.sources.base import SIMULATED, Source, open_source
 from vehest.training.context import Progress
 
 STAGE = "ingest"
@@ -157,3 +157,34 @@ def recording_file(recording_id: str) -> str:
             f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
         )
     return f"{recording_id}.parquet"
+
+
+def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
+    """The configuration of a simulated data set's ingest; ``seed=1`` among the overrides is short for ``dataset.seed=1``.
+
+    Raises:
+        ConfigurationError: the data set is not simulated, or an override makes no sense.
+    """
+    spelt_out = [f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override for override in overrides]
+    config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
+    if config["dataset"].get("source") != SIMULATED:
+        raise ConfigurationError(f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'")
+    return config
+
+
+def outcome_of(ingested: Artefact) -> dict[str, Any]:
+    """Number and hours of the drives, and the names of those that span, left the road or ended before their manoeuvre did.
+
+    Raises:
+        DataError: a recording is damaged.
+    """
+    hours = 0.0
+    flagged: dict[str, list[str]] = {"spun": [], "left_road": [], "not_completed": []}
+    for name in sorted(ingested.outputs):
+        recording = read_recording(ingested.folder / name, ["vx"])
+        flags: Mapping[str, Any] = recording.provenance.get("flags", {})
+        hours += len(recording) / recording.rate_hz / 3600.0
+        for flag, holds in (("spun", flags.get("spun")), ("left_road", flags.get("left_road")), ("not_completed", not flags["completed"])):
+            if holds:
+                flagged[flag].append(recording.id)
+    return {"drives": len(ingested.outputs), "hours": hours, **flagged}

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
@@ -115,13 +114,12 @@ def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estima
     for member, job in zip(members, jobs, strict=True):
         member.seed(job.seed)
     training: Any = settings_from_config(members[0].training_type, first.training, "training")
-    train, validation = ([_load(first.data, span) for span in spans] for spans in (first.split.train, first.split.validation))
+    train, validation = (
+        [read_recording(recording_file(first.data[span.dataset], span)).cut(span.start, span.stop) for span in spans]
+        for spans in (first.split.train, first.split.validation)
+    )
     records = type(members[0]).fit_members(members, FitData(train, validation), training, context)
     return list(zip(members, records, strict=True))
-
-
-def _load(data: Mapping[str, Artefact], span: Span) -> Recording:
-    return read_recording(recording_file(data[span.dataset], span)).cut(span.start, span.stop)
 
 
 def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: Path) -> None:
