@@ -105,7 +105,8 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> 
         source = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"])
         recording = source.read(name).without_references()
     cut = recording.cut(max(first, recording.start_time), min(last, recording.start_time + recording.duration))
-    return dict(prepared_recording(model, cut, preparation_of(folder)).channels)
+    model.preparation = preparation_of(folder)
+    return dict(prepared_recording(model, cut).channels)
 
 
 def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[str, Any]]:

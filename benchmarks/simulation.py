@@ -76,16 +76,16 @@ def dataset_run(name: str, jobs: int) -> tuple[float, float, int]:
     """Seconds, peak memory of the largest process [MB], and how many drives there are."""
     from vehest.run.config import compose_config
     from vehest.run.console import Messages
+    from vehest.run.ingest import outcome_of
     from vehest.run.runner import Runner
     from vehest.run.signals import StopSignals
-    from vehest.run.simulate import outcome_of
 
     with tempfile.TemporaryDirectory(prefix="vehest-bench-") as folder:
         config = compose_config("ingest", [f"dataset={name}", f"output={folder}"])
         started = time.perf_counter()
         artefact = Runner(Path(folder), Messages(quiet=True), StopSignals(), jobs).ingest(config)
         seconds = time.perf_counter() - started
-        n_drives = outcome_of(artefact).drives
+        n_drives = outcome_of(artefact)["drives"]
     peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     return seconds, peak * 1024 / 1e6, n_drives
 

@@ -20,11 +20,9 @@ from vehest.data.estimate import Estimate
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import load_model as _load_model
 from vehest.estimators.model_files import save_model as _save_model
-from vehest.run.calibrate import trust_of
-from vehest.run.estimate import PRETRAINED, estimate_recording, find_model, preparation_of, read_table, write_estimate_table
-from vehest.run.in_memory import score_on, train_on
+from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, write_estimate_table
+from vehest.run.fit_recordings import score_on, train_on
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust, write_trust
 from vehest.trust.verdict import reason_in_words
@@ -62,10 +60,7 @@ def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None)
         DataError: its files are damaged.
     """
     root = Path(output or os.environ.get("VEHEST_OUTPUT", "outputs"))
-    folder = find_model(str(model), root, partial(warnings.warn, stacklevel=3))
-    estimator = _load_model(folder)
-    estimator.preparation = preparation_of(folder)
-    trust = trust_of(folder, root)
+    _, estimator, trust = open_model(str(model), root, partial(warnings.warn, stacklevel=4))
     if trust is not None:
         _TRUST[estimator] = trust
     return estimator
@@ -81,7 +76,7 @@ def train(
         train: recordings to learn from, with ``vy_ref``, at any rate from the estimator's upwards.
         validation: recordings that decide when to stop, of the same kind; may be the same objects where the method does not stop early.
         overrides: as of ``vehest train``, for example ``["estimator.n_local=3", "training.max_epochs=50"]``.
-        seed: of whatever is random.
+        seed: of all random numbers.
 
     Raises:
         ConfigurationError: an unknown name or setting.
@@ -144,7 +139,7 @@ def estimate(model: Estimator, recording: Recording) -> Estimate:
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    return estimate_recording(model, recording, dict(model.preparation), _TRUST.get(model))
+    return estimate_recording(model, recording, _TRUST.get(model))
 
 
 def online(model: Estimator, bus_rate_hz: float | None = None, *, elsewhere: bool = False) -> GuardedStepper:

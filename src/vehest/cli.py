@@ -1,4 +1,4 @@
-"""The command line: one thin function a command; what is heavy is imported inside it."""
+"""The command line: one thin function a command; heavy modules are imported inside it."""
 
 from __future__ import annotations
 
@@ -93,14 +93,14 @@ def _complete_model_or_file(incomplete: str) -> list[str]:
     return _complete_model(incomplete) + [file for file in files if file.startswith(incomplete)]
 
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would run and what would be skipped; run nothing.")]
-Force = Annotated[bool, typer.Option("--force", help="Run although the outcome is there already.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing.")]
+Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
 DatasetOrFile = Annotated[
     str,
-    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME what that one reads.", autocompletion=_complete_dataset),
+    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=_complete_dataset),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but warnings and the outcome.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", "-j", min=1, help="Processes that run side by side; by default one a core.")]
 LauncherName = Annotated[
     str,
@@ -146,12 +146,12 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 def new_car(
     name: Annotated[str, typer.Argument(help="Name of the data set to be, such as my_car.", show_default=False)],
     files: Annotated[list[Path], typer.Argument(help="Logs of one car with the same columns, a recording each.", show_default=False)],
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Take what is proposed, ask nothing, and list what was left open.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Accept all proposals, ask nothing, and list open questions.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Write files anew that are there already.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be written; write nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the files that would be written; write nothing.")] = False,
     answer: Annotated[
         list[str] | None,
-        typer.Option("--answer", "-a", help="KEY=ANSWER beforehand, as --json names what is open; repeatable."),
+        typer.Option("--answer", "-a", help="KEY=ANSWER beforehand, with a KEY that --json lists as open; repeatable."),
     ] = None,
     wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")] = None,
     mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
@@ -160,7 +160,7 @@ def new_car(
 ) -> None:
     """Begin with logs of your own car: `vehest new my_car lap*.csv`.
 
-    Proposes for every column channel, unit, sign and delay, with what speaks for it, asks what the logs do not decide, and writes
+    Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs do not decide, and writes
     conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.run.own_car.inspect import inspect
@@ -180,7 +180,7 @@ def ingest(
     dataset: Dataset,
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
     download: Annotated[
-        bool, typer.Option("--download", help="First fetch files that are missing, and compare checksums; goes on where a break left it.")
+        bool, typer.Option("--download", help="First fetch missing files, and compare checksums; resumes an interrupted download.")
     ] = False,
     dry_run: DryRun = False,
     force: Force = False,
@@ -216,14 +216,14 @@ def simulate(
     The same seed gives the same samples. Drives are made side by side; a run that is stopped goes on with those that are missing. Drives
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
+    from vehest.run.ingest import outcome_of, simulation_config
     from vehest.run.run_cache import RunOptions
-    from vehest.run.simulate import outcome_of, simulation_config
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
         artefact = runner.ingest(config)
-    outcome = outcome_of(artefact).as_plain()
+    outcome = outcome_of(artefact)
     if not as_json:
         outcome |= {name: counted(drives) for name, drives in outcome.items() if isinstance(drives, list)}
     emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
@@ -310,7 +310,7 @@ def estimate(
         str | None,
         typer.Argument(
             metavar="FILE",
-            help="The recording after a model: a table, or with dataset=NAME what that one reads; it needs no reference channels.",
+            help="The recording after a model: a table, or with dataset=NAME one of its format; it needs no reference channels.",
             show_default=False,
         ),
     ] = None,
@@ -326,9 +326,9 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    Beside v and β stand half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid.
+    The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid.
 
-    For a car that nobody has trained on, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest and says so.
+    For a car without a model of its own, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest, with a note.
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
@@ -353,7 +353,7 @@ def replay(
     dbc: Annotated[Path | None, typer.Option("--dbc", help="What describes the bus; by default the data set's.")] = None,
     dataset: Annotated[
         str | None,
-        typer.Option("--dataset", help="A data set of the source can, which says what is which channel.", autocompletion=_complete_dataset),
+        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=_complete_dataset),
     ] = None,
     signals: Annotated[
         str,
@@ -380,10 +380,10 @@ def replay(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Put a log's frames on a bus and let a model estimate online from what it takes off: `vehest replay drive.asc --dbc car.dbc -m MODEL`.
+    """Replay a log's frames on a bus and let a model estimate online from them: `vehest replay drive.asc --dbc car.dbc -m MODEL`.
 
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
-    Ctrl-C ends it; what was written is kept.
+    Ctrl-C ends it; written files stay.
     """
     from vehest.run.replay import ReplayWords, replay_log
     from vehest.run.signals import StopSignals
@@ -425,22 +425,18 @@ def export(
     One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
     file, test vectors, and a README with units and the bytes that it takes.
     """
-    from vehest.estimators.model_files import load_model
     from vehest.export.folder import export_model
-    from vehest.run.calibrate import trust_of
-    from vehest.run.estimate import find_model
+    from vehest.run.estimate import open_model
 
-    config = _compose("estimate", [])
-    output = Path(config["output"])
-    folder = find_model(model, output, note)
-    fitted = load_model(folder)
+    output = Path(_compose("estimate", [])["output"])
+    folder, fitted, trust = open_model(model, output, note)
     if onnx:
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
         emit(as_json, {"out": str(out), "model": str(folder)})
         return
-    found = export_model(fitted, trust_of(folder, output), out, precision, bus_rate, elsewhere=elsewhere)
+    found = export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere)
     emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
 
 
@@ -463,10 +459,10 @@ def compare(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Score estimates made elsewhere on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
+    """Score estimates of any tool on one recording: `vehest compare lap.csv mine.csv theirs.csv`.
 
-    v = 0 and a static map, fitted on the other half of the drive, stand beside them. Where all estimates are there they are scored, with
-    95 % intervals over blocks of the drive; nothing is called best that is not below all others by more than chance.
+    v = 0 and a static map, fitted on the other half of the drive, are scored too. Scores cover the part that all estimates have, with 95 %
+    intervals over blocks of the drive; an estimate is called best only if it is significantly below all others.
     """
     from vehest.run.compare_files import compare_files
 
@@ -485,7 +481,7 @@ def run(
     jobs: Jobs = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Be done in this time, report included; what did not fit is named, and the same command goes on with it."),
+        typer.Option(help="Stop after this time, report included; unfinished jobs are listed, and the same command goes on with them."),
     ] = None,
     launcher: LauncherName = "local",
     address: Address = None,
@@ -493,7 +489,7 @@ def run(
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
-    What is there is skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
+    Existing artefacts are skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
     from vehest.run.run_cache import RunCache, RunOptions
 
@@ -523,7 +519,7 @@ def report(
         bool,
         typer.Option(
             "--check",
-            help="Draw nothing; say which results published in ./results, of all studies or of those named, are not those of today's code, "
+            help="Draw nothing; list published results in ./results, of all or the named studies, that differ from today's code, "
             "configuration and data.",
         ),
     ] = False,
@@ -541,7 +537,7 @@ def report(
         _check_published([word for word in (pipeline, *(overrides or [])) if word is not None], as_json)
         return
     if pipeline is None:
-        raise ConfigurationError(f"say which pipeline, of: {', '.join(pipeline_names())}; or --check")
+        raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
     from vehest.run.run_cache import RunCache, RunOptions
 
     words, options = overrides or [], RunOptions(force, dry_run, quiet, 1)
@@ -583,7 +579,7 @@ def sweep(
     """Train and score all combinations of several values: `vehest sweep estimator=ksnn estimator.n_local=2,3 seed='range(5)'`.
 
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
-    on the validation range. What is there is skipped, a failed job stops no other, the same command finishes what is missing.
+    on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
     from vehest.run.run_cache import RunCache, RunOptions
 
@@ -617,13 +613,13 @@ def show_config(
 def prune(
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed; remove nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be removed; remove nothing.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List what no present key names in the output root, ask, and remove it: `vehest prune output=FOLDER`.
+    """List artefacts that no current configuration can reuse, ask, and remove them: `vehest prune output=FOLDER`.
 
-    That is what other code has made than today's, what is damaged or half-written, and what was made from something that is gone. Models
-    and recordings of today's code stay, whatever their settings, and so does everything that vehest has not made.
+    These are artefacts of other versions, damaged or half-written ones, and those whose inputs are gone. Models and recordings of current
+    versions stay with any settings, and so do files that vehest has not made.
     """
     from vehest.run.prune import remove_unused, size_in_words, unused_artefacts
 
@@ -632,12 +628,12 @@ def prune(
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
     found = unused_artefacts(Path(str(config["output"])))
     total = sum(one.size for one in found)
-    shown = [TerminalTable("", ("no present key names", "size", "age", "since"), [one.in_words() for one in found])] if found else []
+    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), [one.in_words() for one in found])] if found else []
     emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {size_in_words(total)}" if found else "nothing to remove"])
     removed: list[str] = []
     if found and not dry_run:
         if not yes and not sys.stdin.isatty():
-            raise ConfigurationError("there is no terminal to ask at; add --yes to remove, or --dry-run")
+            raise ConfigurationError("no terminal for questions; use --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
             remove_unused(found, lambda one: removed.append(str(one.path)))
     listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
@@ -646,7 +642,7 @@ def prune(
 
 @app.command()
 def doctor(as_json: AsJson = False) -> None:
-    """Say what works on this machine and what is missing."""
+    """Check the environment: working and missing parts on this machine."""
     from vehest.run.doctor import examine
 
     items = examine()
@@ -707,7 +703,7 @@ def data_usable(
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say of every estimator whether these recordings will do, which channels are missing, and what could supply them."""
+    """List for every estimator whether these recordings suffice, which channels are missing, and how to supply them."""
     from vehest.run.inspect_data import examine_usability
 
     emit(as_json, *examine_usability(source, overrides or []))
@@ -742,7 +738,7 @@ def data_align(
 ) -> None:
     """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.
 
-    Prints what was found with its uncertainty, and the transforms that would correct it. Applies nothing.
+    Prints the estimates with their uncertainty, and the transforms that would correct it. Applies nothing.
     """
     from vehest.alignment.settings import AlignmentSettings
     from vehest.run.align import align_recording, as_plain, in_words, refuse_other_files, write_alignment
@@ -772,7 +768,7 @@ def main() -> None:
         silence(sys.stdout)
         sys.exit(141)
     except Stopped as stopped:
-        _fail(f"stopped by {stopped}; what was finished is kept, the same command goes on", stopped.exit_code)
+        _fail(f"stopped by {stopped}; finished artefacts are kept, the same command goes on", stopped.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         _fail("stopped", 130)
     except Exception as error:
@@ -788,14 +784,14 @@ _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 
 def _fail_usage(error: Any) -> None:
     context = error.ctx
-    if type(error).__name__ == "NoArgsIsHelpError":  # the help stands on the screen
+    if type(error).__name__ == "NoArgsIsHelpError":  # the help is on the screen
         sys.exit(error.exit_code)
     words = error.format_message().strip().rstrip(".").replace(". Did you mean", "; did you mean")
     key = str(getattr(error, "option_name", "")).lstrip("-").partition("=")[0]
     if key in GROUPS or key in ROOT_KEYS or "." in key:
-        hint = f"what belongs to the configuration is written without dashes: {key}=…"
+        hint = f"keys of the configuration are written without dashes: {key}=…"
     else:
-        hint = f"'{context.command_path if context else 'vehest'} --help' says what there is"
+        hint = f"'{context.command_path if context else 'vehest'} --help' lists commands and options"
     _fail(f"{words[:1].lower()}{words[1:]}{'' if words.endswith('?') else ';'} {hint}", error.exit_code)
 
 

@@ -162,9 +162,9 @@ def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
         ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")}, "'parsec' is no unit"),
         ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")}, "is in 'km/h' by the file and in 'm/s'"),
         ({"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")}, "stands in several messages"),
-        ({"dbc": None}, "say what describes the bus"),
+        ({"dbc": None}, "nothing describes the bus"),
         ({"dataset": "tabular", "signals": ""}, "is of source 'tabular'"),
-        ({"dataset": "can"}, "both say what is which channel"),
+        ({"dataset": "can"}, "both name the channels"),
         ({"speed": "fast"}, "--speed must be"),
         ({"speed": "-1"}, "--speed must be"),
         ({"speed": "max", "interface": "socketcan"}, "needs the virtual bus"),
@@ -189,7 +189,7 @@ def test_words_that_make_no_sense_are_one_line(tmp_path: Path, words: dict[str, 
 def test_the_log_itself_is_never_written_over(tmp_path: Path) -> None:
     written = write_log(drive(2.0), tmp_path)
     before = written.log.read_bytes()
-    with pytest.raises(ConfigurationError, match="is what is read"):
+    with pytest.raises(ConfigurationError, match="is an input"):
         replayed(written, out=written.log)
     assert written.log.read_bytes() == before
 

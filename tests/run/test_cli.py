@@ -434,7 +434,7 @@ def test_a_model_is_not_tested_on_what_it_learnt_from(place):
     swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
     code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
     assert code == 2
-    assert "shares samples with what" in line
+    assert "shares samples with the ranges" in line
 
 
 def test_estimate_neither_replaces_folders_nor_its_own_recording(place):

@@ -68,7 +68,7 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
 
 
 def test_missing_choice_names_the_choices(elsewhere):
-    with pytest.raises(ConfigurationError, match=r"say which dataset: dataset=… \(choices: .*tabular"):
+    with pytest.raises(ConfigurationError, match=r"dataset is not chosen; dataset=… \(choices: .*tabular"):
         compose_config("ingest")
 
 

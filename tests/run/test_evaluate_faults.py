@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import read_artefact
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices, packaged_conf
-from vehest.run.evaluate import code_of_evaluation, plan_evaluate
-from vehest.run.evaluate_faults import FaultedJob
+from vehest.run.evaluate import Evaluation, code_of_evaluation
 from vehest.run.faults import FaultSettings, all_of, faults_of
 from vehest.run.study import jobs_of, read_study
 from vehest.trust.faults import KINDS, is_fault
@@ -278,6 +278,7 @@ def test_faults_of_a_pipeline_that_make_no_sense_are_one_line(place, evaluation,
 def test_a_plan_without_faults_is_that_of_the_evaluation(trained):
     data, model = (read_artefact(next((trained.folder / "outputs").glob(name))) for name in ("downsample/mine-20hz-*", "train/kinematic-*"))
     split = Split("mine", (), (), {"test": (Span("mine", "three", 0.0, 20.0),)})
-    job = plan_evaluate(model, split, {"mine": data}, {"mine": data}, {"mine": "simulated"}, Protocol(), Path("outputs"))
-    assert FaultedJob(job).plan is job.plan
-    assert FaultedJob(job, (FaultSettings("bias", "ay", "mild"),)).plan.key != job.plan.key
+    how = Evaluation(split, {"mine": data}, {"mine": data}, {"mine": "simulated"}, Protocol(), Path("outputs"))
+    faulted = replace(how, faults=(FaultSettings("bias", "ay", "mild"),)).of(model, None).plan
+    assert faulted.key != how.of(model, None).plan.key
+    assert faulted.code == f"{how.of(model, None).plan.code} faults=1"

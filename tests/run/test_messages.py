@@ -1,4 +1,4 @@
-"""What a user is told: usage errors, hostile names, full disks, broken streams; one line each, and nothing that steers a terminal."""
+"""Messages to users: usage errors, hostile names, full disks, broken streams; one line each, without control of the terminal."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from vehest.data.limits import Limits, use_limits
 from vehest.run.config import as_yaml, compose_config, count, expand, limits_of
 from vehest.run.console import Messages
 from vehest.run.failures import failure_of
+from vehest.run.printing import TerminalTable, emit
 
 HOSTILE = "a\x1b]0;owned\x07\x9b31m\u202e[bold]b[/] :car:"
 
@@ -39,9 +40,9 @@ def _shows_only_text(text: str) -> bool:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("trian",), "no such command 'trian'; did you mean 'train'? 'vehest --help' says what there is"),
-        (("train", "--nope"), "'vehest train --help' says what there is"),
-        (("data", "shwo"), "'vehest data --help' says what there is"),
+        (("trian",), "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options"),
+        (("train", "--nope"), "'vehest train --help' lists commands and options"),
+        (("data", "shwo"), "'vehest data --help' lists commands and options"),
         (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
         (("run", "small", "--jobs", "0"), "invalid value for '--jobs'"),
         (("run", "small", "--jobs", "many"), "invalid value for '--jobs'"),
@@ -126,9 +127,7 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
 
 
 def test_tables_read_no_markup_and_hold_no_escapes(place, capsys):
-    from vehest.cli import _table
-
-    _table(["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])
+    emit(False, None, [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])])
     out = capsys.readouterr().out
     assert _shows_only_text(out)
     assert "[bold]name[/]" in out
@@ -198,8 +197,8 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
         ("range(nan,5)", "cannot be read"),
         ("range(0)", "stands for no value"),
         ("choice()", "cannot be read"),
-        ("interval(0,1)", "an interval cannot be counted"),
-        ("glob(*)", "list the values of an option"),
+        ("interval(0,1)", "cannot be read"),
+        ("glob(*)", "stands for no value"),
         ("9" * 5000, "cannot be read"),
     ],
 )

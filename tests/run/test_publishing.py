@@ -210,7 +210,7 @@ def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked: Place) -> None
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (("report",), 2, "say which pipeline, of:"),
+        (("report",), 2, "no pipeline is named; there are:"),
         ((*CHECK, "smal"), 4, "there is no pipeline 'smal'; did you mean pipelines/small.yaml?"),
         ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes what comes out"),
     ],

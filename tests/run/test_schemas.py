@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -250,13 +251,13 @@ def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
 
 def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path: Path) -> None:
     artefact = made(tmp_path)
-    with pytest.raises(DataError, match=r"manifest\.json': config\.estimator is missing"):
+    with pytest.raises(DataError, match=r"manifest\.json': config describes no training \('train'\)"):
         learnt_spans(artefact)
     entry = {"dataset": "d", "recording": "r", "start": "-inf", "stop": "late"}
     config = {"estimator": {"rate_hz": 20}, "train": [entry], "validation": []}
     told = Artefact(**{**artefact.__dict__, "config": config})
     assert trained_rate(told) == 20.0
-    with pytest.raises(DataError, match="name no ranges"):
+    with pytest.raises(DataError, match="describes no training"):
         learnt_spans(told)
 
 
@@ -482,9 +483,9 @@ def conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("text", ["hydra:\n  searchpath: [pkg://antigravity]", "a: &a {hydra: {searchpath: [pkg://antigravity]}}\n<<: *a"])
 def test_no_root_file_in_conf_reaches_hydras_search_path(conf: Path, text: str) -> None:
-    (conf / "ingest.yaml").write_text(text)
-    with pytest.raises(ConfigurationError, match=r"ingest\.yaml' names options of Hydra itself"):
-        compose_config("ingest", ["dataset=sim_small"])
+    (conf / "ingest.yaml").write_text(f"{text}\ndefaults: [dataset: tabular, common, _self_]")
+    assert compose_config("ingest", ["dataset=sim_small"])["dataset"]["name"] == "sim_small"
+    assert "antigravity" not in sys.modules
 
 
 @pytest.mark.parametrize(
@@ -535,10 +536,13 @@ def test_wrong_values_on_the_command_line_name_their_keys() -> None:
             compose_config("train", [override])
 
 
-@pytest.mark.parametrize("override", ["hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil", "+tracking@hydra.job=none"])
+@pytest.mark.parametrize(
+    "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
+)
 def test_no_override_reaches_hydra_itself(override: str) -> None:
-    with pytest.raises(ConfigurationError, match="sets an option of Hydra itself, or leaves conf/"):
+    with pytest.raises(ConfigurationError, match="is an option of Hydra itself"):
         compose_config("train", [override])
+    assert "antigravity" not in sys.modules
 
 
 def test_the_protocol_is_read_with_its_types() -> None:

@@ -767,7 +767,7 @@ def test_ctrl_c_keeps_what_has_arrived_and_the_same_command_goes_on(place: Place
     code, _, err = place("ingest", "mine", "--download", "root=data")
     thread.join()
     assert code == 130
-    assert err == "error: stopped by SIGINT; what was finished is kept, the same command goes on\n"
+    assert err == "error: stopped by SIGINT; finished artefacts are kept, the same command goes on\n"
     under_way = place.folder / "data" / "mine" / UNDER_WAY
     assert sorted(file.name for file in under_way.iterdir()) == ["one.csv.part", "one.csv.part.json"]
     kept = (under_way / "one.csv.part").stat().st_size

@@ -61,7 +61,7 @@ def main() -> None:
         path.parent.mkdir(exist_ok=True)
         if not path.exists():
             write_recording(drive, path)
-        write_estimate(estimate_recording(estimator, drive, PREPARATION, trust), folder / "estimate.parquet")
+        write_estimate(estimate_recording(estimator, drive, trust), folder / "estimate.parquet")
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ import pytest
 from place import run_vehest
 from vehest.data.store import read_estimate, read_recording
 from vehest.estimators.model_files import load_model
-from vehest.run.calibrate import trust_of
-from vehest.run.estimate import estimate_recording, preparation_of
+from vehest.run.estimate import estimate_recording, open_model
 
 HERE = Path(__file__).parent
 MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
@@ -29,11 +28,10 @@ def drive_file(channels: tuple[str, ...], rate_hz: float) -> Path:
 def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
     if name == "factor_graph":
         pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
-    folder = HERE / "models" / name
-    model = load_model(folder)
+    folder, model, trust = open_model(str(HERE / "models" / name), HERE, print)
     drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
     then = read_estimate(folder / "estimate.parquet")
-    now = estimate_recording(model, drive, preparation_of(folder), trust_of(folder, folder))
+    now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
     for channel, values in then.channels.items():
         np.testing.assert_allclose(now[channel], values, rtol=0.0, atol=TOLERANCE, equal_nan=True, err_msg=f"{name}: {channel}")

@@ -1,12 +1,14 @@
-"""Between training and evaluation: how far a model's estimates can be trusted, from its own training and validation ranges.
+"""Calibrates a model between training and evaluation: bands, limits of samples and health, from its training and validation ranges.
 
-A calibration belongs to a model and knows no evaluation's protocol: estimates run through whole ranges from a start of their own, as they
-do on a new drive. It is judged by what it says on test ranges, which it does not see.
+model, ranges -> estimates through whole ranges from a start of their own, as on a new drive -> `Trust` -> trust.yaml
+
+A calibration knows no evaluation's protocol, and no test range.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,14 +36,7 @@ SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 @dataclass(frozen=True)
 class CalibrateJob:
-    """One model to calibrate.
-
-    Args:
-        plan: the artefact it becomes.
-        model: what the train stage made.
-        split: whose training and validation ranges serve.
-        data: data set -> recordings at the model's rate, references included.
-    """
+    """One model to calibrate on the training and validation ranges of a split."""
 
     plan: StagePlan
     model: Artefact
@@ -50,35 +45,23 @@ class CalibrateJob:
 
 
 def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path) -> CalibrateJob | None:
-    """What a calibration would make; none where a split has no validation range, and so nothing to calibrate by.
-
-    Args:
-        model: what the train stage made.
-        split: that the model was trained on; of a model that learns nothing, any.
-        data: data set -> recordings at the model's rate.
-        output: the output root.
+    """The calibration of a model; none where a split has no validation range.
 
     Raises:
         DataError: the split names a recording that the data set does not have.
     """
     if not split.validation:
         return None
-    roles = {"train": split.train, "validation": split.validation}
+    spans = {"train": split.train, "validation": split.validation}
     inputs = {"model": model.digest}
-    inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for spans in roles.values() for span in spans}
-    plan = StagePlan(
-        stage=STAGE,
-        label=f"{model.label}-trust",
-        config={role: [str(span) for span in spans] for role, spans in roles.items()},
-        inputs=inputs,
-        code=code_of_calibration(read_description(model.folder).estimator),
-        output=output,
-    )
-    return CalibrateJob(plan, model, split, data)
+    inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for own in spans.values() for span in own}
+    config = {role: [str(span) for span in own] for role, own in spans.items()}
+    code = code_of_calibration(read_description(model.folder).estimator)
+    return CalibrateJob(StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output), model, split, data)
 
 
 def code_of_calibration(estimator: str) -> str:
-    """Version of what a calibration of an estimator runs.
+    """Version of a calibration of an estimator.
 
     Raises:
         ConfigurationError: the name is unknown.
@@ -87,118 +70,55 @@ def code_of_calibration(estimator: str) -> str:
 
 
 def write_calibration(job: CalibrateJob, folder: Path) -> None:
-    """Calibrate a model; write trust.yaml into ``folder``. What keeps a model from bands or health is noted in there."""
+    """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
     description, estimator = read_description(job.model.folder), load_model(job.model.folder)
-    train, validation = (_stretches(job.data, spans) for spans in (job.split.train, job.split.validation))
+    train, validation = ([_stretch(job.data, span) for span in spans] for spans in (job.split.train, job.split.validation))
     write_trust(learn_trust(estimator, train, validation, description.variant), folder)
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A range to learn from, with what of its recording lies before it.
+    """A range to learn from, with the part of its recording before it."""
 
-    Args:
-        recording: at the model's rate, from `WARM_UP_SECONDS` before the range on as far as there is any, references included.
-        start: of the range [s].
-        dataset: whose recording it is; empty where it is of none.
-        name: of the range, for people.
-    """
-
-    recording: Recording
-    start: float
-    dataset: str
-    name: str
+    recording: Recording  # at the model's rate, from `WARM_UP_SECONDS` before the range if it is that long, references included
+    start: float  # of the range [s]
+    dataset: str  # of the recording; may be empty
+    name: str  # for people
 
     @property
-    def measured(self) -> Recording:
-        """The range as an estimator may see it."""
-        return self.recording.cut(self.start, self.recording.end_time).without_references()
+    def range(self) -> Recording:
+        """The recording without its warm-up."""
+        return self.recording.cut(self.start, self.recording.end_time)
+
+
+def _stretch(data: Mapping[str, Artefact], span: Span) -> Stretch:
+    recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
+    return Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe())
 
 
 def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = "") -> Trust:
-    """Bands, limits of samples and health of an estimator, from what it was fitted on and what it was stopped on.
+    """Bands, limits of samples and health of a fitted estimator.
 
     Args:
         estimator: fitted.
         train: give scales, limits and relations between channels.
         validation: gives factors of bands and, together with ``train``, thresholds of health.
-        variant: what the paper calls the estimator.
+        variant: name in its paper.
     """
     bands, guard, health, notes = None, None, None, []
     try:
         bands = _bands(estimator, train, validation)
-    except DataError as error:  # as of a reference that is not there, which is no reason to go without an evaluation
+    except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))
     try:
         if not train:
             raise DataError("there is no training range to learn limits and health from")
-        ranges = [stretch.recording.cut(stretch.start, stretch.recording.end_time) for stretch in train]
-        guard = learn_limits(ranges, estimator.channels, estimator.settings.rate_hz)
-        learnt, stopped = ([stretch.measured for stretch in part] for part in (train, validation))
+        guard = learn_limits([stretch.range for stretch in train], estimator.channels, estimator.settings.rate_hz)
+        learnt, stopped = ([stretch.range.without_references() for stretch in part] for part in (train, validation))
         health = learn_health(learnt, stopped, estimator.channels, estimator.settings.rate_hz)
     except DataError as error:
         notes.append(str(error))
     return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
-
-
-def calibration_figures(folder: Path) -> dict[str, float]:
-    """Figures of a calibration that are worth tracking; none where there are no bands.
-
-    Raises:
-        VehestError: it cannot be read.
-    """
-    bands = read_trust(folder).bands
-    if bands is None:
-        return {}
-    return {
-        "calibration_blocks": float(bands.n_blocks),
-        "calibration_blocks_effective": bands.sideslip.effective_blocks,
-        "calibration_seconds": bands.seconds,
-    }
-
-
-def trust_of(model_folder: Path, output: Path) -> Trust | None:
-    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root, else in another.
-
-    Of several calibrations, which a model that learns nothing has, the one that was made last.
-
-    Args:
-        model_folder: of the model, wherever it is.
-        output: an output root.
-
-    Raises:
-        DataError: it is damaged.
-    """
-    if (model_folder / TRUST).is_file():
-        return read_trust(model_folder)
-    found = calibration_of(model_folder, output)
-    return None if found is None else read_trust(found.folder)
-
-
-def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
-    """The calibration of a model in its own output root or in another, see `trust_of`."""
-    try:
-        digest = read_artefact(model_folder).digest
-    except VehestError:
-        return None
-    found = []
-    own = model_folder.resolve().parent.parent
-    for folder in sorted({place for root in (own, output.resolve()) for place in (root / STAGE).glob("[!.]*")}):
-        try:
-            artefact = read_artefact(folder)
-        except VehestError:
-            continue
-        if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
-            found.append(artefact)
-    return max(found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None)
-
-
-def _stretches(data: Mapping[str, Artefact], spans: Sequence[Span]) -> list[Stretch]:
-    found = []
-    for span in spans:
-        recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
-        found.append(Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe()))
-    return found
 
 
 def _bands(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch]) -> Bands:
@@ -234,3 +154,42 @@ def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
         yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
         found.append(Piece(rows[scored], vy[scored], variance[scored], error[scored], turned[scored], yaw_rate, recording.rate_hz))
     return found
+
+
+def calibration_figures(folder: Path) -> dict[str, float]:
+    """Figures of a calibration for tracking; none where there are no bands.
+
+    Raises:
+        VehestError: it cannot be read.
+    """
+    bands = read_trust(folder).bands
+    if bands is None:
+        return {}
+    figures = {"calibration_blocks": float(bands.n_blocks), "calibration_blocks_effective": bands.sideslip.effective_blocks}
+    return figures | {"calibration_seconds": bands.seconds}
+
+
+def trust_of(model_folder: Path, output: Path) -> Trust | None:
+    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root or in ``output``.
+
+    Raises:
+        DataError: it is damaged.
+    """
+    if (model_folder / TRUST).is_file():
+        return read_trust(model_folder)
+    found = calibration_of(model_folder, output)
+    return None if found is None else read_trust(found.folder)
+
+
+def calibration_of(model_folder: Path, output: Path) -> Artefact | None:
+    """The calibration of a model in its own output root or in another; the newest of several."""
+    found = []
+    with suppress(VehestError):
+        digest = read_artefact(model_folder).digest
+        roots = {model_folder.resolve().parent.parent, output.resolve()}
+        for folder in sorted({folder for root in roots for folder in (root / STAGE).glob("[!.]*")}):
+            with suppress(VehestError):
+                artefact = read_artefact(folder)
+                if artefact.stage == STAGE and artefact.inputs.get("model") == digest:
+                    found.append(artefact)
+    return max(found, key=lambda artefact: str(artefact.provenance.get("created", "")), default=None)

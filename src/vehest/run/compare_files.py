@@ -1,8 +1,10 @@
-"""Estimates that were made elsewhere, scored beside each other and beside vehest's own on one recording with a reference."""
+"""Scores estimates of any tool, and of vehest's models, beside each other on one recording with a reference.
+
+tables, models -> `Estimate` each -> scored where all of them have values, beside v = 0 and a static map -> ranking and verdict
+"""
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -19,17 +21,17 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_estimate
-from vehest.estimators.model_files import load_model, read_description
+from vehest.estimators.model_files import read_description
 from vehest.estimators.static_map import StaticMap, StaticMapSettings
 from vehest.evaluation.blocks import segments_of
-from vehest.evaluation.metrics import Protocol, Scored, accuracy, score
-from vehest.evaluation.ranking import Name, Ranking, rank
-from vehest.run.calibrate import trust_of
+from vehest.evaluation.metrics import Protocol, accuracy, score
+from vehest.evaluation.ranking import rank
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
-from vehest.run.downsample import transforms_of
-from vehest.run.estimate import estimate_recording, find_model, preparation_of, read_table
+from vehest.run.downsample import resampled
+from vehest.run.estimate import estimate_recording, open_model, read_table
 from vehest.run.printing import TerminalTable, complain, note
+from vehest.run.terminal import SCORE_HEADER, score_cells
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
 from vehest.sources.unit_spellings import plain_unit
@@ -47,43 +49,23 @@ LEAST_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class ComparedFiles:
-    """Estimates of one recording, ranked.
+    """Estimates of one recording, ranked."""
 
-    Args:
-        rows: one an estimate, the lowest RMSE(β) first: name, metrics, and where it stands.
-        verdict: in words.
-        start, stop: of what was scored [s].
-        rate_hz: at which it was.
-    """
-
-    rows: Sequence[Mapping[str, Any]]
+    rows: Sequence[Mapping[str, Any]]  # one an estimate, the lowest RMSE(β) first: name, metrics and ranking
     verdict: str
-    start: float
+    start: float  # of the scored part [s]
     stop: float
     rate_hz: float
 
     def in_words(self) -> list[str | TerminalTable]:
         """For a terminal."""
-        header = (
-            "estimate",
-            "RMSE(β) [deg]",
-            "95 % interval [deg]",
-            "to the lowest [deg]",
-            "beats v = 0, static map",
-            "RMSE(v) [m/s]",
-            "FVU",
-        )
+        cells = [(row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}") for row in self.rows]
         scored = f"scored from {self.start:.6g} to {self.stop:.6g} s at {self.rate_hz:g} Hz"
-        return [TerminalTable("", (*header, "FVU"), [_cells(row) for row in self.rows]), scored, self.verdict]
+        return [TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells), scored, self.verdict]
 
 
 def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
-    """Score estimates made elsewhere, and models, on one recording.
-
-    Args:
-        recording: file with its reference.
-        words: tables of estimates and overrides of conf/estimate.yaml.
-        models: to run on it; one that learnt on it gets a warning.
+    """Score estimates of other tools, and models, on one recording.
 
     Raises:
         ConfigurationError: two estimates have the same name.
@@ -99,53 +81,34 @@ def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) 
         if len(estimates) < len(files):
             raise ConfigurationError("two estimates have the same file name; rename one, since it names the row")
         for name in models:
-            folder = find_model(name, Path(config["output"]), note)
-            model, trust = load_model(folder), trust_of(folder, Path(config["output"]))
+            folder, model, trust = open_model(name, Path(config["output"]), note)
             about = read_description(folder).about
             if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
                 complain(f"warning: '{name}' learnt on this recording: its row is no test")
-            estimates[name] = estimate_recording(model, drive.without_references(), preparation_of(folder), trust)
+            estimates[name] = estimate_recording(model, drive.without_references(), trust)
         return compare_estimates(drive, estimates)
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
-    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
-    return [
-        str(row["estimate"]),
-        f"{row['rmse_sideslip']:.3f}",
-        f"{low:.3f} … {high:.3f}" if math.isfinite(low) else "–",
-        str(row["against_best"]),
-        f"{row['beats_zero']}, {row['beats_static_map']}",
-        f"{row['rmse_vy']:.3f}",
-        f"{row['fvu']:.3f}",
-    ]
-
-
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:
-    """Read v or β from a table that any tool wrote, or from what ``vehest estimate`` did.
+    """Read v or β from a table of any tool, or of ``vehest estimate``.
 
     Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
     β is there, v = u tan β with the recording's u.
-
-    Args:
-        file: table with a column of time, on the recording's clock.
-        vx: the recording.
 
     Raises:
         MissingError: there is no such file.
         DataError: it has neither v nor β, or no time, or cannot be read.
     """
     if file.suffix == ".parquet":
-        with suppress(DataError):  # a table of another tool's
+        with suppress(DataError):  # a table of another tool
             return read_estimate(file)
     names = column_names(file, {})
     time = _column_like(names, TIMES)
     found = {channel: _column_like(names, spellings) for channel, spellings in SPELLINGS.items()}
     channel = next((channel for channel, column in found.items() if column is not None), None)
     if time is None or channel is None:
-        what = "a column of time [s]" if time is None else "a column vy [m/s] or sideslip [rad]"
-        listed = ", ".join(names[:12]) + (", …" if len(names) > 12 else "")
-        raise DataError(f"'{file}' has no {what.removeprefix('a ')} (it has {listed}); name one so")
+        wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
+        raise DataError(f"'{file}' has no column {wanted} (it has {', '.join(names[:12])}{', …' if len(names) > 12 else ''})")
     column = str(found[channel])
     dataset = {
         "name": file.stem,
@@ -165,7 +128,7 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
 
 
 def _column_like(names: Sequence[str], spellings: set[str]) -> str | None:
-    """The first column that is called so, what stands in brackets and the case left aside."""
+    """The first column of that name, without its unit in brackets and whatever its case."""
     bare = {name: re.sub(r"[\[(].*?[\])]", "", name).strip().lower().replace(" ", "_") for name in names}
     return next((name for name in names if bare[name] in spellings or bare[name].replace("_", "") in spellings), None)
 
@@ -179,15 +142,9 @@ def _unit_in(name: str) -> str | None:
 
 
 def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_hz: float = 20.0) -> ComparedFiles:
-    """Score estimates where all of them are there, with v = 0 and a static map beside them.
+    """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
-    The map is fitted on one half of the scored range and judged on the other, and the other way round, so that it knows no sample that it
-    is judged by.
-
-    Args:
-        drive: with ``vx``, ``vy_ref`` and, for the map, ``yaw_rate``.
-        estimates: name -> estimate on the clock of ``drive``.
-        rate_hz: at which all are read.
+    The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
 
     Raises:
         DataError: no reference, too little in common, or gaps within what is in common.
@@ -201,35 +158,26 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
     if taken := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
     channels = [name for name in ("vx", "vy_ref", "ay", "yaw_rate") if name in drive]
-    reference = drive.select(channels)
-    for transform in transforms_of({"rate_hz": min(rate_hz, drive.rate_hz), "method": "polyphase", "transforms": []}):
-        reference = transform(reference)
+    reference = resampled(drive.select(channels), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
     start, stop = _in_common(reference, estimates)
     span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
     everyone = {**estimates, **_baselines(reference, start, stop)}
     scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in everyone.items()}
     ranking = rank({name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()}, reference.rate_hz)
-    return ComparedFiles(_rows(ranking, scored), _verdict(ranking), start, stop, reference.rate_hz)
-
-
-def _rows(ranking: Ranking, scored: Mapping[Name, Scored]) -> list[dict[str, Any]]:
-    rows = []
-    for name in ranking.order:
-        errors = accuracy([scored[name]])
-        rows.append({"estimate": name[0], **{key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}})
-        rows[-1] |= standing_columns(ranking, name)
-    return rows
-
-
-def _verdict(ranking: Ranking) -> str:
     titles = {name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0]) for name in ranking.order}
-    return (
-        verdict_sentences(ranking, titles, "this recording").replace("**", "").replace(" over its seeds", "").replace(" and over seeds", "")
-    )
+    verdict = verdict_sentences(ranking, titles, "this recording")
+    for words in ("**", " over its seeds", " and over seeds"):
+        verdict = verdict.replace(words, "")
+    rows = []
+    for ranked in ranking.order:
+        errors = accuracy([scored[ranked]])
+        figures = {key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}
+        rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
+    return ComparedFiles(rows, verdict, start, stop, reference.rate_hz)
 
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
-    """From when to when every estimate and the reference are there [s]."""
+    """Start and end [s] of the part in which every estimate and the reference have values."""
     known = np.flatnonzero(np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"]))
     if not len(known):
         raise DataError(f"recording '{reference.id}': channel 'vy_ref' has no sample")
@@ -249,23 +197,24 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
 
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
-    """v = 0, and the static map where the car turns enough for one."""
+    """v = 0, and the static map where the car turns enough to fit one."""
 
     def made(name: str, vy: FloatArray) -> Estimate:
         return Estimate(reference.id, name, reference.rate_hz, reference.start_time, {"vy": vy, "sideslip": np.zeros_like(vy)})
 
-    found = {"zero": made("zero", np.zeros(len(reference)))}
+    vy = np.zeros(len(reference))
+    zero = {"zero": made("zero", vy)}
     if "yaw_rate" not in reference:
-        return found
-    middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
-    for learnt, told in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
-        part = reference.cut(*learnt)
-        mapped = StaticMap(StaticMapSettings(reference.rate_hz))
-        clean = np.isfinite(np.stack([part[name] for name in ("yaw_rate", "vx", "vy_ref")])).all(axis=0)
-        kept = {name: part[name][clean] for name in ("yaw_rate", "vx", "vy_ref")}
+        return zero
+    middle, vy = 0.5 * (start + stop), vy.copy()
+    for fitted, held_out in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
+        part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
+        clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
+        kept = {name: values[clean] for name, values in part.channels.items()}
+        model = StaticMap(StaticMapSettings(reference.rate_hz))
         try:
-            mapped.values = mapped.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
+            model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
         except DataError:
-            return found
-        vy[told] = mapped.lateral_velocity({name: reference[name][told] for name in mapped.channels})
-    return found | {"static_map": made("static_map", vy)}
+            return zero
+        vy[held_out] = model.lateral_velocity({name: reference[name][held_out] for name in model.channels})
+    return zero | {"static_map": made("static_map", vy)}

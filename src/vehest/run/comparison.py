@@ -16,9 +16,10 @@ from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact
 from vehest.run.config import GIVEN, Config
 from vehest.run.estimate import find_model, model_artefact
+from vehest.run.evaluate import Evaluation
 from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import all_of, check_channels, faults_of
-from vehest.run.group import Evaluation, Group, Member
+from vehest.run.group import Group, Member
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop
 from vehest.run.study import Job
@@ -231,7 +232,7 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
     for what, text in notes:
         key = "evaluation.rate_hz" if what == "evaluation" else "estimator.rate_hz"
         line = ("note", "rate", what, f"{text}; {key}=… chooses a lower rate")
-        if line not in runner.messages.said:
+        if line not in runner.messages.printed:
             runner.messages.line(*line)
 
 

@@ -1,4 +1,4 @@
-"""Whether a training has to wait for compilation first, so that people can be told."""
+"""Whether a training has to wait for compilation first."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import importlib
 from pathlib import Path
 
 SLOW = {"learned_ukf": "vehest.estimators.kernels.planar_car"}
-"""Estimators that compile for tens of seconds, and what of them takes longest."""
+"""Estimators that compile for tens of seconds -> their slowest kernel."""
 
 
 def has_to_compile(estimator: str) -> bool:
-    """Whether an estimator's training compiles on this machine before it starts; what it leaves is loaded from then on."""
+    """Whether an estimator's training compiles on this machine before it starts; later ones load the result."""
     if estimator not in SLOW:
         return False
     kernel = importlib.import_module(SLOW[estimator])

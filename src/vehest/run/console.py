@@ -1,6 +1,6 @@
-"""What people see while stages run: a line an artefact and a progress bar, all on standard error.
+"""Progress of stages on standard error: a line an artefact, and progress bars.
 
-Names and other text come from files: their control characters are shown as escapes, and nothing in them is read as markup.
+Text from files is shown with control characters as escapes, and nothing in it is read as markup.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-MOST_STANDING = 12
+WARNING = "warn"
+MOST_ROWS = 12  # of finished trainings above the bars
 MOST_BARS = 16  # of trainings that run at a time
-LINE_BREAK = "\n"
 
 
 class _Console(Console):
@@ -40,63 +40,46 @@ class _Console(Console):
         raise BrokenPipeError  # which rich would turn into an exit
 
 
-WARNING = "warn"
-
-
 class Messages:
-    """Lines and bars on standard error; standard output stays free for results.
-
-    Args:
-        quiet: say nothing but warnings.
-        silent: say nothing at all.
+    """Lines and bars on standard error; warnings alone if ``quiet``, nothing at all if ``silent``.
 
     Attributes:
-        said: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is printed.
+        printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
     """
 
     def __init__(self, *, quiet: bool = False, silent: bool = False) -> None:
         self.console = _Console(stderr=True, highlight=False, soft_wrap=True, quiet=silent)
         self.quiet = quiet or silent
-        self.said: list[tuple[str, str, str, str]] = []
+        self.printed: list[tuple[str, str, str, str]] = []
 
-    def again(self, said: Sequence[tuple[str, str, str, str]]) -> None:
-        """Say lines and warnings that were said before."""
-        for status, stage, label, detail in said:
+    def again(self, printed: Sequence[tuple[str, str, str, str]]) -> None:
+        """Print earlier lines and warnings once more."""
+        for status, stage, label, detail in printed:
             if status == WARNING:
                 self.warn(detail)
             else:
                 self.line(status, stage, label, detail)
 
     def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
-        """Say what became of one artefact."""
-        self.said.append((status, stage, label, detail))
+        """Print the status of one artefact."""
+        self.printed.append((status, stage, label, detail))
         if not self.quiet:
             word, colour = MARKS[status]
             shown = (f" {printable(detail)}" if detail else "", "dim")
             self._print(Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown))
 
     def warn(self, text: str) -> None:
-        """Say something that needs attention."""
-        self.said.append((WARNING, "", "", text))
-        self._print(Text.assemble(("warning", "yellow"), f" {printable(text, keep=LINE_BREAK)}"))
+        """Print a warning."""
+        self.printed.append((WARNING, "", "", text))
+        self._print(Text.assemble(("warning", "yellow"), f" {printable(text, keep=chr(10))}"))
 
     def _print(self, text: Text) -> None:
-        with suppress(OSError):  # nobody reads it, or its disk is full: the work goes on
+        with suppress(OSError):  # a closed stream or a full disk does not end the work
             self.console.print(text)
 
     @contextmanager
-    def off_record(self) -> Iterator[None]:
-        """Say in here what `said` is not to hold."""
-        before = self.said
-        self.said = []
-        try:
-            yield
-        finally:
-            self.said = before
-
-    @contextmanager
     def bars(self) -> Iterator[Bars]:
-        """Progress bars that vanish when all is done; nothing is drawn where there is no terminal."""
+        """Progress bars that vanish at the end; nothing is drawn without a terminal."""
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -111,46 +94,35 @@ class Messages:
 
 
 class Bars:
-    """Progress bars by name, and above them how those that are done stand to each other."""
+    """Progress bars by name, between a table of finished trainings and counts of all."""
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self._tasks: dict[str, TaskID] = {}
-        self._standing: dict[str, tuple[float, ...]] = {}
-        self._header: tuple[str, ...] = ()
+        self._done: dict[str, Mapping[str, float]] = {}
         self._counted: Mapping[str, str] = {}
 
     def __rich__(self) -> RenderableType:
-        shown: list[RenderableType] = [self._progress]
-        if self._standing:
-            shown.insert(0, self._table())
-        if self._counted:
-            counts = Table(*self._counted, box=None, header_style="dim", padding=(0, 2))
-            counts.add_row(*self._counted.values())
-            shown.append(counts)
-        return Group(*shown)
+        best = sorted(self._done.items(), key=lambda row: tuple(row[1].values()))[:MOST_ROWS]
+        rows: list[list[str | Text]] = [[Text(printable(name)), *(f"{value:.3f}" for value in figures.values())] for name, figures in best]
+        done = _grid(["done so far", *best[0][1]] if best else [], rows)
+        counts = _grid(list(self._counted), [list(self._counted.values())])
+        return Group(*done, self._progress, *counts)
 
     def count(self, counted: Mapping[str, str]) -> None:
-        """Say how much is done; nothing where there is nothing to count."""
+        """Show numbers below the bars, such as how many are done."""
         self._counted = counted
 
-    def _table(self) -> Table:
-        table = Table(*self._header, box=None, header_style="dim", padding=(0, 2))
-        for name, values in sorted(self._standing.items(), key=lambda row: row[1])[:MOST_STANDING]:
-            table.add_row(Text(printable(name)), *(f"{value:.3f}" for value in values))
-        return table
-
     def stands(self, name: str, figures: Mapping[str, float]) -> None:
-        """Add one that is done, by its figures; the first of them sorts the rows."""
+        """Add a finished training to the table, which the first figure sorts."""
         if figures:
-            self._header = ("done so far", *figures)
-            self._standing[name] = tuple(figures.values())
+            self._done[name] = figures
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
-        """Move a bar; it appears when it is first moved."""
-        if name not in self._tasks and len(self._tasks) >= MOST_BARS:
-            return
+        """Move a bar, which appears when it is first moved."""
         if name not in self._tasks:
+            if len(self._tasks) >= MOST_BARS:
+                return
             self._tasks[name] = self._progress.add_task(printable(name), total=total, note="")
         self._progress.update(self._tasks[name], completed=done, total=total, note=printable(note))
 
@@ -158,11 +130,19 @@ class Bars:
         """Move the bar of a training."""
         if progress is None:
             self.step(name, 0, 1, "starting")
-            return
-        note = f"{progress.active}/{progress.members} active, best validation loss {progress.best_validation_loss:.4g}"
-        self.step(name, progress.epoch, progress.max_epochs, note)
+        else:
+            note = f"{progress.active}/{progress.members} active, best validation loss {progress.best_validation_loss:.4g}"
+            self.step(name, progress.epoch, progress.max_epochs, note)
 
     def close(self, name: str) -> None:
-        """Take a bar away."""
+        """Remove a bar."""
         if name in self._tasks:
             self._progress.remove_task(self._tasks.pop(name))
+
+
+def _grid(header: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> list[Table]:
+    """A table without borders; nothing without a header."""
+    table = Table(*header, box=None, header_style="dim", padding=(0, 2))
+    for row in rows if header else ():
+        table.add_row(*row)
+    return [table] if header else []

@@ -1,4 +1,4 @@
-"""Before the first stage: fetch a data set's files into its folder."""
+"""Before the first stage: fetches a data set's files into its folder."""
 
 from __future__ import annotations
 
@@ -12,23 +12,20 @@ from vehest.sources.download import Outcome, download_of
 
 
 def download_files(config: Config, runner: Runner) -> None:
-    """Fetch what is missing of a data set's files, and record or compare the checksums of the others.
-
-    Args:
-        config: as composed for ``ingest``.
-        runner: whose messages and dry run apply.
+    """Fetch missing files of a data set, and record or compare the checksums of the others.
 
     Raises:
-        ConfigurationError: the data set does not say where its files come from.
+        ConfigurationError: the data set names no source of its files.
         DataError: a file has other bytes than recorded.
         MissingError: no data root is set, the server is out of reach or lacks a file, or the disk is full.
         DryRunStop: in a dry run, if a file would have to be fetched.
     """
     source = open_source(config["dataset"])
     if source.dataset.get("download") is None:
+        known = [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]
         raise ConfigurationError(
             f"data set '{source.name}' does not say where its files can be fetched from (download); "
-            f"data sets that do: {', '.join(_downloadable()) or 'none'}"
+            f"data sets that do: {', '.join(known) or 'none'}"
         )
     download = download_of(source)
     if runner.dry_run:
@@ -46,18 +43,13 @@ def download_files(config: Config, runner: Runner) -> None:
 
         for outcome in download.fetch(progress):
             bars.close(f"download {outcome.name}")
-            runner.messages.line("skip" if outcome.what == "matched" else "done", "download", outcome.name, _detail(outcome))
+            runner.messages.line("skip" if outcome.what == "matched" else "done", "download", outcome.name, _in_words(outcome))
 
 
-def _detail(outcome: Outcome) -> str:
+def _in_words(outcome: Outcome) -> str:
     if outcome.what == "matched":
         return "is there, with the recorded checksum"
     if outcome.what == "recorded":
         return f"was there; its checksum is now recorded: sha256 {outcome.sha256}"
     went_on = f", went on after {outcome.resumed_at / 1e6:.1f} MB" if outcome.resumed_at else ""
     return f"{outcome.size / 1e6:.1f} MB{went_on}, sha256 {outcome.sha256}"
-
-
-def _downloadable() -> list[str]:
-    """Data sets that say where their files come from."""
-    return [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]

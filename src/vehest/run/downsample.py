@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.data.store import read_recording, write_recording
 from vehest.data.transforms import Resample, Transform, transform_from_config
 from vehest.run.artefacts import Artefact, StagePlan
@@ -16,31 +17,18 @@ VERSION = "1"
 
 
 def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
-    """What a downsampling would make.
-
-    Args:
-        ingested: what the ingest stage made.
-        rate_hz: new rate [Hz].
-        options: ``downsample`` of the configuration.
-        output: the output root.
+    """The artefact of a downsampling.
 
     Raises:
         ConfigurationError: a rate, method or transform that makes no sense.
     """
     config = {"rate_hz": float(rate_hz), "method": options["method"], "transforms": list(options.get("transforms") or [])}
     transforms_of(config)
-    return StagePlan(
-        stage=STAGE,
-        label=f"{ingested.label}-{rate_hz:g}hz",
-        config=config,
-        inputs=dict(ingested.outputs),
-        code=code_of_downsampling(),
-        output=output,
-    )
+    return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of_downsampling(), output)
 
 
 def code_of_downsampling() -> str:
-    """Version of what a downsampling runs."""
+    """Version of a downsampling."""
     return f"downsample={VERSION}"
 
 
@@ -50,19 +38,24 @@ def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path
     Raises:
         DataError: a recording cannot be brought to that rate.
     """
-    transforms = transforms_of(config)
     for name in ingested.outputs:
-        recording = read_recording(ingested.folder / name)
-        if config["rate_hz"] > recording.rate_hz * (1 + 1e-9):
-            raise DataError(
-                f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {config['rate_hz']:g} Hz asked for"
-            )
-        for transform in transforms:
-            recording = transform(recording)
-        write_recording(recording, folder / name)
+        write_recording(resampled(read_recording(ingested.folder / name), config["rate_hz"], config), folder / name)
 
 
-def transforms_of(config: Mapping[str, Any]) -> Sequence[Transform]:
-    """The transforms that a downsampling applies, in order."""
+def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, Any]) -> Recording:
+    """A recording at another rate, after the transforms of a preparation and by its method.
+
+    Raises:
+        DataError: it is sampled more slowly.
+    """
+    if recording.rate_hz < rate_hz * (1 - 1e-9):
+        raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed")
+    for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
+        recording = transform(recording)
+    return recording
+
+
+def transforms_of(config: Mapping[str, Any]) -> list[Transform]:
+    """The transforms of a downsampling, in order."""
     first = [transform_from_config(entry) for entry in config["transforms"]]
     return [*first, Resample(float(config["rate_hz"]), config["method"])]

@@ -1,4 +1,7 @@
-"""Running a trained model on a new recording that has no reference channels."""
+"""Runs a trained model on a new recording that has no reference channels.
+
+model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.alignment.checks import checks_of_recording
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
@@ -27,7 +30,7 @@ from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
-from vehest.run.downsample import transforms_of
+from vehest.run.downsample import resampled
 from vehest.run.printing import complain, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
@@ -37,36 +40,25 @@ from vehest.trust.record import Trust, is_other_vehicle
 from vehest.trust.verdict import reason_in_words
 
 SUFFIXES = (".parquet", ".csv")
-CONTRADICTIONS = ("sign", "unit")
-"""Checks that prove a channel wrong by others."""
+CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 PRETRAINED = "pretrained"
-"""Name of the model that comes with vehest, for cars that nobody has trained on."""
+"""Name of the model that comes with vehest, for cars without a model of their own."""
 
 
 def pretrained_folder() -> Path:
-    """Where the model that comes with vehest lies."""
+    """The folder of the model that comes with vehest."""
     return Path(__file__).resolve().parents[1] / PRETRAINED
 
 
 def pretrained_note() -> str:
-    """What people should know of an estimate by the model that comes with vehest.
-
-    Raises:
-        MissingError: it is not installed.
-        DataError: its description is damaged.
-    """
+    """The caution that goes with estimates of the model that comes with vehest."""
     return " ".join(read_description(pretrained_folder()).about.note.split())
 
 
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
 
-    Of several that fit the newest is taken.
-
-    Args:
-        name: path or start of the name.
-        output: the output root.
-        say: told which one was taken and which others fit.
+    Of several models the newest is taken, with a remark to ``say``.
 
     Raises:
         MissingError: there is none.
@@ -76,16 +68,31 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
         return given
     if name == PRETRAINED:
         return pretrained_folder()
-    found = sorted(folder for folder in (output / "train").glob(f"{given.name}*") if folder.is_dir() and not folder.name.startswith("."))
+    models = sorted(output.glob("train/[!.]*"))
+    found = sorted(
+        (folder for folder in models if folder.is_dir() and folder.match(f"{given.name}*")), key=lambda folder: -folder.stat().st_mtime_ns
+    )
     if not found:
-        known = sorted(folder.name for folder in (output / "train").glob("[!.]*"))
+        known = [folder.name for folder in models]
         listed = f" (there are: {', '.join(known[:8])}{', …' if len(known) > 8 else ''})" if known else "; train one first"
         raise MissingError(f"there is no model '{name}', neither a folder nor in '{output / 'train'}'{listed}")
     if len(found) > 1:
-        found.sort(key=lambda folder: folder.stat().st_mtime_ns, reverse=True)
         others = f"{', '.join(folder.name for folder in found[1:4])}{f' and {len(found) - 4} more' if len(found) > 4 else ''}"
         say(f"'{name}' is taken for {found[0].name}, the newest; it could also be {others}")
     return found[0]
+
+
+def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Path, Estimator, Trust | None]:
+    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration.
+
+    Raises:
+        MissingError: there is none.
+        DataError: its files are damaged.
+    """
+    folder = find_model(name, output, say)
+    model = load_model(folder)
+    model.preparation = preparation_of(folder)
+    return folder, model, trust_of(folder, output)
 
 
 def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> dict[str, Any]:
@@ -94,7 +101,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
         out: table to write.
-        strict: whether what speaks against a channel is an error; else it is printed as a warning.
+        strict: whether findings in the channels are an error; else they are printed as warnings.
 
     Returns:
         Figures of the estimate and a verdict.
@@ -108,44 +115,41 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
-    if out.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"'{out}' must end in {' or '.join(SUFFIXES)}")
-    config = compose_config("estimate", overrides)
-    folder = find_model(name, Path(config["output"]), note)
-    model = load_model(folder)
-    own_preparation = any(key_of(override).split(".")[0] == "downsample" for override in overrides)
-    downsample = config["downsample"] if own_preparation else preparation_of(folder)
+    _check_table_name(out)
     if out.is_dir():
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
-    trust = trust_of(folder, Path(config["output"]))
+    config = compose_config("estimate", overrides)
+    folder, model, trust = open_model(name, Path(config["output"]), note)
+    if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
+        model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):
         drive = read_table(file, overrides)
-        findings = findings_for(drive, model, config["dataset"].get("accept") or ())
+        findings = _findings(drive, model, config["dataset"].get("accept") or ())
         if strict and findings:
-            raise DataError(f"'{file}': {finding_in_words(findings[0])}")
-        result = estimate_recording(model, drive, downsample, trust)
+            raise DataError(f"'{file}': {findings[0]}")
+        result = estimate_recording(model, drive, trust)
     for finding in findings:
-        complain(f"warning: {finding_in_words(finding)}")
+        complain(f"warning: {finding}")
     write_estimate_table(result, out)
-    remark = {"note": pretrained_note()} if name == PRETRAINED else {}
-    said = {"verdict": verdict_of(result, drive, trust), "findings": [finding_in_words(finding) for finding in findings]}
-    return {"out": str(out), "model": str(folder) if not remark else PRETRAINED, **summary_of(result), **said, **remark}
+    figures = {"verdict": _verdict(result, drive, trust), "findings": findings}
+    figures |= {"note": pretrained_note()} if name == PRETRAINED else {}
+    return {"out": str(out), "model": PRETRAINED if name == PRETRAINED else str(folder), **_summary(result), **figures}
 
 
 def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact: that of the stage ``train``, or one that came without, such as `pretrained_folder` or what `save` wrote.
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model.
 
     Raises:
         MissingError: there is no model.
         DataError: its files are damaged.
-        ConfigurationError: it is what another stage made.
+        ConfigurationError: another stage made it.
     """
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != TRAIN:
-            raise ConfigurationError(f"'{folder}' holds no model but what the stage '{artefact.stage}' made")
+            raise ConfigurationError(f"'{folder}' holds no model but an artefact of the stage '{artefact.stage}'")
         return artefact
     about = read_description(folder)
     outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
@@ -155,13 +159,13 @@ def model_artefact(folder: Path) -> Artefact:
     return Artefact(folder, TRAIN, label, key, "complete", outputs, config, {}, skipped=True)
 
 
+def preparation_of(model_folder: Path) -> dict[str, Any]:
+    """Method and transforms of a model's training data; new recordings must be prepared the same way."""
+    return read_description(model_folder).about.downsample.as_plain()
+
+
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
     """Read a recording from its file, a table unless the data set says otherwise, as conf/estimate.yaml and overrides describe it.
-
-    Args:
-        path: the file.
-        overrides: of conf/estimate.yaml.
-        references: whether reference channels that the data set declares are read.
 
     Raises:
         MissingError: there is no such file.
@@ -169,12 +173,17 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
         ConfigurationError: the file is of another format than the data set's.
     """
     config = compose_config("estimate", overrides)
+    dataset = config["dataset"] if references else _without_references(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):
-        return _read_table(path, config["dataset"], references)
+        recording = read_single(dataset, path)
+        for finding in checks_of_recording(recording):
+            if finding.level == "error" and finding.check not in (dataset.get("accept") or []):
+                raise DataError(f"'{path}': channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
+    return recording
 
 
 def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
-    """A data set's options for a new drive, which needs no reference channels, whatever is declared; not validated yet."""
+    """Options of a data set without its reference channels; not validated yet."""
     channels, transforms = dataset.get("channels"), dataset.get("transforms")
     if isinstance(channels, dict):
         channels = {name: entry for name, entry in channels.items() if not str(name).endswith(REFERENCE_SUFFIX)}
@@ -184,61 +193,52 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
 
 
-def _read_table(path: Path, dataset: dict[str, Any], references: bool) -> Recording:
-    if not references:
-        dataset = _without_references(dataset)
-    recording = read_single(dataset, path)
-    accepted = set(dataset.get("accept") or [])
-    for finding in checks_of_recording(recording):
-        if finding.level == "error" and finding.check not in accepted:
-            raise DataError(f"'{path}': channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
-    return recording
+def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
+    """Findings of the checks in the channels that a model reads, the gravest first.
+
+    Raises:
+        DataError: these channels contradict each other in sign or unit, so that no estimate can be right.
+    """
+    read = [name for name in model.channels if name in recording]
+    findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
+    for finding in findings:
+        if finding.check in CONTRADICTIONS and finding.check not in accepted:
+            raise DataError(
+                f"recording '{recording.id}': channels contradict each other: {finding.message} (or dataset.accept=[{finding.check}])"
+            )
+    return [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
 
 
-def estimate_recording(model: Estimator, recording: Recording, downsample: dict[str, Any], trust: Trust | None = None) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it, under the contract that holds online (`vehest.trust.contract`).
-
-    Args:
-        model: fitted.
-        recording: with the channels that the model reads, at any rate from the model's upwards.
-        downsample: method and transforms, as in `preparation_of`.
-        trust: learnt with the model; without it there is neither band nor health of channels.
+def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
+    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`).
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    needed = prepared_recording(model, recording, downsample)
+    needed = prepared_recording(model, recording)
     estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_other_vehicle(trust, recording))
     return require_estimate(model, recording, estimate)
 
 
-def prepared_recording(model: Estimator, recording: Recording, downsample: dict[str, Any]) -> Recording:
+def prepared_recording(model: Estimator, recording: Recording) -> Recording:
     """The channels that a model reads, at its rate; see `estimate_recording`.
 
     Raises:
         DataError: a channel is missing, or the recording is sampled too slowly.
     """
-    rate = model.settings.rate_hz
-    needed = recording.select(model.channels) if all(name in recording for name in model.channels) else recording
     for name in model.channels:
-        if name not in needed:
+        if name not in recording:
             raise DataError(
                 f"recording '{recording.id}' has no channel '{name}', which '{model.name}' needs (it reads {', '.join(model.channels)})"
             )
-    if recording.rate_hz < rate * (1 - 1e-9):
-        raise DataError(
-            f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate:g} Hz that '{model.name}' works at"
-        )
-    for transform in transforms_of({"rate_hz": rate, **downsample}):
-        needed = transform(needed)
-    return needed
+    return resampled(recording.select(model.channels), model.settings.rate_hz, model.preparation)
 
 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
-    """The estimate, if there is any.
+    """The estimate, unless it is empty.
 
     Raises:
-        DataError: there is none, since the recording is too short.
+        DataError: the recording is too short.
     """
     if np.isnan(estimate["vy"]).all():
         raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
@@ -252,80 +252,51 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
         ConfigurationError: another ending.
         MissingError: it cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"'{path}' must end in {' or '.join(SUFFIXES)}")
+    _check_table_name(path)
     if path.suffix.lower() == ".parquet":
         write_estimate(estimate, path)
         return
-    columns: dict[str, Any] = {"time": estimate.time, **estimate.channels}
-    if "health" in columns:
-        columns["health"] = columns["health"].astype(int)
-        columns["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
-    frame = pd.DataFrame(columns)
+    frame = pd.DataFrame({"time": estimate.time, **estimate.channels})
+    if "health" in frame:
+        frame["health"] = frame["health"].astype(int)
+        frame["health_reason"] = [reason_in_words(code) for code in frame["health_reason"]]
     with written_aside(path) as aside:
         frame.to_csv(aside, index=False, lineterminator="\n")
 
 
-def preparation_of(model_folder: Path) -> dict[str, Any]:
-    """How a model's recordings were brought to its rate when it was trained; a new one must be prepared the same way."""
-    return read_description(model_folder).about.downsample.as_plain()
+def _check_table_name(path: Path) -> None:
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigurationError(f"'{path}' must end in {' or '.join(SUFFIXES)}")
 
 
-def summary_of(estimate: Estimate) -> dict[str, Any]:
-    """What an estimate holds, for people and scripts."""
-    known = estimate["vy"][~pd.isna(estimate["vy"])]
-    degrees = [math.degrees(value) for value in (estimate["sideslip"][~pd.isna(estimate["sideslip"])])] or [math.nan]
-    said: dict[str, Any] = {
+def _summary(estimate: Estimate) -> dict[str, Any]:
+    """Figures of an estimate, for people and scripts."""
+    degrees = [math.degrees(value) for value in estimate["sideslip"][~np.isnan(estimate["sideslip"])]] or [math.nan]
+    figures: dict[str, Any] = {
         "recording": estimate.recording_id,
         "estimator": estimate.estimator,
         "rate_hz": estimate.rate_hz,
         "samples": len(estimate),
-        "estimated": len(known),
+        "estimated": int((~np.isnan(estimate["vy"])).sum()),
         "quantities": {name: QUANTITIES[name] for name in estimate.channels},
         "sideslip_deg": {"min": round(min(degrees), 3), "max": round(max(degrees), 3)},
     }
     if "band_sideslip" in estimate.channels:
         half = np.degrees(estimate["band_sideslip"][~np.isnan(estimate["band_sideslip"])])
-        said["band_sideslip_deg"] = (
-            {"median": round(float(np.median(half)), 3), "largest": round(float(half.max()), 3)} if len(half) else {}
-        )
-    return said
+        band = {"median": round(float(np.median(half)), 3), "largest": round(float(half.max()), 3)} if len(half) else {}
+        figures["band_sideslip_deg"] = band
+    return figures
 
 
-def findings_for(recording: Recording, model: Estimator, accepted: Sequence[str] = ()) -> list[Finding]:
-    """What the checks find in the channels that a model reads, the gravest first.
-
-    Args:
-        recording: at its native rate.
-        model: whose channels count.
-        accepted: names of checks that are not to stop anything.
-
-    Raises:
-        DataError: channels that the model reads contradict each other in sign or unit, which no estimate survives.
-    """
-    read = [name for name in model.channels if name in recording]
-    findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
-    for finding in findings:
-        if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            raise DataError(
-                f"recording '{recording.id}': channels contradict each other: {finding.message} (or dataset.accept=[{finding.check}])"
-            )
-    return findings
-
-
-def finding_in_words(finding: Finding) -> str:
-    """What a check found, after the channel's name where it is about one."""
-    return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
-
-
-def verdict_of(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
-    """How far an estimate can be trusted, in a line."""
+def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
+    """The share of valid samples and what makes others invalid, in a line."""
     if trust is None or trust.health is None:
         return "this model has no calibration: no band, and health from gaps and speeds alone"
-    status, reasons = estimate["health"], estimate["health_reason"]
-    outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
-    bad = status[~np.isnan(estimate["vy"])] > 0
-    found, counts = np.unique(reasons[(status > 0) & (reasons > 0) & ~np.isnan(estimate["vy"])], return_counts=True)
+    estimated = ~np.isnan(estimate["vy"])
+    status, reasons = estimate["health"][estimated], estimate["health_reason"][estimated]
+    found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
     worst = [reason_in_words(float(found[at])) for at in np.argsort(-counts)[:2]]
-    said = f"valid in {100.0 * (1.0 - float(bad.mean())):.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
-    return f"{outside}; {said}" if outside else said
+    share = 100.0 * (1.0 - float((status > 0).mean()))
+    valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
+    outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
+    return f"{outside}; {valid}" if outside else valid

@@ -1,4 +1,4 @@
-"""Which faults an evaluation is made under, as conf/fault, ``faults`` of the configuration and pipelines name them."""
+"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them."""
 
 from __future__ import annotations
 
@@ -17,35 +17,23 @@ from vehest.data.splits import Span, Split
 from vehest.run.artefacts import Artefact
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
-from vehest.run.evaluate import scored_spans
 from vehest.run.train import recording_file
 from vehest.trust.faults import Fault, Severity
 
-NONE = "none"
-DRAWN_START = (0.2, 0.4)
-"""Between which shares of a range a fault starts whose start is drawn."""
+NONE = {"name": "none"}
+DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 
 
 @dataclass(frozen=True)
 class FaultSettings:
-    """One choice of ``fault``.
-
-    Args:
-        name: kind of the fault.
-        channel: that it befalls.
-        severity: which size.
-        size: instead of the severity's.
-        start: after the start of each range [s]; None: drawn, within `DRAWN_START`.
-        duration: how long it lasts [s]; None: to the end of the range.
-        seed: of everything that is drawn.
-    """
+    """One choice of ``fault``; conf/fault explains its keys."""
 
     name: str
     channel: str
     severity: Annotated[Severity, "mild, medium or severe"]
-    size: float | None = None
-    start: float | None = None
-    duration: float | None = None
+    size: float | None = None  # instead of the severity's
+    start: float | None = None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    duration: float | None = None  # [s]; None: to the end of the range
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -53,7 +41,7 @@ class FaultSettings:
 
     @property
     def condition(self) -> str:
-        """What it is called in an evaluation."""
+        """Its name in an evaluation."""
         return self._fault.condition
 
     @property
@@ -61,13 +49,7 @@ class FaultSettings:
         return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
 
     def within(self, start: float, length: float, position: int) -> Fault:
-        """The fault in one of the ranges, or sequences, that an estimate is made of; what is drawn differs between them.
-
-        Args:
-            start: of the range, after the first sample that the estimator gets [s].
-            length: of the range [s].
-            position: of the range among those of its test set.
-        """
+        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length`` [s] long; each draws anew."""
         drawn = np.random.default_rng([self.seed, position])
         own_start = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
         if own_start < 0:
@@ -77,7 +59,7 @@ class FaultSettings:
 
 
 def faults_of(config: Config) -> tuple[FaultSettings, ...]:
-    """The faults that a configuration of ``eval`` names: those listed in ``faults``, then the choice of ``fault``.
+    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``.
 
     Raises:
         ConfigurationError: a fault that makes no sense, or two of one name.
@@ -87,57 +69,56 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
         raise ConfigurationError(
             "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]"
         )
-    bases: dict[str, Mapping[str, Any]] = {}
-    found = []
-    for entry in listed:
-        kind = str(entry["kind"])  # which is a number where Hydra reads nan or inf
-        if kind not in bases:
-            bases[kind] = _base(kind)
-        found.append(_settings({**bases[kind], **{key: value for key, value in entry.items() if key != "kind"}}))
+    kinds, known = [str(entry["kind"]) for entry in listed], [name for name in choices("fault") if name != NONE["name"]]
+    if unknown := [kind for kind in kinds if kind not in known]:
+        raise ConfigurationError(f"faults: there is no kind '{unknown[0]}'; there are: {', '.join(known)}")
+    bases = {kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(kinds)}
+    found = [
+        _settings({**bases[kind], **{key: value for key, value in entry.items() if key != "kind"}})
+        for kind, entry in zip(kinds, listed, strict=True)
+    ]
     chosen = chosen_fault(config)
-    return all_of([found, [chosen] if chosen is not None else []])
+    return all_of([found, [] if chosen is None else [chosen]])
 
 
 def chosen_fault(config: Config) -> FaultSettings | None:
-    """The choice of ``fault``, which the figures of a sweep are of; None where there is none.
+    """The choice of ``fault``, if any; the figures of a sweep are those under it.
 
     Raises:
         ConfigurationError: it makes no sense.
     """
-    chosen = config.get("fault") or {"name": NONE}
-    return None if chosen == {"name": NONE} else _settings(chosen)
+    chosen = config.get("fault") or NONE
+    return None if chosen == NONE else _settings(chosen)
+
+
+def _settings(content: Mapping[str, Any]) -> FaultSettings:
+    return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")
 
 
 def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
     """Faults of several configurations together, each once.
 
     Raises:
-        ConfigurationError: two that differ have one name, so that nobody could tell their errors apart.
+        ConfigurationError: two different ones have one name.
     """
     found: dict[str, FaultSettings] = {}
-    for own in (fault for some in faults for fault in some):
-        if found.setdefault(own.condition, own) != own:
+    for fault in (fault for some in faults for fault in some):
+        if found.setdefault(fault.condition, fault) != fault:
             raise ConfigurationError(
-                f"two faults are both called {own.condition}: they differ in start or duration; give them different seeds too, "
+                f"two faults are both called {fault.condition}: they differ in start or duration; give them different seeds too, "
                 f"or evaluate them one after the other"
             )
     return tuple(found.values())
 
 
 def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]) -> None:
-    """See that the recordings of every test have the channels that faults befall; no samples are read.
-
-    Args:
-        faults: of an evaluation.
-        split: its validation range and tests.
-        data: data set -> recordings at the estimator's rate.
+    """Check that all scored recordings have the faulty channels; no samples are read.
 
     Raises:
         ConfigurationError: one of them lacks one.
     """
-    if not faults:
-        return
-    for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in scored_spans(split)):
+    spans = [span for spans in (split.validation, *split.tests.values()) for span in spans] if faults else []
+    for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
         held = stored_contents(recording_file(data[dataset], Span(dataset, recording))).channels
         for fault in faults:
             if fault.channel not in held:
@@ -146,17 +127,3 @@ def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[
                     f"fault '{fault.condition}': recording '{recording}' of data set '{dataset}' has no channel '{fault.channel}' "
                     f"(it has {known})"
                 )
-
-
-def _base(kind: str) -> Mapping[str, Any]:
-    """What conf/fault says of a kind."""
-    known = [name for name in choices("fault") if name != NONE]
-    if kind not in known:
-        raise ConfigurationError(f"faults: there is no kind '{kind}'; there are: {', '.join(known)}")
-    own = compose_config("eval", [f"fault={kind}"])["fault"]
-    assert isinstance(own, dict)
-    return own
-
-
-def _settings(content: Mapping[str, Any]) -> FaultSettings:
-    return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")

@@ -5,7 +5,7 @@ Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluatio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,46 +15,15 @@ import torch
 
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
-from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
 from vehest.run.calibrate import plan_calibrate, write_calibration
-from vehest.run.evaluate import plan_evaluate
-from vehest.run.evaluate_faults import FaultedJob, write_faulted
-from vehest.run.faults import FaultSettings
+from vehest.run.evaluate import Evaluation, write_evaluation
 from vehest.run.locks import Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
 
 Report = Callable[[Progress | Waiting], None]
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """How the members of a group are to be evaluated.
-
-    Args:
-        split: its validation range and tests are scored.
-        data: data set -> recordings at the estimator's rate.
-        references: data set -> recordings at the evaluation rate.
-        kinds: data set -> ``real`` or ``simulated``.
-        protocol: how estimates are scored.
-        output: the output root.
-        faults: under which they are evaluated too.
-    """
-
-    split: Split
-    data: Mapping[str, Artefact]
-    references: Mapping[str, Artefact]
-    kinds: Mapping[str, str]
-    protocol: Protocol
-    output: Path
-    faults: tuple[FaultSettings, ...] = ()
-
-    def of(self, model: Artefact, calibration: Artefact | None) -> FaultedJob:
-        """The evaluation of a model that was calibrated, or not."""
-        job = plan_evaluate(model, self.split, self.data, self.references, self.kinds, self.protocol, self.output, calibration)
-        return FaultedJob(job, self.faults)
 
 
 @dataclass(frozen=True)
@@ -152,7 +121,7 @@ def _member(
             return Member(job, model)
     if group.evaluation is not None:
         scoring = group.evaluation.of(model, calibration)
-        evaluation = made(scoring.plan, partial(write_faulted, scoring))
+        evaluation = made(scoring.plan, partial(write_evaluation, scoring))
     return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
 
 

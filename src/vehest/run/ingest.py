@@ -1,4 +1,7 @@
-"""First stage: raw files, or a simulation, to recordings in the store."""
+"""First stage: raw files, or a simulation, to recordings in the store.
+
+data set -> source -> recording -> checks -> one Parquet file each
+"""
 
 from __future__ import annotations
 
@@ -12,30 +15,26 @@ from typing import Any
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove, remove_leftovers, sha256_of
-from vehest.data.recording import Recording
-from vehest.data.store import write_recording
-from vehest.run.artefacts import StagePlan
-from vehest.run.config import Config, missing_keys
+from vehest.data.store import read_recording, write_recording
+from vehest.run.artefacts import Artefact, StagePlan
+from vehest.run.config import Config, compose_config, key_of, missing_keys
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
 from vehest.run.locks import held
 from vehest.run.signals import StopSignals
-from vehest.sources.base import Source, open_source, source_class
+from vehest.sources.base import SIMULATED, Source, open_source, source_class
 from vehest.training.context import Progress
 
 STAGE = "ingest"
 VERSION = "1"
 PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
-Report = Callable[[int, int, str], None]
-PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; says nothing about its samples
+Report = Callable[[int, int, str], None]  # recordings done, recordings in all, name of one that was begun
+PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a data set's configuration; samples do not depend on it
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """What an ingest would make.
-
-    Args:
-        config: as composed for ``ingest``.
+    """The artefact of an ingest.
 
     Raises:
         MissingError: the raw files are not there.
@@ -43,47 +42,27 @@ def plan_ingest(config: Config) -> StagePlan:
         DataError: a recording's name cannot be a file's.
     """
     dataset: Mapping[str, Any] = config["dataset"]
-    missing = missing_keys(dict(dataset))
-    if missing:
+    if missing := missing_keys(dict(dataset)):
         raise ConfigurationError(f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set")
     source = open_source(dataset)
     if not source.ids():
         raise ConfigurationError(f"data set '{source.name}' names no recordings")
     for recording_id in source.ids():
         recording_file(recording_id)
+    content = {key: value for key, value in dataset.items() if key not in PROSE}
     inputs = {name: sha256_of(origin) if isinstance(origin, Path) else str(origin) for name, origin in source.inputs().items()}
-    return StagePlan(
-        stage=STAGE,
-        label=source.name,
-        config={key: value for key, value in dataset.items() if key not in PROSE},
-        inputs=inputs,
-        code=code_of_ingest(dataset),
-        output=Path(config["output"]),
-    )
+    return StagePlan(STAGE, source.name, content, inputs, code_of_ingest(dataset), Path(config["output"]))
 
 
 def code_of_ingest(dataset: Mapping[str, Any]) -> str:
-    """Version of what an ingest runs.
-
-    Args:
-        dataset: its configuration.
-    """
+    """Version of an ingest of a data set."""
     return f"ingest={VERSION} {dataset['source']}={source_class(dataset).version}"
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:
     """Read every recording, check it, and write it into ``folder``.
 
-    Where recordings take long to make, they are made side by side, and those that are done are kept beside the artefacts until all
-    are: a run that was interrupted goes on with the missing ones.
-
-    Args:
-        config: as composed for ``ingest``.
-        plan: of this ingest.
-        folder: empty.
-        jobs: processes.
-        stop: when a signal came, no other recording is begun.
-        report: called with (recordings done, recordings in all, name of one that was begun).
+    Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
 
     Raises:
         DataError: a recording cannot be used as it is.
@@ -91,29 +70,27 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     """
     source = open_source(config["dataset"])
     ids = source.ids()
-    if source.slow:
-        _make_side_by_side(config["dataset"], ids, plan, folder, jobs, stop, report)
+    if not source.slow:
+        for position, recording_id in enumerate(ids):
+            report(position, len(ids), recording_id)
+            _make(source, recording_id, folder)
         return
-    for position, recording_id in enumerate(ids):
-        report(position, len(ids), recording_id)
-        _make(source, recording_id, folder)
-
-
-def _make_side_by_side(
-    dataset: Mapping[str, Any], ids: Sequence[str], plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report
-) -> None:
     parts = _parts_of(plan)
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
     missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
-    tasks = [partial(_make_part, dict(dataset), recording_id, parts) for recording_id in missing]
-    made, failures = [recording_id for recording_id in ids if recording_id not in missing], []
-    for end in launch(tasks, jobs, stop, lambda at, _: report(len(made), len(ids), missing[at])):
+    tasks = [partial(_make_part, dict(config["dataset"]), recording_id, parts) for recording_id in missing]
+    done, failures = len(ids) - len(missing), []
+
+    def begun(at: int, _: object) -> None:
+        report(done, len(ids), missing[at])
+
+    for end in launch(tasks, jobs, stop, begun):
         if isinstance(end.outcome, Failure):
             failures.append(end.outcome)
         else:
-            made.append(end.outcome)
-            report(len(made), len(ids), "")
+            done += 1
+            report(done, len(ids), "")
     if not any(parts.iterdir() if parts.is_dir() else ()):
         remove(parts)
     stop.raise_if_requested()
@@ -125,8 +102,37 @@ def _make_side_by_side(
         _link(parts / recording_file(recording_id), folder / recording_file(recording_id))
 
 
+def _make_part(
+    dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
+) -> None:
+    _make(open_source(dataset), recording_id, parts)
+
+
+def _make(source: Source, recording_id: str, folder: Path) -> None:
+    """Read, check and write a recording.
+
+    Raises:
+        DataError: it is unusable, or a check finds an error that the data set does not accept.
+    """
+    recording = source.read(recording_id)
+    for finding in checks_of_recording(recording):
+        if finding.level == "error" and finding.check not in (source.dataset.get("accept") or []):
+            raise DataError(
+                f"data set '{source.name}', recording '{recording.id}': channel '{finding.channel}': {finding.message} "
+                f"(or accept: [{finding.check}])"
+            )
+    write_recording(recording, folder / recording_file(recording_id))
+
+
+def _link(source: Path, target: Path) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # not every file system has links
+        shutil.copyfile(source, target)
+
+
 def drop_parts(plan: StagePlan) -> None:
-    """Remove what was kept for an ingest that is finished, unless somebody makes it once more."""
+    """Remove the parts of a finished ingest, unless another process makes it once more."""
     if _parts_of(plan).exists():
         with held(plan.lock) as free:
             if free:
@@ -137,43 +143,8 @@ def _parts_of(plan: StagePlan) -> Path:
     return plan.folder.with_name(f"{PARTS_PREFIX}{plan.folder.name}")
 
 
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # not every file system has links
-        shutil.copyfile(source, target)
-
-
-def _make_part(
-    dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
-) -> str:
-    _make(open_source(dataset), recording_id, parts)
-    return recording_id
-
-
-def _make(source: Source, recording_id: str, folder: Path) -> None:
-    recording = source.read(recording_id)
-    refuse_unusable(recording, source)
-    write_recording(recording, folder / recording_file(recording_id))
-
-
-def refuse_unusable(recording: Recording, source: Source) -> None:
-    """Stop where a check finds an error that the data set does not accept.
-
-    Raises:
-        DataError: what was found.
-    """
-    accepted = set(source.dataset.get("accept") or [])
-    for finding in checks_of_recording(recording):
-        if finding.level == "error" and finding.check not in accepted:
-            raise DataError(
-                f"data set '{source.name}', recording '{recording.id}': channel '{finding.channel}': {finding.message} "
-                f"(or accept: [{finding.check}])"
-            )
-
-
 def recording_file(recording_id: str) -> str:
-    """The name of a recording's file in the store: the id itself, since splits and later stages find recordings by it.
+    """The file of a recording in the store: its name is the id itself, by which splits and later stages find it.
 
     Raises:
         DataError: the id cannot be a file's name, or would lead elsewhere.
@@ -185,3 +156,34 @@ def recording_file(recording_id: str) -> str:
             f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
         )
     return f"{recording_id}.parquet"
+
+
+def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
+    """The configuration of a simulated data set's ingest; ``seed=1`` among the overrides is short for ``dataset.seed=1``.
+
+    Raises:
+        ConfigurationError: the data set is not simulated, or an override makes no sense.
+    """
+    spelt_out = [f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override for override in overrides]
+    config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
+    if config["dataset"].get("source") != SIMULATED:
+        raise ConfigurationError(f"data set '{dataset}' is not simulated but read from files; run 'vehest ingest {dataset}'")
+    return config
+
+
+def outcome_of(ingested: Artefact) -> dict[str, Any]:
+    """Number and hours of the drives, and the names of those that span, left the road or ended before their manoeuvre did.
+
+    Raises:
+        DataError: a recording is damaged.
+    """
+    hours = 0.0
+    flagged: dict[str, list[str]] = {"spun": [], "left_road": [], "not_completed": []}
+    for name in sorted(ingested.outputs):
+        recording = read_recording(ingested.folder / name, ["vx"])
+        flags: Mapping[str, Any] = recording.provenance.get("flags", {})
+        hours += len(recording) / recording.rate_hz / 3600.0
+        for flag, holds in (("spun", flags.get("spun")), ("left_road", flags.get("left_road")), ("not_completed", not flags["completed"])):
+            if holds:
+                flagged[flag].append(recording.id)
+    return {"drives": len(ingested.outputs), "hours": hours, **flagged}

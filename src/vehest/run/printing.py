@@ -1,4 +1,4 @@
-"""What a command prints: lines and tables on standard output, or one JSON object; remarks on standard error."""
+"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard error."""
 
 from __future__ import annotations
 
@@ -19,13 +19,7 @@ from vehest.data.errors import MissingError, is_printable, printable
 
 @dataclass(frozen=True)
 class TerminalTable:
-    """A table in a terminal.
-
-    Args:
-        title: line above it; none if empty.
-        header: over the columns.
-        rows: of cells.
-    """
+    """A table in a terminal; an empty title is left out."""
 
     title: str
     header: Sequence[str]
@@ -33,11 +27,11 @@ class TerminalTable:
 
 
 class OutputClosed(Exception):
-    """Nobody reads standard output any more."""
+    """The reader of standard output has closed it."""
 
 
 def open_streams() -> None:
-    """Give streams that were closed at the start a null device, and let every stream show any character, as an escape if need be."""
+    """Replace streams that were closed at the start by a null device; let the others show any character, as an escape if need be."""
     for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -47,16 +41,16 @@ def open_streams() -> None:
 
 
 def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print what came of a command.
+    """Print the outcome of a command.
 
     Args:
-        as_json: as one JSON object, whatever is shown else.
+        as_json: as one JSON object.
         outcome: plain values.
         shown: lines and tables for people; by default a line for each key of the outcome.
 
     Raises:
         MissingError: the disk behind standard output is full.
-        OutputClosed: nobody reads it any more.
+        OutputClosed: its reader has closed it.
     """
     if as_json:
         echo(as_json_text(outcome), keep="\n")
@@ -70,64 +64,8 @@ def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | Non
             _print_table(one)
 
 
-def echo(text: str, keep: str = "") -> None:
-    """Print a line on standard output, control characters as escapes except for those to ``keep``; the one way there.
-
-    Raises:
-        MissingError: its disk is full.
-        OutputClosed: nobody reads it any more.
-    """
-    try:
-        typer.echo(printable(text, keep))
-    except BrokenPipeError:
-        raise OutputClosed from None
-    except OSError as error:
-        silence(sys.stdout)
-        raise MissingError(f"cannot write to standard output ({error.strerror})") from error
-
-
-def complain(text: str) -> None:
-    """Print on standard error, if anybody reads it."""
-    try:
-        typer.echo(text, err=True)
-    except OSError:
-        silence(sys.stderr)
-
-
-def note(text: str) -> None:
-    """Print a remark on standard error."""
-    complain(f"note: {text}")
-
-
-def silence(stream: Any) -> None:
-    """Let what a broken stream still holds go nowhere, so that leaving does not complain about it."""
-    with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
-        os.dup2(nowhere.fileno(), stream.fileno())
-
-
-def counted(names: Sequence[str]) -> str:
-    """How many there are, and the first of them."""
-    some = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
-    return f"{len(names)} ({some})" if names else "0"
-
-
-def as_json_text(outcome: Any) -> str:
-    """An outcome as JSON; what is not a finite number becomes null, a character that is not to be shown its escape in JSON."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(inner) for key, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
-    text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
-    return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)
-
-
 def _print_table(shown: TerminalTable) -> None:
-    """Print a table, as wide as it needs to be where there is no terminal; a title after an empty line."""
+    """Print a table, 160 characters wide without a terminal; a title after an empty line."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -144,3 +82,58 @@ def _print_table(shown: TerminalTable) -> None:
     with console.capture() as captured:
         console.print(table)
     echo(captured.get().removesuffix("\n"), keep="\n\x1b")  # cells hold no escapes any more, styles do
+
+
+def echo(text: str, keep: str = "") -> None:
+    """Print a line on standard output, control characters as escapes except for those in ``keep``.
+
+    Raises:
+        MissingError: its disk is full.
+        OutputClosed: its reader has closed it.
+    """
+    try:
+        typer.echo(printable(text, keep))
+    except BrokenPipeError:
+        raise OutputClosed from None
+    except OSError as error:
+        silence(sys.stdout)
+        raise MissingError(f"cannot write to standard output ({error.strerror})") from error
+
+
+def complain(text: str) -> None:
+    """Print on standard error, unless it is closed."""
+    try:
+        typer.echo(text, err=True)
+    except OSError:
+        silence(sys.stderr)
+
+
+def note(text: str) -> None:
+    """Print a remark on standard error."""
+    complain(f"note: {text}")
+
+
+def silence(stream: Any) -> None:
+    """Discard the rest of a broken stream, so that leaving does not complain about it."""
+    with suppress(OSError, ValueError), open(os.devnull, "w", encoding="utf-8") as nowhere:
+        os.dup2(nowhere.fileno(), stream.fileno())
+
+
+def counted(names: Sequence[str]) -> str:
+    """Their number, and the first of them."""
+    return f"{len(names)} ({', '.join([*names[:6], *(['…'] if len(names) > 6 else [])])})" if names else "0"
+
+
+def as_json_text(outcome: Any) -> str:
+    """An outcome as JSON; numbers that are not finite become null, unprintable characters their escapes."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
+    text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
+    return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)

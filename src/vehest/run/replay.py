@@ -1,8 +1,9 @@
-"""A model online on the frames of a log: what the command line says, and what a replay needs."""
+"""Runs a model online on the frames of a log, as ``vehest replay`` asks for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,8 @@ from vehest.bus.view import standard_view
 from vehest.data.errors import ConfigurationError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
-from vehest.estimators.model_files import load_model
-from vehest.run.calibrate import trust_of
 from vehest.run.config import compose_config
-from vehest.run.estimate import PRETRAINED, find_model, pretrained_note
+from vehest.run.estimate import PRETRAINED, open_model, pretrained_note
 from vehest.trust.contract import GuardedStepper
 
 SAME_RATE = 1e-6
@@ -25,7 +24,7 @@ SAME_RATE = 1e-6
 
 @dataclass(frozen=True)
 class ReplayWords:
-    """Options of ``vehest replay``, as the command line has them."""
+    """Options of ``vehest replay``."""
 
     log: Path
     model: str = PRETRAINED
@@ -50,12 +49,6 @@ def replay_log(
 ) -> dict[str, Any]:
     """Replay a log and let a model estimate; returns its figures.
 
-    Args:
-        words: what was asked for.
-        overrides: of conf/estimate.yaml.
-        stopped: whether to end early.
-        say: which of several models of a name was taken.
-
     Raises:
         ConfigurationError: words that make no sense together.
         MissingError: log, DBC, model, bus or a package is not there.
@@ -64,12 +57,11 @@ def replay_log(
     bus = Bus(words.interface, words.channel, _speed(words.speed), _identifier(words.identifier))
     for path in (words.out, words.write_dbc):
         if path is not None and any(path.resolve() == other.resolve() for other in (words.log, words.dbc) if other is not None):
-            raise ConfigurationError(f"'{path}' is what is read; name another file")
+            raise ConfigurationError(f"'{path}' is an input; name another file")
     if words.out is not None:
         check_output(words.out)
     config = compose_config("estimate", [*([f"dataset={words.dataset}"] if words.dataset else []), *overrides])
-    folder = find_model(words.model, Path(config["output"]), say)
-    model, trust = load_model(folder), trust_of(folder, Path(config["output"]))
+    folder, model, trust = open_model(words.model, Path(config["output"]), say)
     with use_limits(limits_from_config(config["limits"])):
         signals = _signals(words, config["dataset"], model)
         found = survey(words.log, signals, words.bus_rate)
@@ -86,23 +78,30 @@ def replay_log(
             standard_view(f"{words.log.name} on {bus.interface} {bus.channel}", quiet=words.quiet),
             stopped,
         )
-    stepper = GuardedStepper(model, trust, faster)
-    said: dict[str, Any] = {"log": str(words.log), "model": PRETRAINED if words.model == PRETRAINED else str(folder)}
-    said |= {"samples_hz": found.timing.rate_hz, "estimates_hz": model.settings.rate_hz, "delay_ms": round(1e3 * stepper.delay, 3)}
-    written = [*output.files, *([words.write_dbc] if words.write_dbc else [])]
-    note = {"note": pretrained_note()} if words.model == PRETRAINED else {}
-    return {**said, **figures.plain(), "stopped": stopped(), "written": [str(file) for file in written], **note}
+    delay_ms = round(1e3 * GuardedStepper(model, trust, faster).delay, 3)
+    is_pretrained = words.model == PRETRAINED
+    return {
+        "log": str(words.log),
+        "model": PRETRAINED if is_pretrained else str(folder),
+        "samples_hz": found.timing.rate_hz,
+        "estimates_hz": model.settings.rate_hz,
+        "delay_ms": delay_ms,
+        **figures.plain(),
+        "stopped": stopped(),
+        "written": [str(file) for file in (*output.files, *([words.write_dbc] if words.write_dbc else []))],
+        **({"note": pretrained_note()} if is_pretrained else {}),
+    }
 
 
 def _signals(words: ReplayWords, dataset: dict[str, Any], model: Estimator) -> BusSignals:
-    told = [word for word in words.signals.split(",") if word.strip()]
+    named = [word for word in words.signals.split(",") if word.strip()]
     if words.dataset is not None:
-        if told:
-            raise ConfigurationError("--dataset and --signals both say what is which channel; leave one out")
+        if named:
+            raise ConfigurationError("--dataset and --signals both name the channels; leave one out")
         return from_dataset(dataset, model.channels, model.skippable, words.dbc)
     if words.dbc is None:
-        raise ConfigurationError("say what describes the bus: --dbc car.dbc, or --dataset NAME")
-    return from_names(words.dbc, model.channels, model.skippable, told)
+        raise ConfigurationError("nothing describes the bus; add --dbc car.dbc, or --dataset NAME")
+    return from_names(words.dbc, model.channels, model.skippable, named)
 
 
 def _speed(text: str) -> float | None:
@@ -115,10 +114,7 @@ def _speed(text: str) -> float | None:
 
 
 def _identifier(text: str) -> int:
-    try:
-        value = int(text, 0)
-    except ValueError:
-        value = 0
-    if not value > 0:
-        raise ConfigurationError(f"--id must be an identifier such as 0x6F0, not '{text}'")
-    return value
+    with suppress(ValueError):
+        if int(text, 0) > 0:
+            return int(text, 0)
+    raise ConfigurationError(f"--id must be an identifier such as 0x6F0, not '{text}'")

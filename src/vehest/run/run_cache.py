@@ -171,7 +171,7 @@ class RunCache:
             key=self.key,
             raw=dict(raw),
             made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
-            lines=tuple(_next_time(runner.messages.said, made)),
+            lines=tuple(_next_time(runner.messages.printed, made)),
             summary=summary,
             publication=publication,
             store=tracker.store if tracker is not None else "",

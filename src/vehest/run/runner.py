@@ -23,10 +23,10 @@ from vehest.run.compiling import has_to_compile
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
-from vehest.run.evaluate import protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config
 from vehest.run.failures import Failure
 from vehest.run.faults import FaultSettings
-from vehest.run.group import Evaluation, Group, Member, drop_finished_checkpoint, existing
+from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher

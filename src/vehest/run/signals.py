@@ -1,5 +1,4 @@
-"""What ends work early: Ctrl-C and SIGTERM, after which a fit ends cleanly with the best so far and any other stage is dropped without a
-trace, and a time that was given."""
+"""Early ends of the work: Ctrl-C and SIGTERM, after which a fit keeps the best so far and other stages leave nothing, and a time limit."""
 
 from __future__ import annotations
 
@@ -11,11 +10,7 @@ from types import FrameType
 
 
 class Stopped(BaseException):
-    """A signal asked vehest to stop.
-
-    Args:
-        number: of the signal.
-    """
+    """A signal, by its number, asked vehest to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -27,7 +22,7 @@ class DryRunStop(Exception):
 
 
 class StopSignals:
-    """Remembers the first SIGINT or SIGTERM; raises `Stopped` at once, or later where a fit is to end cleanly."""
+    """Records the first SIGINT or SIGTERM; raises `Stopped` at once, or later where a fit is to end cleanly."""
 
     def __init__(self) -> None:
         self.number: int | None = None
@@ -36,25 +31,6 @@ class StopSignals:
     def requested(self) -> bool:
         """Whether a signal came."""
         return self.number is not None
-
-    @contextmanager
-    def installed(self) -> Iterator[None]:
-        """Listen, and put the former handlers back afterwards."""
-        former = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in former.items():
-                signal.signal(number, handler)
-
-    @contextmanager
-    def deferred(self) -> Iterator[None]:
-        """Only remember a first signal in here; a second one stops at once."""
-        self._deferred = True
-        try:
-            yield
-        finally:
-            self._deferred = False
 
     def raise_if_requested(self) -> None:
         """Stop now if a signal came.
@@ -65,6 +41,25 @@ class StopSignals:
         if self.number is not None:
             raise Stopped(self.number)
 
+    @contextmanager
+    def installed(self) -> Iterator[None]:
+        """Listen, and restore the former handlers afterwards."""
+        former = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in former.items():
+                signal.signal(number, handler)
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Only record a first signal in here; a second one stops at once."""
+        self._deferred = True
+        try:
+            yield
+        finally:
+            self._deferred = False
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         first = self.number is None
         self.number = self.number or number
@@ -73,12 +68,7 @@ class StopSignals:
 
 
 class TimeLimit:
-    """Asks to stop as a signal does, or once a time is up; in the end only a signal counts.
-
-    Args:
-        stop: signals.
-        until: reading of ``time.monotonic`` from which on to stop [s]; none for never.
-    """
+    """Stops like a signal, and from ``until`` on, a reading of ``time.monotonic`` [s]; None for no limit."""
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:
         self._stop, self._until = stop, until
@@ -88,5 +78,5 @@ class TimeLimit:
         return self._stop.requested() or (self._until is not None and time.monotonic() >= self._until)
 
     def deferred(self) -> AbstractContextManager[None]:
-        """As that of the signals."""
+        """That of the signals."""
         return self._stop.deferred()

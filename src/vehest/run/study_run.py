@@ -23,7 +23,7 @@ from vehest.run.comparison import Comparison, failed_in, lower_rate, plan_traini
 from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate_faults import fault_figures, write_faulted
+from vehest.run.evaluate import fault_figures, write_evaluation
 from vehest.run.faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
@@ -262,7 +262,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         check_channels(faults, split, how.data)
         calibration = _calibration(trained, split, how.data, runner)
         scoring = how.of(trained, calibration)
-        artefact = runner.ensure(scoring.plan, partial(write_faulted, scoring))
+        artefact = runner.ensure(scoring.plan, partial(write_evaluation, scoring))
         if runner.tracker is not None:
             if calibration is not None:
                 log_calibration(runner.tracker, calibration)

@@ -15,28 +15,12 @@ if TYPE_CHECKING:
 
     from vehest.studies.sweep import SweepArtefacts
 
-BOARD_HEADER = (
-    "estimator",
-    "parameters",
-    "seeds",
-    "RMSE(β) [deg]",
-    "95 % interval [deg]",
-    "to the lowest [deg]",
-    "beats v = 0, static map",
-    "FVU",
-)
+SCORE_HEADER = ("RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0, static map")
 
 
 @dataclass(frozen=True)
 class TerminalSummary:
-    """What is printed of a study.
-
-    Args:
-        tables: one after another.
-        note: line below them; none if empty.
-        page: file of the report that is named last.
-        figures: the same for ``--json``, as JSON.
-    """
+    """Tables of a study, a note below them (may be empty), the file of its report, and the figures of ``--json`` as JSON."""
 
     tables: tuple[TerminalTable, ...]
     note: str
@@ -45,36 +29,28 @@ class TerminalSummary:
 
 
 def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
-    """The overview of a study in parts, or of recordings alone.
-
-    Args:
-        overview: as the report shows it.
-        left_out: name of a failed or unfinished job -> why.
-    """
+    """The overview of a study in parts, or of recordings alone."""
     rows = tuple(tuple(_cell(value) for value in row) for row in overview.itertuples(index=False))
     table = TerminalTable("", tuple(str(name) for name in overview.columns), rows)
-    return TerminalSummary((table,), _note(left_out), "report.html", json.dumps({"overview": _records(overview)} | _failed(left_out)))
+    figures = {"overview": _records(overview)} | _failed(left_out)
+    return TerminalSummary((table,), "\n".join(_notes(left_out)), "report.html", json.dumps(figures))
 
 
 def summary_of_leaderboard(title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]) -> TerminalSummary:
-    """The leaderboard of a study, a table a test set, with the study's verdict.
-
-    Args:
-        title: of the study.
-        board: one row an estimator and test set.
-        left_out: name of a failed or unfinished job -> why.
-        verdict: a line each.
-    """
+    """The leaderboard of a study, a table a test set, with the study's verdict."""
+    header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
     tables, notes = [], []
     for test_set, rows in board.groupby("test_set", sort=False):
         given = " (estimates start at the reference state)" if (rows["start"] == "reference").any() else ""
-        cells = tuple(_board_row(row) for row in rows.to_dict("records"))
-        tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", BOARD_HEADER, cells))
+        cells = tuple(
+            (row["title"], f"{row['n_parameters']:.0f}", str(row["n_seeds"]), *score_cells(row), f"{row['fvu']:.3f}")
+            for row in rows.to_dict("records")
+        )
+        tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner")
-    note = "\n".join([*notes, *([_note(left_out)] if left_out else []), *verdict])
     figures = {"leaderboard": _records(board)} | ({"verdict": list(verdict)} if verdict else {}) | _failed(left_out)
-    return TerminalSummary(tuple(tables), note, "report.html", json.dumps(figures))
+    return TerminalSummary(tuple(tables), "\n".join([*notes, *_notes(left_out), *verdict]), "report.html", json.dumps(figures))
 
 
 def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> TerminalSummary:
@@ -95,8 +71,15 @@ def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> Terminal
     return TerminalSummary((shown,), note, "report.md", json.dumps(figures))
 
 
-def _note(left_out: Mapping[str, str]) -> str:
-    return "\n".join(f"left out: {name}: {reason}" for name, reason in left_out.items())
+def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Cells of a ranked estimate under `SCORE_HEADER`."""
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    interval = f"{low:.3f} … {high:.3f}" if low > 0 else "–"
+    return (f"{row['rmse_sideslip']:.3f}", interval, str(row["against_best"]), f"{row['beats_zero']}, {row['beats_static_map']}")
+
+
+def _notes(left_out: Mapping[str, str]) -> list[str]:
+    return [f"left out: {name}: {reason}" for name, reason in left_out.items()]
 
 
 def _failed(left_out: Mapping[str, str]) -> dict[str, Any]:
@@ -104,22 +87,9 @@ def _failed(left_out: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Rows as JSON has them: what is not a finite number is null."""
+    """Rows with null in place of numbers that are not finite."""
     rows: list[dict[str, Any]] = json.loads(table.to_json(orient="records"))
     return rows
-
-
-def _board_row(row: dict[Any, Any]) -> tuple[str, ...]:
-    return (
-        str(row["title"]),
-        f"{row['n_parameters']:.0f}",
-        str(row["n_seeds"]),
-        f"{row['rmse_sideslip']:.3f}",
-        f"{row['rmse_sideslip_low']:.3f} … {row['rmse_sideslip_high']:.3f}" if row["rmse_sideslip_low"] > 0 else "–",
-        str(row["against_best"]),
-        f"{row['beats_zero']}, {row['beats_static_map']}",
-        f"{row['fvu']:.3f}",
-    )
 
 
 def _cell(value: Any) -> str:

@@ -28,8 +28,8 @@ from vehest.data.text_files import number_in, read_rows
 from vehest.estimators.model_files import read_description
 from vehest.run.artefacts import MANIFEST, Artefact
 from vehest.run.calibrate import calibration_figures
-from vehest.run.evaluate import read_metrics, read_scored
-from vehest.run.group import Evaluation, Member
+from vehest.run.evaluate import Evaluation, read_metrics, read_scored
+from vehest.run.group import Member
 from vehest.run.locks import Lock, held
 from vehest.run.train import HISTORY, STAGE, read_fit_metrics
 from vehest.studies.artefacts import read_frame
