@@ -118,6 +118,7 @@ def test_a_killed_worker_is_replaced_and_the_bits_are_the_same(cluster, folder, 
     assert driver.ended() == 0, driver.said
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
+    assert "again   ray        A worker died" in driver.said
     assert before.items() <= manifests(output).items(), "nothing that had finished was trained again"
     assert not list(output.glob("checkpoints/*"))
 

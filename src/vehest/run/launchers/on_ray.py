@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 from collections import ChainMap, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,11 +101,16 @@ class RayLauncher:
             raise MissingError(f"there is no Ray cluster at '{self._address}' ({_line(error)}); {hint}") from error
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
+        ray._private.worker.print_to_stdstream = self._print  # would go to standard output
         self._ray, self._mark = ray, new_mark(self._output)
         self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
         machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
+
+    def _print(self, data: Mapping[str, Any], **_: Any) -> None:
+        """Print what Ray says of a lost worker or machine."""
+        self._messages.line("again", "ray", str(data["lines"][0]).partition("\n")[0])
 
     def _begin(self, position: int, group: Group) -> Any:
         task = self._task.options(name=group.name)
