@@ -110,8 +110,7 @@ class Tracker:
         return False
 
     def _runs(self, tags: Mapping[str, str]) -> list[Any]:
-        quoted = {name: value.replace("'", "''") for name, value in tags.items()}
-        wanted = " and ".join(f"tags.`{name}` = '{value}'" for name, value in quoted.items())
+        wanted = " and ".join(f"tags.`{name}` = '{value}'" for name, value in tags.items())  # hashes and names of files: without quotes
         return list(self._client.search_runs([self._experiment_id], wanted))
 
     def _run_of(self, artefact: Artefact) -> Any:
