@@ -465,7 +465,7 @@ def test_force_trains_from_the_start_again(place):
     process = _start(place, "train", *LONG)
     _wait_for(process, lambda: _checkpoint_epoch(place) >= 300)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
+    process.communicate(timeout=HANGS)
     reached = _checkpoint_epoch(place)
     assert reached >= 300, "so many that the second training cannot pass them unseen"
     process = _start(place, "train", *LONG, "--force")
@@ -503,14 +503,28 @@ def test_odd_values_are_refused_in_one_line(place, arguments):
 LONG = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none", "split=mine")
 
 
+HANGS = 900.0  # s after which a test fails; until then it waits for what happens
+_started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _nothing_outlives_its_test():
+    yield
+    while _started:
+        process = _started.pop()
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
 def _start(place: Place, *arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "vehest", *arguments], cwd=place.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    command = [sys.executable, "-m", "vehest", *arguments]
+    _started.append(subprocess.Popen(command, cwd=place.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+    return _started[-1]
 
 
-def _wait_for(process: subprocess.Popen[str], condition, seconds: float = 90.0) -> None:
-    deadline = time.monotonic() + seconds
+def _wait_for(process: subprocess.Popen[str], condition) -> None:
+    deadline = time.monotonic() + HANGS
     while not condition():
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline, "nothing happened in time"
@@ -528,7 +542,7 @@ def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(pla
     process = _start(place, "train", *LONG)
     _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=HANGS)
     assert process.returncode == code, err
     assert "the best so far is kept in" in err
     (model,) = (place.folder / "outputs" / "train").iterdir()
@@ -573,7 +587,7 @@ def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, nu
     process = _start(place, "ingest", "mine")
     _wait_for(process, lambda: len(list((place.folder / "outputs" / "ingest").glob(f"{ASIDE_PREFIX}*/*.parquet"))) > 2)
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=HANGS)
     assert process.returncode == (143 if number == signal.SIGTERM else -signal.SIGKILL), err
     assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
     if number == signal.SIGTERM:
@@ -591,7 +605,7 @@ def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
     assert children
     process.kill()
     process.communicate()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + HANGS
     while any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2] for pid in children):
         assert time.monotonic() < deadline, "workers must end with their parent"
         time.sleep(0.1)
@@ -606,7 +620,7 @@ def _limited(place: Place, limit: int, *arguments: str) -> subprocess.CompletedP
     )
     program += "from vehest.cli import main\nmain()"
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(place.folder / "numba")}
-    return subprocess.run([sys.executable, "-c", program], cwd=place.folder, capture_output=True, text=True, timeout=120, env=environment)
+    return subprocess.run([sys.executable, "-c", program], cwd=place.folder, capture_output=True, text=True, timeout=HANGS, env=environment)
 
 
 def test_a_full_disk_in_ingest_and_train_is_one_line_and_leaves_nothing(place):
