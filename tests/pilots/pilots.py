@@ -56,8 +56,7 @@ def _budgets_of(overrides: Sequence[str]) -> list[str]:
     """Overrides for what is above its budget in a training's configuration, or in a phase of it."""
     training = compose_config("train", overrides)["training"]
     phases = {"training": training} | {f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)}
-    numbers = [(phase, name, value) for phase, values in phases.items() for name, value in values.items() if name in BUDGETS]
-    return [f"{phase}.{name}={BUDGETS[name]}" for phase, name, value in numbers if value > BUDGETS[name]]
+    return [f"{phase}.{name}={most}" for phase, values in phases.items() for name, most in BUDGETS.items() if values.get(name, most) > most]
 
 
 def write_data_sets(folder: Path) -> None:
@@ -76,15 +75,15 @@ def write_data_sets(folder: Path) -> None:
 
 def run(study: str, out: Path, output: Path, jobs: int) -> bool:
     """Run the pilot of a study and keep its tables; returns whether all of it succeeded."""
-    begun, computed = time.monotonic(), sum(os.times()[2:4])
+    begun, computed = time.monotonic(), sum(os.times()[2:4])  # the latter of processes that ended
     pipeline = yaml.safe_load((ROOT / "pipelines" / f"{study}.yaml").read_text(encoding="utf-8"))
     (output / f"{study}.yaml").write_text(yaml.safe_dump(reduced(pipeline), allow_unicode=True, sort_keys=False), encoding="utf-8")
     words = ["vehest", "run", f"{study}.yaml", f"output={output}", "tracking=none", f"--jobs={jobs}", "--json"]
     ran = subprocess.run([sys.executable, "-m", *words], cwd=output, stdout=subprocess.PIPE, text=True, check=False)
     if ran.stdout:
         collect(Path(json.loads(ran.stdout)["report"]).parent, out / study)
-    seconds, computing = time.monotonic() - begun, sum(os.times()[2:4]) - computed
-    print(f"{study}: exit code {ran.returncode}, {seconds:.0f} s, {computing:.0f} s of processors", flush=True)
+    seconds = f"{time.monotonic() - begun:.0f} s, {sum(os.times()[2:4]) - computed:.0f} s of processors"
+    print(f"{study}: exit code {ran.returncode}, {seconds}", flush=True)
     return ran.returncode == 0
 
 
