@@ -15,10 +15,11 @@ SPLIT ?= quickstart
 SEEDS ?= range(3)
 FUZZ ?= 3000
 KILLS ?= 100
+PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock
+.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -79,6 +80,12 @@ test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for t
 
 golden: $(INSTALLED) ## record the numbers that the golden tests compare, after a version was raised
 	PYTHONPATH=tests:tests/sources $(BIN)/python tests/golden/golden_numbers.py
+
+pilots: $(INSTALLED) ## every study on small budgets, its tables in build/pilots (PILOTS=FOLDER, STUDIES="ksnn trust"); needs VEHEST_DATA
+	nice $(BIN)/python tests/pilots/pilots.py $(STUDIES) --out $(PILOTS) --jobs $(JOBS)
+
+pilots-compare: $(INSTALLED) ## tables of two such runs, cell by cell (A=FOLDER B=FOLDER)
+	$(BIN)/python tests/pilots/pilots.py --compare $(A) $(B)
 
 kills: $(INSTALLED) ## kill the quickstart 100 times (KILLS=100, SEED=0), every run after it must end in the same numbers; half an hour
 	$(BIN)/python tests/kills/kills.py --kills $(KILLS) --seed $(SEED)

@@ -24,6 +24,11 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, 
     assert not has_to_compile("learned_ukf")
 
 
+def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planar_car, "_transition", lambda: None)
+    assert not has_to_compile("learned_ukf")
+
+
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
 def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path: Path, kernels: str) -> None:
     here = Path(__file__).parent

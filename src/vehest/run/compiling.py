@@ -14,5 +14,7 @@ def has_to_compile(estimator: str) -> bool:
     if estimator not in SLOW:
         return False
     kernel = importlib.import_module(SLOW[estimator])
+    if not hasattr(kernel._transition, "stats"):  # NUMBA_DISABLE_JIT
+        return False
     folder = kernel._transition.stats.cache_path
     return folder is not None and not any(Path(folder).glob(f"{kernel.__name__.rpartition('.')[2]}._transition-*.nbi"))

@@ -321,8 +321,11 @@ class _Kept:
     def __init__(self, function: Callable[..., Any]) -> None:
         # numba looks code up by the name, file and date of the outermost function; what else goes into it is in the digest.
         function.__qualname__ = f"{function.__name__}_{_digest()}"
-        self._is_ready = False
+        self.dispatcher: Any = function
         self.lock: Path | None = None
+        self._is_ready = bool(numba.config.DISABLE_JIT)
+        if self._is_ready:
+            return
         try:
             self.dispatcher = numba.njit(cache=True, error_model="numpy")(function)
             self.lock = Path(self.dispatcher.stats.cache_path) / f"{Path(__file__).stem}.lock"

@@ -1,0 +1,150 @@
+"""Runs every study on small budgets and keeps the tables of its report, which say whether a change moved numbers; README.md says more.
+
+pipelines/STUDY.yaml -> reduced pipeline -> `vehest run` -> report's metrics.csv and tables/*.csv -> rounded, in OUT/STUDY/ -> `compare`
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from vehest.run.config import compose_config, expand, key_of
+
+ROOT = Path(__file__).resolve().parents[2]
+ABSENT = {"ksnn_revs"}  # needs the official files of the Revs database
+BUDGETS = {"max_epochs": 2, "max_evaluations": 6, "grid": 1, "trials": 4, "scaling_trials": 3, "generations": 5, "restarts": 1}
+MOST_DRIVES, MOST_SECONDS = 3, 100  # of each kind in a simulated data set; of a drive
+OWN_FILES = {"saloon_standstill": {"files": "standstill.VBO"}}  # others that lie in its folder are refused
+DIGITS, SHOWN = 6, 5
+_texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
+
+
+def reduced(pipeline: Mapping[str, Any]) -> dict[str, Any]:
+    """A pipeline with all parts and candidates, but one seed and at most the `BUDGETS` for each training."""
+    parts = {name: {**part, "sweeps": _reduced_sweeps(part["sweeps"])} for name, part in pipeline.get("parts", {}).items()}
+    changed = {"parts": parts} if parts else {"sweeps": _reduced_sweeps(pipeline["sweeps"])} if "sweeps" in pipeline else {}
+    return {**pipeline, **changed, "publish": False}
+
+
+def _reduced_sweeps(sweeps: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Every candidate as a sweep of its own, with the first seed of its sweep."""
+    candidates = []
+    for sweep in sweeps:
+        seeds = [override for override in sweep if key_of(override) == "seed"]
+        for candidate in expand([override for override in sweep if override not in seeds]):
+            chosen = tuple(override for override in candidate if key_of(override).startswith(("estimator", "training")))
+            candidates.append([*candidate, *_budgets_of(chosen), *expand(seeds)[0]])
+    return candidates
+
+
+@cache
+def _budgets_of(overrides: Sequence[str]) -> list[str]:
+    """Overrides for what is above its budget in a training's configuration, or in a phase of it."""
+    training = compose_config("train", overrides)["training"]
+    phases = {"training": training} | {f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)}
+    return [f"{phase}.{name}={most}" for phase, values in phases.items() for name, most in BUDGETS.items() if values.get(name, most) > most]
+
+
+def write_data_sets(folder: Path) -> None:
+    """Configurations of data sets that are other than the packaged ones: fewer and shorter simulated drives."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in (ROOT / "conf" / "dataset").glob("*.yaml"):
+        dataset = yaml.safe_load(file.read_text(encoding="utf-8")) | OWN_FILES.get(file.stem, {})
+        for drive in dataset.get("drives", []):
+            if "count" in drive:
+                drive["count"] = min(drive["count"], MOST_DRIVES)
+            if isinstance(drive["manoeuvre"].get("duration"), int):
+                drive["manoeuvre"]["duration"] = min(drive["manoeuvre"]["duration"], MOST_SECONDS)
+        if "drives" in dataset or file.stem in OWN_FILES:
+            (folder / file.name).write_text(yaml.safe_dump(dataset, allow_unicode=True), encoding="utf-8")
+
+
+def run(study: str, out: Path, output: Path, jobs: int) -> bool:
+    """Run the pilot of a study and keep its tables; returns whether all of it succeeded."""
+    begun, computed = time.monotonic(), sum(os.times()[2:4])  # the latter of processes that ended
+    pipeline = yaml.safe_load((ROOT / "pipelines" / f"{study}.yaml").read_text(encoding="utf-8"))
+    (output / f"{study}.yaml").write_text(yaml.safe_dump(reduced(pipeline), allow_unicode=True, sort_keys=False), encoding="utf-8")
+    words = ["vehest", "run", f"{study}.yaml", f"output={output}", "tracking=none", f"--jobs={jobs}", "--json"]
+    ran = subprocess.run([sys.executable, "-m", *words], cwd=output, stdout=subprocess.PIPE, text=True, check=False)
+    if ran.stdout:
+        collect(Path(json.loads(ran.stdout)["report"]).parent, out / study)
+    seconds = f"{time.monotonic() - begun:.0f} s, {sum(os.times()[2:4]) - computed:.0f} s of processors"
+    print(f"{study}: exit code {ran.returncode}, {seconds}", flush=True)
+    return ran.returncode == 0
+
+
+def collect(report: Path, folder: Path) -> None:
+    """Copy a report's tables, numbers rounded."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for file in [*report.glob("metrics.csv"), *(report / "tables").glob("*.csv")]:
+        target = folder / file.relative_to(report)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _texts(file).map(_rounded).to_csv(target, index=False)
+
+
+def _rounded(cell: str) -> str:
+    try:
+        return f"{float(cell):.{DIGITS}g}"
+    except ValueError:
+        return cell
+
+
+def differences(first: Path, second: Path) -> Iterator[str]:
+    """Files that two folders do not share, tables of another shape, and cells with other values."""
+    for name in sorted({file.relative_to(side).as_posix() for side in (first, second) for file in side.rglob("*.csv")}):
+        absent = [side for side in (first, second) if not (side / name).is_file()]
+        if absent:
+            yield f"{name}: not in {absent[0]}"
+            continue
+        table, other = _texts(first / name), _texts(second / name)
+        if list(table) != list(other) or len(table) != len(other):
+            yield f"{name}: {len(table)} rows of {','.join(table)} | {len(other)} rows of {','.join(other)}"
+            continue
+        for row, column in np.argwhere((table != other).to_numpy()):
+            yield f"{name}, row {row + 1}, {table.columns[column]}: {table.iat[row, column]} | {other.iat[row, column]}"
+
+
+def compare(first: Path, second: Path) -> int:
+    """Print of every study whether its tables are equal, else the first differences and their number; returns how many studies differ."""
+    differing = 0
+    for study in sorted({folder.name for side in (first, second) for folder in side.iterdir() if folder.is_dir()}):
+        alone = [side for side in (first, second) if not (side / study).is_dir()]
+        found = [f"not in {alone[0]}"] if alone else list(differences(first / study, second / study))
+        print(f"{study}: {f'{len(found)} differences' if found else 'equal'}", *found[:SHOWN], sep="\n  ")
+        differing += bool(found)
+    return differing
+
+
+def main() -> None:
+    """Run or compare; the exit code is 1 where a pilot failed, or folders differ."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("studies", nargs="*", help="names of pipelines; all by default")
+    parser.add_argument("--out", type=Path, default=Path("build/pilots"), help="folder for the tables")
+    parser.add_argument("--jobs", type=int, default=1, help="processes side by side")
+    parser.add_argument("--compare", nargs=2, type=Path, metavar="OUT", help="compare two folders of tables instead")
+    given = parser.parse_args()
+    if given.compare:
+        sys.exit(compare(*given.compare) > 0)
+    studies = given.studies or sorted({file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - ABSENT)
+    with tempfile.TemporaryDirectory(prefix="pilots-") as output:  # a new one: keys say nothing of code whose versions stayed
+        write_data_sets(Path(output) / "conf" / "dataset")
+        succeeded = [run(study, given.out.resolve(), Path(output), given.jobs) for study in studies]
+    sys.exit(not all(succeeded))
+
+
+if __name__ == "__main__":
+    main()
