@@ -15,7 +15,7 @@ from itertools import accumulate
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
-from numba import types
+from numba import config, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
@@ -51,6 +51,15 @@ def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any,
         found[name] = flat[begin:end].view(dtype).reshape(shape)
         begin = begin if name == "every" else end
     return kind(**found), begin
+
+
+def _plain_views(kind: Any, flat: FloatArray, sizes: Any) -> Any:
+    """`open_views` without compilation, scalars as numbers."""
+
+    def opened(own: Any) -> Any:
+        return type(own)(*(opened(of) if hasattr(of, "_fields") else of if of.ndim else of.item() for of in own))
+
+    return opened(views(kind, flat, sizes)[0])
 
 
 def allocated(kind: Any, sizes: Any) -> FloatArray:
@@ -104,3 +113,7 @@ def _compiled_type(kind: Any) -> Any:
         return scalar if own[1] is None else types.Array(scalar, len(own[1]), "C")
 
     return types.BaseTuple.from_types([of(own) for own in _fields(kind).values()], kind)
+
+
+if config.DISABLE_JIT:
+    open_views = _plain_views
