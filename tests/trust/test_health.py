@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from collections import Counter
 from dataclasses import asdict, replace
 from functools import cache
@@ -150,6 +153,25 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once() -> None:
     for name in Health._fields:
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in single]), getattr(whole, name))
     assert np.isfinite(whole.ratio).all()
+
+
+def test_without_compilation_health_is_the_same(tmp_path: Path) -> None:
+    """As under a debugger; 6 s of a drive with a fault."""
+    model, drive = model_of(), measured_drive(3)
+    rows = np.ascontiguousarray(np.stack([np.asarray(drive[name]) for name in model.channels], axis=1)[:300])
+    rows[200:, 0] += 0.5
+    measured, file = np.isfinite(rows), tmp_path / "health.npz"
+    compiled = health_rows(model.packed(), rows, measured, model.start())
+    np.savez(file, tables=model.packed(), rows=rows, measured=measured, start=model.start())
+    program = "import sys, numpy as np; from vehest.trust.health import health_rows; own = np.load(sys.argv[1])\n"
+    program += "found = health_rows(own['tables'], own['rows'], own['measured'], own['start'].copy())\n"
+    program += "np.savez(sys.argv[1], status=found.status, reason=found.reason)"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", program, str(file)], env=environment, check=True)
+    plain = np.load(file)
+    assert np.array_equal(plain["status"], compiled.status)
+    assert np.array_equal(plain["reason"], compiled.reason)
+    assert (compiled.status != VALID).any()
 
 
 def test_senseless_values_leave_nothing_behind() -> None:
