@@ -28,7 +28,6 @@ ROOT = Path(__file__).resolve().parents[2]
 ABSENT = {"ksnn_revs"}  # needs the official files of the Revs database
 BUDGETS = {"max_epochs": 2, "max_evaluations": 6, "grid": 1, "trials": 4, "scaling_trials": 3, "generations": 5, "restarts": 1}
 MOST_DRIVES, MOST_SECONDS = 3, 100  # of each kind in a simulated data set; of a drive
-OWN_FILES = {"saloon_standstill": {"files": "standstill.VBO"}}  # others that lie in its folder are refused
 DIGITS, SHOWN = 6, 5
 _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
 
@@ -60,16 +59,16 @@ def _budgets_of(overrides: Sequence[str]) -> list[str]:
 
 
 def write_data_sets(folder: Path) -> None:
-    """Configurations of data sets that are other than the packaged ones: fewer and shorter simulated drives."""
+    """Configurations of simulated data sets with fewer and shorter drives."""
     folder.mkdir(parents=True, exist_ok=True)
     for file in (ROOT / "conf" / "dataset").glob("*.yaml"):
-        dataset = yaml.safe_load(file.read_text(encoding="utf-8")) | OWN_FILES.get(file.stem, {})
+        dataset = yaml.safe_load(file.read_text(encoding="utf-8"))
         for drive in dataset.get("drives", []):
             if "count" in drive:
                 drive["count"] = min(drive["count"], MOST_DRIVES)
             if isinstance(drive["manoeuvre"].get("duration"), int):
                 drive["manoeuvre"]["duration"] = min(drive["manoeuvre"]["duration"], MOST_SECONDS)
-        if "drives" in dataset or file.stem in OWN_FILES:
+        if "drives" in dataset:
             (folder / file.name).write_text(yaml.safe_dump(dataset, allow_unicode=True), encoding="utf-8")
 
 
