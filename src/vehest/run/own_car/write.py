@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
 
 import yaml
@@ -17,7 +16,7 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.run.config import compose_config
 from vehest.run.own_car.dataset import Draft, draft
 from vehest.run.own_car.families import Plan, pipeline_of, plan_of
-from vehest.run.own_car.inspect import Examined, paths_of, refuse_existing
+from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED
 
@@ -46,115 +45,91 @@ ASSUMED = """The car's parameters are made of wheelbase and mass: centre of grav
 cornering stiffness of an axle 10/rad times its load. Write yours where you know them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Outcome of `vehest new`.
-
-    Args:
-        draft: the data set.
-        plan: estimators to try; None where there is no reference or none can be used.
-        open: questions without an answer, those of the vehicle left out.
-        files: path -> text, written unless ``dry_run``.
-        dry_run: whether nothing was written.
-    """
-
-    draft: Draft
-    plan: Plan | None
-    open: tuple[Question, ...]
-    files: Mapping[Path, str]
-    dry_run: bool
-
-    def next_commands(self) -> list[str]:
-        """Commands to go on with."""
-        name, file = self.draft.examined.name, self.draft.examined.files[0]
-        commands = [f"vehest data check {name}", f"vehest data usable {name}"]
-        if self.plan is not None:
-            return [*commands, f"vehest run {name} --minutes 15"]
-        if file.is_dir() or not self.draft.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
-            return commands
-        return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
-
-    def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
-        own, examined = self.draft, self.draft.examined
-        found = examined.proposals
-        channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
-        return {
-            "name": examined.name,
-            "files": [str(file) for file in examined.files],
-            "source": examined.log.source,
-            "recordings": [one.id for one in own.contents],
-            "rate_hz": min(one.rate_hz for one in own.contents),
-            "seconds": own.seconds,
-            "time": None if examined.log.clock is None else asdict(examined.log.clock),
-            "channels": [one | {"asked": one["asked"] or None} for one in channels],
-            "left_right": found.left_right or None,
-            "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
-            "unused": list(found.unused),
-            "open": [question.as_plain() for question in self.open],
-            "vehicle": dict(examined.vehicle),
-            "steering_ratio_found": None if own.ratio is None else {"value": own.ratio[0], "uncertainty": own.ratio[1]},
-            "has_reference": "vy_ref" in own.channels,
-            "estimators": [] if self.plan is None else list(self.plan.estimators),
-            "lacking": {} if self.plan is None else dict(self.plan.lacking),
-            "findings": [f"{one.channel}: {one.message}" if one.channel else one.message for one in own.remarks],
-            "notes": list(own.notes),
-            "written": [str(file) for file in self.files],
-            "next": self.next_commands(),
-            "dry_run": self.dry_run,
-        }
-
-    def in_words(self) -> list[str]:
-        """For a terminal, a line each."""
-        own, lines = self.draft, []
-        if own.ratio is not None:
-            value, spread = own.ratio
-            doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
-            lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
-        lines += [f"{name} {late.evidence}" for name, late in own.late.items()]
-        lines += [f"note: {note}" for note in own.notes]
-        lines += [f"warning: {one.channel + ': ' if one.channel else ''}{one.message}" for one in own.remarks]
-        lines += ["open, taken as proposed:"] if self.open else []
-        lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in self.open]
-        lines += _limits(own)
-        if self.plan is not None:
-            lines += [f"left out: {name}: {lack}" for name, lack in self.plan.lacking.items()]
-        tried = "" if self.plan is None else ", ".join(self.plan.estimators)
-        purposes = ("channels, units and signs of the columns", "ranges for training, validation and test", f"estimators: {tried}")
-        for file, purpose in zip(self.files, purposes, strict=False):
-            lines.append(f"{'would write' if self.dry_run else 'wrote'} {file}: {purpose}")
-        return [*lines, "next:", *(f"  {command}" for command in self.next_commands())]
-
-
-def write(examined: Examined, left: Sequence[Question] = (), *, force: bool = False, dry_run: bool = False) -> Outcome:
+def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = False) -> tuple[dict[str, Any], list[str]]:
     """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
 
     Args:
         examined: logs after the answers.
         left: questions without an answer.
-        force: whether existing files may be replaced.
         dry_run: whether to write nothing.
 
+    Returns:
+        The outcome for JSON and for a terminal.
+
     Raises:
-        ConfigurationError: a file exists, and ``force`` is not given.
         MissingError: the disk is full, or a folder cannot be written to.
         VehestError: the data set cannot be read.
     """
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else None
+    plan = plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else Plan((), {})
     texts = [_dataset_text(made, left)]
-    if plan is not None and plan.sweeps:
+    if plan.sweeps:
         split = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
         texts += [_yaml(split, [f"{name}: {SPLIT_HEAD}"]), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
     files = dict(zip(paths_of(name), texts, strict=False))
     if not dry_run:
-        refuse_existing(name, force=force)
         with ExitStack() as stack:
             for file, text in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
-    return Outcome(made, plan if len(texts) > 1 else None, tuple(left), files, dry_run)
+    following = _next_commands(made, plan)
+    plain = _plain(made, plan, left) | {"written": [str(file) for file in files], "next": following, "dry_run": dry_run}
+    purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
+    lines = _words(made, plan, left)
+    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
+        lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
+    return plain, [*lines, "next:", *(f"  {command}" for command in following)]
+
+
+def _next_commands(made: Draft, plan: Plan) -> list[str]:
+    name, file = made.examined.name, made.examined.files[0]
+    commands = [f"vehest data check {name}", f"vehest data usable {name}"]
+    if plan.sweeps:
+        return [*commands, f"vehest run {name} --minutes 15"]
+    if file.is_dir() or not made.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
+        return commands
+    return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
+
+
+def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
+    examined, found = made.examined, made.examined.proposals
+    channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
+    return {
+        "name": examined.name,
+        "files": [str(file) for file in examined.files],
+        "source": examined.log.source,
+        "recordings": [one.id for one in made.contents],
+        "rate_hz": min(one.rate_hz for one in made.contents),
+        "seconds": made.seconds,
+        "time": None if examined.log.clock is None else asdict(examined.log.clock),
+        "channels": [one | {"asked": one["asked"] or None} for one in channels],
+        "left_right": found.left_right or None,
+        "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
+        "unused": list(found.unused),
+        "open": [question.as_plain() for question in left],
+        "vehicle": dict(examined.vehicle),
+        "steering_ratio_found": None if made.ratio is None else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
+        "has_reference": "vy_ref" in made.channels,
+        "estimators": list(plan.estimators),
+        "lacking": plan.lacking,
+        "findings": made.remarks,
+        "notes": made.notes,
+    }
+
+
+def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
+    lines = []
+    if made.ratio is not None:
+        value, spread = made.ratio
+        doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
+        lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
+    lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
+    lines += [f"note: {note}" for note in made.notes]
+    lines += [f"warning: {remark}" for remark in made.remarks]
+    lines += ["open, taken as proposed:"] if left else []
+    lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left]
+    return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
 
 
 def _limits(own: Draft) -> list[str]:
@@ -175,16 +150,15 @@ def _limits(own: Draft) -> list[str]:
 
 def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
     examined = made.examined
-    head = [
-        f"Recordings of {examined.name}: columns with the evidence for their channels; `vehest data check {examined.name}` checks them."
-    ]
+    name = examined.name
+    head = [f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."]
     head += [f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}." for question in left]
-    for name, late in made.late.items():
-        if not CHANNELS[name].is_reference:
+    for channel, late in made.late.items():
+        if not CHANNELS[channel].is_reference:
             head += [
-                f"{name} {late.evidence}.",
+                f"{channel} {late.evidence}.",
                 "An estimator in the car would get it as late; if only the log is, add to transforms:",
-                f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{name}]}}",
+                f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{channel}]}}",
             ]
     comments = dict(DATASET_COMMENTS)
     for one in examined.proposals.channels:
@@ -195,13 +169,11 @@ def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
 
 
 def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
-    head = [
-        f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}",
-        *([ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []),
-    ]
+    head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
+    head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
-    head += ["Left out, and what each lacks:"] if plan.lacking else []
-    return _yaml(pipeline_of(name, plan, minutes), [*head, *(f"  {own}: {lack}" for own, lack in plan.lacking.items())])
+    head += ["Left out, and what each lacks:", *(f"  {own}: {lack}" for own, lack in plan.lacking.items())]
+    return _yaml(pipeline_of(name, plan, minutes), head)
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
