@@ -679,7 +679,7 @@ def test_steering_alone_has_a_figure_too(called: Called) -> None:
         (("weave.parquet",), 2, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
         (("weave.parquet", "-e", "delay,colour"), 2, "'colour' cannot be estimated"),
         (("nothing.csv", "-e", "delay"), 2, "'nothing.csv' is neither a data set"),
-        (("sim_quickstart", "-e", "delay"), 2, "has 3 recordings (drive_1, drive_2, drive_3); say which: --recording ID"),
+        (("sim_quickstart", "-e", "delay"), 2, "3 (drive_1, drive_2, drive_3); choose one by --recording ID"),
         (("sim_quickstart", "-e", "delay", "-r", "drive_9"), 4, "no drive 'drive_9'"),
         (("weave.parquet", "-e", "delay", "-r", "other"), 2, "holds the recording 'weave', not 'other'"),
         (("weave.parquet", "-e", "delay", "--cutoff", "30"), 2, "too high for 50 Hz"),

@@ -18,7 +18,7 @@ from vehest.data.recording import Recording
 from vehest.run.config import Config
 from vehest.run.config_files import choices
 from vehest.run.inspect_data import reading
-from vehest.run.printing import TerminalTable
+from vehest.run.printing import TerminalTable, counted
 from vehest.sources.base import open_source, read_single
 
 FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "alignment.svg")
@@ -115,8 +115,7 @@ def _one_recording(source: str, config: Config, recording_id: str | None) -> Rec
         origin = open_source(config["dataset"])
         known = origin.ids()
         if recording_id is None and len(known) != 1:
-            shown = ", ".join(known[:8]) + (", …" if len(known) > 8 else "")
-            raise ConfigurationError(f"data set '{source}' has {len(known)} recordings ({shown}); say which: --recording ID")
+            raise ConfigurationError(f"recordings of data set '{source}': {counted(known)}; choose one by --recording ID")
         return origin.read(known[0] if recording_id is None else recording_id)
     recording = read_single(config["dataset"], Path(source))
     if recording_id not in (None, recording.id):

@@ -20,7 +20,8 @@ from vehest.data.contents import Contents, common_channels, contents_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.supplies import supply_of
-from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, MOST_LISTED, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.columns import plain_rate
 from vehest.sources.surveys import RawColumn
@@ -82,8 +83,8 @@ def draft(examined: Examined) -> Draft:
     longest = max(recordings, key=lambda own: own.duration)
     late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
-        listed = ", ".join(map(str, rows[:MOST_LISTED])) + (", …" if len(rows) > MOST_LISTED else "")
-        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data row{'s' * (len(rows) > 1)} {listed}")
+        listed = counted([str(row) for row in rows])
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data rows, {listed}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]

@@ -23,7 +23,7 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
 from vehest.sources.columns import plain_rate
-from vehest.sources.surveys import Log, survey
+from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 
@@ -42,8 +42,6 @@ VEHICLE = {
     "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
 }
 """Values of the car that no log holds, as questions."""
-
-Column = tuple[str, str, FloatArray]  # name, unit, samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +116,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
         proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:
-        names = ", ".join(column.name for column in longest.columns[:8])
-        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion (it has {names})")
+        names = counted([column.name for column in longest.columns])
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
     proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
     place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
@@ -213,56 +211,52 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
 
 
-def _evidence(log: Log) -> tuple[list[Column], float | None]:
+def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None]:
     """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz]; without times rows as they are.
 
     Of a long drive the minutes in which columns change most are taken.
     """
-    columns, rate = _on_one_clock(log)
-    if rate is None:
-        return columns, None
-    n_rows = len(columns[0][2])
-    cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
-    factor = max(math.floor(rate / EVIDENCE_HZ), 1)
-    whole = (n_rows - 2 * cut) // factor * factor
-    slower = [(name, unit, values[cut : cut + whole].reshape(-1, factor).mean(axis=1)) for name, unit, values in columns]
-    kept = _busiest([values for _, _, values in slower], round(LONGEST_EVIDENCE * rate / factor), max(round(60.0 * rate / factor), 1))
-    return [(name, unit, values[kept]) for name, unit, values in slower], rate / factor
+    columns = [column for column in log.columns if column.stamps is None or len(column.stamps) > 1]
+    samples, rate = _on_one_clock(log, columns)
+    if rate is not None:
+        n_rows = samples.shape[1]
+        cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
+        factor = max(math.floor(rate / EVIDENCE_HZ), 1)
+        whole = (n_rows - 2 * cut) // factor * factor
+        samples, rate = samples[:, cut : cut + whole].reshape(len(columns), -1, factor).mean(axis=2), rate / factor
+        samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
+    return [(own.name, plain_unit(own.unit) or "", values) for own, values in zip(columns, samples, strict=True)], rate
 
 
-def _on_one_clock(log: Log) -> tuple[list[Column], float | None]:
-    if log.columns[0].stamps is not None:
-        timed = [
-            ((own.name, plain_unit(own.unit) or "", own.values), own.stamps)
-            for own in log.columns
-            if own.stamps is not None and len(own.stamps) > 1
-        ]
+def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
+    """Samples of the columns, (C, T), and their rate [Hz]."""
+    timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
+    if timed:
         begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))
         rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
         grid = np.arange(begin, end, 1.0 / rate)
-        return [(name, unit, np.interp(grid, stamps, values)) for (name, unit, values), stamps in timed], rate
+        return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
-    rows = [(own.name, plain_unit(own.unit) or "", own.values[run]) for own in log.columns]
     if log.seconds is None:
-        return rows, None
+        return np.stack([column.values[run] for column in columns]), None
     stamps = log.seconds[run]
-    columns = [(name, unit, bridged(values, stamps, BRIDGED)) for name, unit, values in rows]
+    rows = [bridged(column.values[run], stamps, BRIDGED) for column in columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     rate = plain_rate(1.0 / step, RATE_TOLERANCE)
     grid = np.arange(stamps[0], stamps[-1], 1.0 / rate)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
     if is_even or len(grid) > 4 * len(stamps):
-        return columns, rate
-    return [(name, unit, np.interp(grid, stamps, values)) for name, unit, values in columns], rate
+        return np.stack(rows), rate
+    return np.stack([np.interp(grid, stamps, values) for values in rows]), rate
 
 
-def _busiest(columns: Sequence[FloatArray], most: int, minute: int) -> slice:
-    """Rows of the stretch in which the columns change most."""
-    if len(columns[0]) <= most:
-        return slice(None)
-    starts = np.arange(0, len(columns[0]) - minute, minute)
+def _busiest(columns: FloatArray, most: int, minute: int) -> FloatArray:
+    """The rows in which the columns change most, (C, at most ``most``)."""
+    if columns.shape[1] <= most:
+        return columns
+    starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
         changes = [[np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts] for values in columns]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)
     first = int(starts[np.argmax(np.convolve(activity, np.ones(most // minute), mode="valid"))])
-    return slice(first, first + most)
+    return columns[:, first : first + most]
