@@ -4,25 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 import yaml
 
+from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
-from vehest.data.errors import ConfigurationError, printable
+from vehest.data.contents import Contents
+from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
+from vehest.estimators.registry import estimator_names
 from vehest.run.config import compose_config
+from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import Draft, draft
-from vehest.run.own_car.families import Plan, pipeline_of, plan_of
 from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
-from vehest.run.usable import SCORED
+from vehest.run.usable import SCORED, car_parameters, usability
 
 LEARNT = 0.7  # of the recordings: training and validation
 SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
 PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
+STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
+HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
+PRETRAINED = "training.start_from=pretrained"
+PRETRAINED_HZ = 20.0
+MINUTES = (0.5, 1.0, 2.0, 5.0)
+"""Of reference, parts of the pipeline where there are more."""
 DATASET_COMMENTS = {
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
@@ -45,6 +55,15 @@ ASSUMED = """The car's parameters are made of wheelbase and mass: centre of grav
 cornering stiffness of an axle 10/rad times its load. Write yours where you know them."""
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Overrides of each sweep of a pipeline with its description, estimators that are tried, and others with what each lacks."""
+
+    sweeps: list[tuple[list[str], str]] = field(default_factory=list)
+    estimators: list[str] = field(default_factory=list)
+    lacking: dict[str, str] = field(default_factory=dict)
+
+
 def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = False) -> tuple[dict[str, Any], list[str]]:
     """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
 
@@ -63,7 +82,7 @@ def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = 
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else Plan((), {})
+    plan = _plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else Plan()
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
         split = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
@@ -111,7 +130,7 @@ def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
         "vehicle": dict(examined.vehicle),
         "steering_ratio_found": None if made.ratio is None else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
         "has_reference": "vy_ref" in made.channels,
-        "estimators": list(plan.estimators),
+        "estimators": plan.estimators,
         "lacking": plan.lacking,
         "findings": made.remarks,
         "notes": made.notes,
@@ -130,6 +149,69 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     lines += ["open, taken as proposed:"] if left else []
     lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left]
     return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
+
+
+def _plan_of(contents: Sequence[Contents], vehicle: Mapping[str, float | None]) -> Plan:
+    """Sweeps over the families that recordings and values of the car allow.
+
+    Args:
+        contents: of the recordings, as the data set makes them.
+        vehicle: known values of the car.
+    """
+    plan, values = Plan(), _car(vehicle)
+    known = {"learned_ukf_variant"}  # only a paper's study compares it
+    for family in yaml.safe_load(Path(__file__).with_name("families.yaml").read_text(encoding="utf-8")):
+        names, overrides = family["estimators"], family.get("overrides", "")
+        known.update(names)
+        if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
+            continue  # the next entry trains the same family from scratch
+        unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
+        car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
+        words = overrides.replace("{car}", car).format(**values).split()
+        lacks = {name: f"the car's {' and '.join(unknown)}" if unknown else _lack(name, words, contents) for name in names}
+        tried = [name for name in names if not lacks[name]]
+        plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
+        if tried:
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], family["about"]))
+            plan.estimators.extend(tried)
+    others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
+    plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; add it as you need it"))
+    return plan
+
+
+def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
+    """Parameters of the car; with wheelbase and mass the others are assumed."""
+    wheelbase, mass = vehicle["wheelbase"] or 0.0, vehicle["mass"] or 0.0
+    half, stiffness = 0.5 * wheelbase, 0.5 * STIFFNESS * mass * GRAVITY
+    values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
+    values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
+    values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
+    return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
+
+
+def _lack(name: str, words: Sequence[str], contents: Sequence[Contents]) -> str:
+    """Channels that an estimator lacks; empty if none."""
+    first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
+    try:
+        found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
+    except VehestError as error:
+        return str(error)
+    return ", ".join([*found.missing.in_words(), *(f"{channel} without gaps" for channel in found.gaps)]) or found.to_give
+
+
+def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
+    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes of reference."""
+    parts: dict[str, Any] = {"all": {"title": "all recordings", "split": name, "sweeps": [words for words, _ in plan.sweeps]}}
+    scratch = ["estimator=ksnn", "estimator.n_local=2", "estimator.n_hidden=2", "training.max_epochs=100"]
+    for own in MINUTES if "ksnn" in plan.estimators else ():
+        if own < 0.8 * minutes:
+            part = {"title": f"{own:g} min of reference", "split": name, "overrides": [f"++split.minutes={own:g}"]}
+            parts[f"minutes_{own:g}"] = part | {"sweeps": [["estimator=zero,static_map"], scratch]}
+            if any(PRETRAINED in words for words, _ in plan.sweeps):
+                tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
+                parts[f"minutes_{own:g}_tuned"] = part | tuned
+    study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
+    return study | {"evaluation": {"rate_hz": 20}, "parts": parts}
 
 
 def _limits(own: Draft) -> list[str]:
@@ -173,7 +255,7 @@ def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
     head += ["Left out, and what each lacks:", *(f"  {own}: {lack}" for own, lack in plan.lacking.items())]
-    return _yaml(pipeline_of(name, plan, minutes), head)
+    return _yaml(_pipeline_of(name, plan, minutes), head)
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
