@@ -122,7 +122,7 @@ def usability(name: str, config: Config, recordings: Sequence[Contents], to_esti
     except ConfigurationError as error:
         absent = absent_channels(getattr(estimator_class(own), "channels", ()), both)
         return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
-    missing = _missing(config, recordings, to_estimate)
+    missing = _missing(estimator, training, recordings, to_estimate)
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
     patterns = settings_without_recordings(estimator, training, [one.id for one in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
@@ -138,16 +138,15 @@ def car_parameters(estimator: str) -> tuple[str, ...]:
 
 def usable_in_words(rows: Sequence[Usability]) -> list[str | TerminalTable]:
     """A table of estimators, transforms that make channels that some lack, and estimators that take another car's parameters."""
-    supplies = {channel: own for row in rows for channel, own in row.missing.supplies.items() if own is not None}
-    borrowing = [row for row in rows if row.car]
-    lines = [f"{channel}: {own.in_words()}" for channel, own in supplies.items()]
-    if borrowing:
-        names = ", ".join(row.estimator for row in borrowing)
-        lines.append(
-            f"your car's parameters, {borrowing[0].car[0]}=… and so on, are wanted by {names}; else they take those of another car"
-        )
+    supplies = {channel: own.in_words() for row in rows for channel, own in row.missing.supplies.items() if own is not None}
     header = ("estimator", "usable", "rate", "missing", "what could supply it")
-    return [TerminalTable("", header, [_cells(row) for row in rows]), "", *lines]
+    lines: list[str | TerminalTable] = [TerminalTable("", header, [_cells(row) for row in rows]), ""]
+    lines += [f"{channel}: {supply}" for channel, supply in supplies.items()]
+    borrowing = [row.estimator for row in rows if row.car]
+    if borrowing:
+        names = ", ".join(borrowing)
+        lines.append(f"your car's parameters, estimator.car.mass=… and so on, are wanted by {names}; else they take those of another car")
+    return lines
 
 
 def _cells(row: Usability) -> list[str]:
@@ -225,8 +224,7 @@ def _built(config: Config) -> tuple[Estimator, Any]:
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 
 
-def _missing(config: Config, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> Missing:
-    estimator, training = _built(config)
+def _missing(estimator: Estimator, training: Any, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> Missing:
     read = [name for own in to_estimate for name in lacking_to_estimate(estimator, own.channels)]
     learnt = [name for own in to_train for name in lacking_to_train(estimator, training, own.channels)]
     return _with_supplies(read, learnt, [*to_train, *to_estimate])
@@ -252,7 +250,7 @@ def _settings_without(
         for key, value in _alternatives(config):
             changed = {**config, "estimator": {**config["estimator"], key: value}}
             with suppress(ConfigurationError):
-                tried.append((_missing(changed, to_train, to_estimate).unsupplied, key, value, changed))
+                tried.append((_missing(*_built(changed), to_train, to_estimate).unsupplied, key, value, changed))
         left, key, value, changed = min(tried, key=lambda entry: len(entry[0]), default=(missing, "", None, config))
         if len(left) >= len(missing):
             break
