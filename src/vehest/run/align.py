@@ -17,7 +17,7 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.run.config import Config
 from vehest.run.config_files import choices
-from vehest.run.inspect_data import reading
+from vehest.run.inspect_data import Lines, reading
 from vehest.run.printing import TerminalTable, counted
 from vehest.sources.base import open_source, read_single
 
@@ -45,10 +45,10 @@ def align_recording(source: str, overrides: Sequence[str], recording_id: str | N
         return align(recording, settings)
 
 
-def in_words(alignment: Alignment, out: Path | None) -> list[str | TerminalTable]:
+def in_words(alignment: Alignment, out: Path | None) -> Lines:
     """An alignment for a terminal; ``out`` is where it was written."""
     first = f"{alignment.recording_id}: {alignment.kind}, {alignment.duration:.6g} s at {alignment.rate_hz:g} Hz; nothing is applied"
-    lines: list[str | TerminalTable] = [first, _parameters(alignment)]
+    lines: Lines = [first, _parameters(alignment)]
     if alignment.residuals:
         lines += ["", _residuals(alignment)]
     lines += [*(f"note: {note}" for note in alignment.notes), f"to correct it: '{override_of(alignment)}'"]

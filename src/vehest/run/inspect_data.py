@@ -80,9 +80,11 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
                 rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
             else:
                 rows += [{"recording": recording.id, **asdict(finding)} for finding in checks_of_recording(recording)]
-    channels = (f" {row['channel']}:" if row["channel"] else "" for row in rows)
-    lines = [f"{row['level']:<7} {row['recording']}:{channel} {row['message']}" for row, channel in zip(rows, channels, strict=True)]
-    return rows, [*lines] or ["nothing found"]
+    lines: Lines = []
+    for row in rows:
+        channel = f" {row['channel']}:" if row["channel"] else ""
+        lines.append(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
+    return rows, lines or ["nothing found"]
 
 
 def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
