@@ -84,7 +84,7 @@ def draft(examined: Examined) -> Draft:
     late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
         listed = counted([str(row) for row in rows])
-        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data rows, {listed}")
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data rows: {listed}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]

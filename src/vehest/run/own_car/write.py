@@ -152,12 +152,7 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 
 
 def _plan_of(contents: Sequence[Contents], vehicle: Mapping[str, float | None]) -> Plan:
-    """Sweeps over the families that recordings and values of the car allow.
-
-    Args:
-        contents: of the recordings, as the data set makes them.
-        vehicle: known values of the car.
-    """
+    """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     plan, values = Plan(), _car(vehicle)
     known = {"learned_ukf_variant"}  # only a paper's study compares it
     for family in yaml.safe_load(Path(__file__).with_name("families.yaml").read_text(encoding="utf-8")):
@@ -176,7 +171,7 @@ def _plan_of(contents: Sequence[Contents], vehicle: Mapping[str, float | None]) 
             plan.estimators.extend(tried)
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
     plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; add it as you need it"))
-    return plan
+    return plan if plan.sweeps else Plan()
 
 
 def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
