@@ -389,7 +389,7 @@ def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
     second["Speed"] /= 3.6
     examined = inspect("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
     remarks = draft(examined).remarks
-    assert any(one.check == "unit" and one.message.startswith("in 'lap_2', ay is 3.6") for one in remarks)
+    assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
 
 
 @pytest.mark.parametrize(
@@ -427,7 +427,7 @@ def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
     table = usual(drive())
     table["Gyro"] = np.repeat(table["Gyro"].to_numpy()[::10], 10)
     remarks = draft(inspect("my_car", [write(tmp_path / "lap.csv", table)])).remarks
-    assert any(one.check == "held" and one.channel == "yaw_rate" for one in remarks)
+    assert any(one.startswith("yaw_rate: ") for one in remarks)
     assert not draft(inspect("my_car", [write(tmp_path / "plain.csv", usual(drive()))])).remarks
 
 
@@ -453,7 +453,7 @@ def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> No
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     made = draft(examined)
     assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
-    assert any("data rows 2001, 2002" in note for note in made.notes)
+    assert any("data rows: 2 (2001, 2002)" in note for note in made.notes)
     recording = open_source(made.dataset).read("lap")
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
