@@ -171,8 +171,7 @@ def new_car(
     examined = inspect(name, files, vehicle, force=force)
     emit(False, None, [] if as_json else examined.in_words())
     examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
-    outcome = write(examined, left, force=force, dry_run=dry_run)
-    emit(as_json, outcome.as_plain(), outcome.in_words())
+    emit(as_json, *write(examined, left, dry_run=dry_run))
 
 
 @app.command(epilog=_offered("dataset"))
@@ -654,10 +653,9 @@ def doctor(as_json: AsJson = False) -> None:
 @data_app.command("list")
 def data_list(as_json: AsJson = False) -> None:
     """List the data sets that conf/dataset offers, with their licences and what to cite."""
-    from vehest.run.inspect_data import dataset_rows, datasets_in_words
+    from vehest.run.inspect_data import list_datasets
 
-    rows = dataset_rows()
-    emit(as_json, rows, datasets_in_words(rows))
+    emit(as_json, *list_datasets())
 
 
 @data_app.command("channels")
@@ -676,10 +674,9 @@ def data_show(
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
-    from vehest.run.inspect_data import describe, recordings_in_words
+    from vehest.run.inspect_data import describe
 
-    shown = describe(source, overrides or [])
-    emit(as_json, shown, recordings_in_words(shown))
+    emit(as_json, *describe(source, overrides or []))
 
 
 @data_app.command("check")
@@ -689,10 +686,10 @@ def data_check(
     as_json: AsJson = False,
 ) -> None:
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
-    from vehest.run.inspect_data import check, finding_row_in_words
+    from vehest.run.inspect_data import check
 
-    findings = check(source, overrides or [])
-    emit(as_json, findings, [finding_row_in_words(row) for row in findings] or ["nothing found"])
+    findings, lines = check(source, overrides or [])
+    emit(as_json, findings, lines)
     if any(row["level"] == "error" for row in findings):
         raise typer.Exit(3)
 
@@ -741,12 +738,10 @@ def data_align(
     Prints the estimates with their uncertainty, and the transforms that would correct it. Applies nothing.
     """
     from vehest.alignment.settings import AlignmentSettings
-    from vehest.run.align import align_recording, as_plain, in_words, refuse_other_files, write_alignment
+    from vehest.run.align import align_recording, as_plain, in_words, write_alignment
 
     asked = tuple(dict.fromkeys(name.strip() for name in estimate.split(",") if name.strip()))
     settings = AlignmentSettings(asked, cutoff, max_delay, tilt, wheelbase, steering_channel, max_ay, min_speed)
-    if out is not None:
-        refuse_other_files(out)
     found = align_recording(source, overrides or [], recording, settings)
     if out is not None:
         write_alignment(found, out)

@@ -16,7 +16,7 @@ from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.run.own_car.dataset import draft
-from vehest.run.own_car.inspect import examine
+from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
@@ -24,11 +24,11 @@ from vehest.sources.surveys import survey
 
 
 def proposed(file: Path) -> dict[str, Proposal]:
-    return examine("my_car", [file]).proposals.by_channel
+    return inspect("my_car", [file]).proposals.by_channel
 
 
 def asked(file: Path) -> list[str]:
-    return [question.key for question in questions_of(examine("my_car", [file]))]
+    return [question.key for question in questions_of(inspect("my_car", [file]))]
 
 
 def test_units_and_signs_of_a_usual_log_are_found_without_any_in_its_header(tmp_path) -> None:
@@ -73,7 +73,7 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_tell(tmp_path) -
     mirrored[["Gyro", "LatAcc", "Steer", "Beta"]] *= -1.0
     assert asked(write(tmp_path / "lap.csv", mirrored)) == ["left_right"]
     with_wheels = mirrored.assign(**{f"Wheel{corner.upper()}": d[f"wheel_{corner}"] for corner in ("fl", "fr", "rl", "rr")})
-    examined = examine("my_car", [write(tmp_path / "wheels.csv", with_wheels)])
+    examined = inspect("my_car", [write(tmp_path / "wheels.csv", with_wheels)])
     assert "right wheels are faster" in examined.proposals.left_right
     found = examined.proposals.by_channel
     assert {name: found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")} == dict.fromkeys(
@@ -90,7 +90,7 @@ def test_the_course_over_latitude_and_longitude_tells_left_from_right(tmp_path) 
     table["Latitude"] = 48.0 + north / 111_000.0
     table["Longitude"] = 16.0 + east / (111_000.0 * np.cos(np.radians(48.0)))
     table.to_csv(tmp_path / "lap.csv", index=False)
-    proposals = examine("my_car", [tmp_path / "lap.csv"]).proposals
+    proposals = inspect("my_car", [tmp_path / "lap.csv"]).proposals
     assert "course over latitude and longitude" in proposals.left_right
     assert proposals.by_channel["yaw_rate"].sign == -1
 
@@ -100,7 +100,7 @@ def test_wheels_alone_give_a_speed_and_their_radius(tmp_path) -> None:
     table = (
         usual(d).drop(columns="Speed").assign(**{f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in ("fl", "fr", "rl", "rr")})
     )
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
     made = draft(examined)
@@ -118,8 +118,8 @@ def test_road_wheel_and_steering_wheel_are_told_apart_by_range_and_slow_corners(
 
 def test_steering_ratio_is_estimated_where_the_wheelbase_is_told(tmp_path) -> None:
     file = write(tmp_path / "lap.csv", usual(drive(300.0)))
-    assert draft(examine("my_car", [file])).ratio is None
-    ratio = draft(examine("my_car", [file], {"wheelbase": 2.7})).ratio
+    assert draft(inspect("my_car", [file])).ratio is None
+    ratio = draft(inspect("my_car", [file], {"wheelbase": 2.7})).ratio
     assert ratio is not None
     assert abs(ratio[0] - 15.0) < max(3.0 * ratio[1], 1.0)
 
@@ -143,7 +143,7 @@ def test_a_delay_of_120_ms_is_found_within_30_ms(tmp_path) -> None:
     d = drive(300.0)
     table = usual(d)
     table["Gyro"] = np.interp(d["t"] - 0.12, d["t"], table["Gyro"])
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     made = draft(examined)
     assert made.late["yaw_rate"].delay == pytest.approx(0.12, abs=0.03)
     assert not any(entry["name"] == "delay_correction" for entry in made.dataset["transforms"]), "an estimator in the car gets it late, too"
@@ -165,7 +165,7 @@ def test_slow_signals_with_empty_cells_are_bridged(tmp_path) -> None:
     d = drive()
     table = usual(d)
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     made = draft(examined)
     assert made.dataset["source"] == "text_log"
     (recording,) = (open_source(made.dataset).read("lap"),)
@@ -174,11 +174,11 @@ def test_slow_signals_with_empty_cells_are_bridged(tmp_path) -> None:
 
 
 def test_a_log_without_reference_cannot_rank_anything(tmp_path) -> None:
-    examined = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
-    outcome = write_files(examined, dry_run=True)
-    assert outcome.plan is None
-    assert [file.parts[0] for file in outcome.files] == ["conf"]
-    assert outcome.next_commands()[-1].startswith("vehest estimate pretrained ")
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
+    outcome, _ = write_files(examined, dry_run=True)
+    assert outcome["estimators"] == []
+    assert [Path(file).parts[0] for file in outcome["written"]] == ["conf"]
+    assert outcome["next"][-1].startswith("vehest estimate pretrained ")
 
 
 def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_path) -> None:
@@ -187,7 +187,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
     x = np.cumsum(d["vx"] * np.cos(yaw) - d["vy"] * np.sin(yaw)) / 50.0
     y = np.cumsum(d["vx"] * np.sin(yaw) + d["vy"] * np.cos(yaw)) / 50.0
     table = usual(d).drop(columns="Beta").assign(pose_x=x, pose_y=y, pose_yaw=yaw)
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     made = draft(examined)
     assert "vy_ref" in made.channels
     recording = open_source(made.dataset).read("lap")
@@ -213,7 +213,7 @@ def test_what_is_no_log_is_one_line(tmp_path, content: bytes, said: str) -> None
     file = tmp_path / "lap.csv"
     file.write_bytes(content)
     with pytest.raises((DataError, MissingError), match=said) as refusal:
-        examine("my_car", [file])
+        inspect("my_car", [file])
     assert "\n" not in str(refusal.value)
     assert "lap.csv" in str(refusal.value)
 
@@ -224,7 +224,7 @@ def test_junk_under_every_ending_is_one_line(tmp_path, ending: str) -> None:
     file = tmp_path / f"lap{ending}"
     file.write_bytes(b"junk\x00" * 1000)
     with pytest.raises(VehestError) as refusal:
-        examine("my_car", [file])
+        inspect("my_car", [file])
     assert "\n" not in str(refusal.value)
 
 
@@ -244,7 +244,7 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path) -> None
     log = survey(tmp_path / "lap.csv")
     assert (log.source, log.options["skip_rows"]) == ("text_log", 3)
     assert {column.name: column.unit for column in log.columns} == {"Ground Speed": "km/h", "Gyro Yaw": "deg/s", "G Lat": "m/s^2"}
-    examined = examine("my_car", [tmp_path / "lap.csv"])
+    examined = inspect("my_car", [tmp_path / "lap.csv"])
     recording = open_source(draft(examined).dataset).read("lap")
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
@@ -290,10 +290,10 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log: st
     if log == "bag":
         pytest.importorskip("rosbags", reason="the extra ros is not installed")
     files = write_log(log, data_root, tmp_path)
-    examined = examine("my_car", files)
-    outcome = write_files(examined, tuple(questions_of(examined)), dry_run=True)
+    examined = inspect("my_car", files)
+    outcome, _ = write_files(examined, tuple(questions_of(examined)), dry_run=True)
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
-    assert [row for row in rows_of(log, answers, outcome.as_plain()) if row["correct"] != "yes"] == []
+    assert [row for row in rows_of(log, answers, outcome) if row["correct"] != "yes"] == []
 
 
 def test_a_log_that_counts_everything_the_other_way_keeps_its_signs_together(tmp_path) -> None:
@@ -333,7 +333,7 @@ def test_times_of_a_clock_are_read(tmp_path, first: str, zone: str) -> None:
         date, "%Y-%m-%dT%H:%M:%S.%f" if "T" in first else "%Y-%m-%d %H:%M:%S.%f"
     )
     table = usual(d).rename(columns={"Time [s]": "Time"}).assign(Time=[stamp.strftime(how)[:-3] + zone for stamp in stamps])
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert examined.rate_hz is None
     recording = open_source(draft(examined).dataset).read("lap")
     assert recording.rate_hz == pytest.approx(50.0)
@@ -346,7 +346,7 @@ def test_marks_of_missing_samples_are_bridged(tmp_path, mark: str) -> None:
     table = usual(d)
     table.loc[1000:1010, "LatAcc"] = np.nan
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table, na_rep=mark)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, na_rep=mark)])
     recording = open_source(draft(examined).dataset).read("lap")
     assert np.isfinite(recording["ay"]).all()
     np.testing.assert_allclose(recording["sideslip_ref"][::5], d["sideslip"][::5], atol=1e-6)
@@ -362,13 +362,13 @@ def test_whole_nanoseconds_since_1970_are_read(tmp_path) -> None:
 
 def test_a_time_that_is_no_clock_is_said(tmp_path) -> None:
     table = usual(drive()).sample(frac=1.0, random_state=0)
-    said = examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    said = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
     assert any("'Time [s]' as the time: it goes backwards" in note and "sort the rows" in note for note in said)
 
 
 def test_a_column_without_a_name_is_said(tmp_path) -> None:
     table = usual(drive()).rename(columns={"Beta": ""})
-    assert "not read: column 7 has no name" in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert "not read: column 7 has no name" in inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
 
 
 def test_without_lateral_acceleration_the_longitudinal_one_tells_the_unit_of_the_speed(tmp_path) -> None:
@@ -379,7 +379,7 @@ def test_without_lateral_acceleration_the_longitudinal_one_tells_the_unit_of_the
 
 def test_an_angle_beyond_what_a_car_can_do_is_left_out_and_said(tmp_path) -> None:
     table = usual(drive()).assign(**{"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6})
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     assert "roll" not in examined.proposals.by_channel
     assert any("'roll (rad)' is named as roll" in note and "left out" in note for note in examined.proposals.notes)
 
@@ -387,9 +387,9 @@ def test_an_angle_beyond_what_a_car_can_do_is_left_out_and_said(tmp_path) -> Non
 def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
     first, second = usual(drive(seed=1)), usual(drive(100.0, seed=2))
     second["Speed"] /= 3.6
-    examined = examine("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
+    examined = inspect("my_car", [write(tmp_path / "lap_1.csv", first), write(tmp_path / "lap_2.csv", second)])
     remarks = draft(examined).remarks
-    assert any(one.check == "unit" and one.message.startswith("in 'lap_2', ay is 3.6") for one in remarks)
+    assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
 
 
 @pytest.mark.parametrize(
@@ -405,14 +405,14 @@ def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, options: dict[s
     table = usual(drive(100.0, seed=2))
     table["Time [s]"] *= 1000.0 if "Time [s]" in columns else 1.0
     with pytest.raises(DataError, match=said):
-        examine("my_car", [*files, write(tmp_path / "lap_2.csv", table.rename(columns=columns), **options)])
+        inspect("my_car", [*files, write(tmp_path / "lap_2.csv", table.rename(columns=columns), **options)])
 
 
 def test_a_mark_in_the_second_file_alone_is_read(tmp_path) -> None:
     second = usual(drive(100.0, seed=2))
     second.loc[10:12, "LatAcc"] = np.nan
     files = [write(tmp_path / "lap_1.csv", usual(drive(seed=1))), write(tmp_path / "lap_2.csv", second, na_rep="-")]
-    examined = examine("my_car", files)
+    examined = inspect("my_car", files)
     assert len(draft(examined).contents) == 2
 
 
@@ -426,15 +426,15 @@ def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path) -> 
 def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
     table = usual(drive())
     table["Gyro"] = np.repeat(table["Gyro"].to_numpy()[::10], 10)
-    remarks = draft(examine("my_car", [write(tmp_path / "lap.csv", table)])).remarks
-    assert any(one.check == "held" and one.channel == "yaw_rate" for one in remarks)
-    assert not draft(examine("my_car", [write(tmp_path / "plain.csv", usual(drive()))])).remarks
+    remarks = draft(inspect("my_car", [write(tmp_path / "lap.csv", table)])).remarks
+    assert any(one.startswith("yaw_rate: ") for one in remarks)
+    assert not draft(inspect("my_car", [write(tmp_path / "plain.csv", usual(drive()))])).remarks
 
 
 def test_a_pose_that_does_not_follow_the_motion_is_told_of(tmp_path) -> None:
     random = np.random.default_rng(0)
     walk = {name: random.standard_normal(6000).cumsum() for name in ("pose_x", "pose_y", "pose_yaw")}
-    proposals = examine("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta").assign(**walk))]).proposals
+    proposals = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta").assign(**walk))]).proposals
     assert not proposals.pose
     assert any("no reference is made of 'pose_x', 'pose_y', 'pose_yaw'" in note for note in proposals.notes)
 
@@ -443,17 +443,17 @@ def test_a_car_that_stands_all_the_time_is_told_of(tmp_path) -> None:
     random = np.random.default_rng(0)
     names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
     table = pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
-    assert any("stands all the time" in note for note in examine("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)
+    assert any("stands all the time" in note for note in inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)
 
 
 def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> None:
     d = drive()
     table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 9999.0
-    examined = examine("my_car", [write(tmp_path / "lap.csv", table)])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
     made = draft(examined)
     assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
-    assert any("data rows 2001, 2002" in note for note in made.notes)
+    assert any("data rows: 2 (2001, 2002)" in note for note in made.notes)
     recording = open_source(made.dataset).read("lap")
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
@@ -464,7 +464,7 @@ def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path) -
     first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
     second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
     assert "roll" in proposed(first)
-    assert "roll" not in examine("my_car", [first, second]).proposals.by_channel
+    assert "roll" not in inspect("my_car", [first, second]).proposals.by_channel
 
 
 def test_steering_and_yaw_rate_without_names_are_not_taken_for_yaw_rate_and_acceleration_unasked(tmp_path) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
@@ -27,75 +28,51 @@ from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.printing import TerminalTable
-from vehest.run.usable import HEADER, all_usabilities, borrowed_cars, remedies, table_row, unscored
+from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
 from vehest.sources.unused import unused_columns
 
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 MOST_COLUMNS = 40  # of a table that are listed
+SPREAD = ("min", "mean", "max", "std")
+
+Lines = list[str | TerminalTable]
 
 
-def dataset_rows() -> list[dict[str, str]]:
-    """A row a data set: name, kind, source, whether its files are here, title, licence, citation."""
+def list_datasets() -> tuple[list[dict[str, str]], Lines]:
+    """Data sets with their files' presence, licences and citations: for JSON and for a terminal."""
     rows = []
     for name in choices("dataset"):
         dataset = compose_config("ingest", [f"dataset={name}"])["dataset"]
-        texts = {key: " ".join(str(dataset.get(key, "")).split()) for key in ("title", "licence", "citation")}
-        rows.append(
-            {"dataset": name, "kind": kind_of(dataset), "source": str(dataset.get("source", "")), "here": _is_here(dataset), **texts}
-        )
-    return rows
-
-
-def datasets_in_words(rows: Sequence[Mapping[str, str]]) -> list[str | TerminalTable]:
-    """Data sets for a terminal, with their licences and what to cite."""
+        row = {"dataset": name, "kind": kind_of(dataset), "source": str(dataset.get("source", "")), "here": _is_here(dataset)}
+        rows.append(row | {key: " ".join(str(dataset.get(key, "")).split()) for key in ("title", "licence", "citation")})
     shown = ("dataset", "kind", "source", "here", "title")
     table = TerminalTable("", ("data set", *shown[1:]), [[row[key] for key in shown] for row in rows])
     cited = [line for row in rows for line in (f"{row['dataset']}: {row['licence']}", f"  cite: {row['citation']}")]
-    return [table, "", "licences and citations", *cited]
+    return rows, [table, "", "licences and citations", *cited]
 
 
-def recordings_in_words(described: Mapping[str, Any]) -> Iterator[str | TerminalTable]:
-    """Output of `describe` for a terminal."""
-    for recording in described["recordings"]:
-        yield (
-            f"{recording['id']}: {recording['kind']}, {recording['vehicle']}, {recording['rate_hz']:g} Hz, "
-            f"{_stretch(recording['start'], recording['end'])}, {recording['samples']} samples"
-        )
-        yield from (f"  {line}" for line in recording["origin"])
-        rows = [[c["name"], c["unit"], *(f"{c[key]:.4g}" for key in ("min", "mean", "max", "std"))] for c in recording["channels"]]
-        yield TerminalTable("", ("channel", "unit", "min", "mean", "max", "std"), rows)
-
-
-def _stretch(start: float, end: float) -> str:
-    """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
-    if not EARLIEST_UNIX < start < LATEST_UNIX:
-        return f"{start:.6g} s to {end:.6g} s"
-    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
-
-
-def finding_row_in_words(row: Mapping[str, str]) -> str:
-    """A row of `check` as a line."""
-    channel = f" {row['channel']}:" if row["channel"] else ""
-    return f"{row['level']:<7} {row['recording']}:{channel} {row['message']}"
-
-
-def describe(source: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Recordings of a data set or file, with ranges of their channels.
+def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
+    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal.
 
     Raises:
         VehestError: they cannot be read.
     """
-    config = config_of(source, overrides)
-    with use_limits(limits_from_config(config["limits"])):
-        return {"source": source, "recordings": [_described(read()) for _, read in _readers(source, config)]}
+    with reading(source, overrides) as config:
+        recordings = [_described(read()) for _, read in _readers(source, config)]
+    lines: Lines = []
+    for own in recordings:
+        about = f"{own['id']}: {own['kind']}, {own['vehicle']}, {own['rate_hz']:g} Hz, {_stretch(own['start'], own['end'])}"
+        rows = [[channel["name"], channel["unit"], *(f"{channel[key]:.4g}" for key in SPREAD)] for channel in own["channels"]]
+        lines += [f"{about}, {own['samples']} samples", *(f"  {line}" for line in own["origin"])]
+        lines.append(TerminalTable("", ("channel", "unit", *SPREAD), rows))
+    return {"source": source, "recordings": recordings}, lines
 
 
-def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
-    """Findings of the checks, a row each; a recording that cannot be read is an error too."""
-    config = config_of(source, overrides)
+def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], Lines]:
+    """Findings of the checks, for JSON and for a terminal; a recording that cannot be read is an error too."""
     rows: list[dict[str, str]] = []
-    with use_limits(limits_from_config(config["limits"])):
+    with reading(source, overrides) as config:
         for name, read in _readers(source, config):
             try:
                 recording = read()
@@ -103,51 +80,57 @@ def check(source: str, overrides: Sequence[str]) -> list[dict[str, str]]:
                 rows.append({"level": "error", "recording": name, "check": "read", "channel": "", "message": str(error)})
             else:
                 rows += [{"recording": recording.id, **asdict(finding)} for finding in checks_of_recording(recording)]
-    return rows
+    lines: Lines = []
+    for row in rows:
+        channel = f" {row['channel']}:" if row["channel"] else ""
+        lines.append(f"{row['level']:<7} {row['recording']}:{channel} {row['message']}")
+    return rows, lines or ["nothing found"]
 
 
-def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], list[str | TerminalTable]]:
+def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
     """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal.
 
     Raises:
         VehestError: it cannot be read.
     """
-    config = config_of(source, overrides)
-    with use_limits(limits_from_config(config["limits"])):
+    with reading(source, overrides) as config:
         recordings = _contents(source, config)
         columns = unused_columns(config["dataset"], None if source in choices("dataset") else Path(source))
     if not recordings:
         raise DataError(f"'{source}' holds no recordings")
-    rows, missing = all_usabilities(recordings), [one.channel for one in unscored(recordings)]
-    lines: list[str | TerminalTable] = [TerminalTable("", HEADER, [table_row(row) for row in rows]), "", *remedies(rows)]
+    rows, missing = all_usabilities(recordings), absent_channels(SCORED, recordings).to_estimate
+    lines = usable_in_words(rows)
     if missing:
         lines.append(f"every estimate is scored by {' and '.join(missing)}")
     if columns:
         names = ", ".join(columns[:MOST_COLUMNS]) + (", …" if len(columns) > MOST_COLUMNS else "")
         lines.append(f"columns that no channel uses: {names}; what is not in the log may be one of them, to be declared in conf/dataset")
-    borrowed = borrowed_cars(rows)
     plain = {
         "source": source,
         "recordings": [recording.id for recording in recordings],
         "rate_hz": min(recording.rate_hz for recording in recordings),
         "missing_to_score": missing,
-        "unused_columns": list(columns),
+        "unused_columns": columns,
         "estimators": [row.as_plain() for row in rows],
     }
-    return plain, [*lines, borrowed] if borrowed else lines
+    return plain, lines
 
 
-def config_of(source: str, overrides: Sequence[str]) -> Config:
-    """The configuration that reads a data set or a file.
+@contextmanager
+def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
+    """The configuration that reads a data set or a file, while its limits hold.
 
     Raises:
         ConfigurationError: it is neither, or an override makes no sense.
     """
     if source in choices("dataset"):
-        return compose_config("ingest", [f"dataset={source}", *overrides])
-    if not os.path.lexists(source):  # also of a name that is too long or holds a null character
+        config = compose_config("ingest", [f"dataset={source}", *overrides])
+    elif os.path.lexists(source):  # also of a name that is too long or holds a null character
+        config = compose_config("estimate", overrides)
+    else:
         raise ConfigurationError(f"'{source}' is neither a data set ({', '.join(choices('dataset'))}) nor a file")
-    return compose_config("estimate", overrides)
+    with use_limits(limits_from_config(config["limits"])):
+        yield config
 
 
 def _contents(source: str, config: Config) -> list[Contents]:
@@ -188,9 +171,15 @@ def _described(recording: Recording) -> dict[str, Any]:
 def _spread(samples: FloatArray) -> dict[str, float]:
     """Range, mean and standard deviation of the measured samples; NaN where there are none."""
     measured = samples[~np.isnan(samples)]
-    functions: dict[str, Callable[[FloatArray], Any]] = {"min": np.min, "mean": np.mean, "max": np.max, "std": np.std}
     with np.errstate(over="ignore", invalid="ignore"):
-        return {name: float(function(measured)) if len(measured) else math.nan for name, function in functions.items()}
+        return {name: float(getattr(measured, name)()) if len(measured) else math.nan for name in SPREAD}
+
+
+def _stretch(start: float, end: float) -> str:
+    """Start and end of a recording [s]; of unix time the date, and seconds from it on."""
+    if not EARLIEST_UNIX < start < LATEST_UNIX:
+        return f"{start:.6g} s to {end:.6g} s"
+    return f"0 s to {end - start:.6g} s from {datetime.fromtimestamp(start, UTC):%Y-%m-%d %H:%M:%S} UTC on"
 
 
 def _is_here(dataset: dict[str, Any]) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 
 from vehest.alignment.align import align
 from vehest.alignment.checks import checks_of_recording
-from vehest.alignment.findings import Finding
 from vehest.alignment.proposals.lateness import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
@@ -21,7 +20,8 @@ from vehest.data.contents import Contents, common_channels, contents_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.supplies import supply_of
-from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, MOST_LISTED, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.columns import plain_rate
 from vehest.sources.surveys import RawColumn
@@ -56,10 +56,10 @@ class Draft:
     examined: Examined
     dataset: Mapping[str, Any]
     late: Mapping[str, Late]
-    contents: tuple[Contents, ...]
-    remarks: tuple[Finding, ...]
+    contents: list[Contents]
+    remarks: list[str]
     ratio: tuple[float, float] | None
-    notes: tuple[str, ...]
+    notes: list[str]
     seconds: float
 
     @property
@@ -81,10 +81,10 @@ def draft(examined: Examined) -> Draft:
     speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
     longest = max(recordings, key=lambda own: own.duration)
-    late, ratio, notes = late_channels(longest), None, list(proposals.notes)
+    late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
-        listed = ", ".join(map(str, rows[:MOST_LISTED])) + (", …" if len(rows) > MOST_LISTED else "")
-        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data row{'s' * (len(rows) > 1)} {listed}")
+        listed = counted([str(row) for row in rows])
+        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data rows: {listed}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]
@@ -101,10 +101,10 @@ def draft(examined: Examined) -> Draft:
         replace(examined, proposals=replace(proposals, channels=channels)),
         dataset,
         late,
-        tuple(contents_of(own) for own in recordings),
-        tuple(_remarks(longest, recordings)),
+        [contents_of(own) for own in recordings],
+        _remarks(longest, recordings),
         ratio,
-        tuple(notes),
+        notes,
         sum(own.duration for own in recordings),
     )
 
@@ -123,29 +123,21 @@ def _recordings(dataset: Mapping[str, Any]) -> list[Recording]:
     return [source.read(name) for name in source.ids()]
 
 
-def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[Finding]:
+def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
     """Findings of the longest recording, and contradictions in the longest one of each other file."""
-    found = [one for one in checks_of_recording(longest) if one.check in REMARKS and one.level != "note"]
+    found = [("", one) for one in checks_of_recording(longest) if one.check in REMARKS]
     by_file = {own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)}
     by_file.pop(longest.provenance.get("file"), None)
     for own in by_file.values():
-        contradictions = (one for one in checks_of_recording(own) if one.check in CONTRADICTIONS and one.level != "note")
-        found += [replace(one, message=f"in '{own.id}', {one.message}") for one in contradictions]
-    return found
+        found += [(f"in '{own.id}', ", one) for one in checks_of_recording(own) if one.check in CONTRADICTIONS]
+    return [f"{one.channel}: {where}{one.message}" if one.channel else where + one.message for where, one in found if one.level != "note"]
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
     """The configuration of the source, without transforms."""
     log, name, proposals = examined.log, examined.name, examined.proposals
-    dataset: dict[str, Any] = {
-        "name": name,
-        "title": f"Recordings of {name}",
-        "kind": "real",
-        "vehicle": name,
-        "licence": "yours",
-        "citation": "none",
-    }
-    dataset |= {"source": log.source, **examined.place}
+    dataset: dict[str, Any] = {"name": name, "title": f"Recordings of {name}", "kind": "real", "vehicle": name}
+    dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
     columns = {column.name: column for column in log.columns}
     if log.source == "rosbag":
         return dataset | _bag_options(columns, proposals.channels)
@@ -155,8 +147,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     if log.source != "vbo":
         dataset["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
-    stray = _stray_rows(examined) if log.source in TABLES and log.clock is not None else {}
-    dataset |= {"drop_rows": stray} if stray else {}
+    if log.source in TABLES and log.clock is not None and (stray := _stray_rows(examined)):
+        dataset["drop_rows"] = stray
     dataset["clock"] = "strict"
     gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
     short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
@@ -175,9 +167,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 
 def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
     """A channel's declaration."""
-    entry = {**place, "unit": one.unit}
-    entry |= {"sign": one.sign} if one.sign != 1 else {}
-    return entry | ({"factor": one.factor} if one.factor != 1.0 else {})
+    sign = {"sign": one.sign} if one.sign != 1 else {}
+    return {**place, "unit": one.unit} | sign | ({"factor": one.factor} if one.factor != 1.0 else {})
 
 
 def _stray_rows(examined: Examined) -> dict[str, list[int]]:
@@ -248,10 +239,8 @@ def _transforms(
 
     A reference that is late is put on the others' clock; a measured channel is not, since an estimator in the car would get it late, too.
     """
-    made: list[dict[str, Any]] = []
-    for name, own in late.items():
-        if CHANNELS[name].is_reference:
-            made.append({"name": "delay_correction", "delay": own.delay, "channels": [name]})
+    references = {name: own.delay for name, own in late.items() if CHANNELS[name].is_reference}
+    made: list[dict[str, Any]] = [{"name": "delay_correction", "delay": own, "channels": [name]} for name, own in references.items()]
     offsets = {one.channel: float(f"{one.factor * one.sign * one.offset:.5g}") for one in examined.proposals.channels if one.offset}
     if offsets and examined.log.source != "rosbag":  # whose channels have an offset of their own
         made.append({"name": "offset_correction", "offsets": offsets})

@@ -23,7 +23,7 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
 from vehest.sources.columns import plain_rate
-from vehest.sources.surveys import Log, survey
+from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 
@@ -33,9 +33,6 @@ ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
 RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
-CLOCKWISE = {"vbo": "heading"}
-"""Source -> column that counts a heading clockwise by its format."""
-WEST_POSITIVE = ("vbo",)
 TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
 """Options of a table's layout with their defaults."""
@@ -83,44 +80,33 @@ class Examined:
         return lines + ([f"  no channel: {counted(list(found.unused))}"] if found.unused else [])
 
 
-def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None], *, force: bool) -> Examined:
-    """Examine logs for a data set of that name, whose files may exist with ``force`` only.
-
-    Raises:
-        ConfigurationError: the name is taken or cannot be part of a file's name.
-        VehestError: as `examine`.
-    """
-    check_name(name, "data set")
-    refuse_existing(name, force=force)
-    if name in choices("dataset") and not paths_of(name)[0].exists():
-        raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
-    with use_limits(limits_from_config(compose_config("estimate")["limits"])):
-        return examine(name, files, vehicle)
-
-
-def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None) -> Examined:
+def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
     """Read logs and propose a channel, unit and sign for each column.
 
     Args:
         name: of the data set.
         files: of one format and one set of columns, a recording each.
         vehicle: known values of `VEHICLE`.
+        force: whether files of a data set of that name may exist.
 
     Raises:
-        ConfigurationError: the files differ in format or folder.
+        ConfigurationError: the name is taken or cannot be part of a file's name, or the files differ in format or folder.
         MissingError: a file does not exist.
         DataError: a file cannot be read, or differs in layout or columns.
     """
-    logs = [survey(file) for file in files]
-    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
-    if len(formats) > 1:
-        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
-    longest = max(logs, key=_length)
-    _refuse_other_layouts(longest, logs)
-    longest = replace(longest, **_common(longest, logs))
+    check_name(name, "data set")
+    existing = [file for file in paths_of(name) if os.path.lexists(file)]
+    if existing and not force:
+        raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
+    if name in choices("dataset") and not paths_of(name)[0].exists():
+        raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
+    with use_limits(limits_from_config(compose_config("estimate")["limits"])):
+        logs = [survey(file) for file in files]
+    longest = _longest(logs)
     others = [log for log in logs if log.file != longest.file]
     columns, rate = _evidence(longest)
-    proposals = propose(columns, rate, compass=CLOCKWISE.get(longest.source, ""), west_positive=longest.source in WEST_POSITIVE)
+    is_vbo = longest.source == "vbo"  # whose headings count clockwise, and longitudes to the west
+    proposals = propose(columns, rate, compass="heading" if is_vbo else "", west_positive=is_vbo)
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
     used = {one.column for one in proposals.channels}
@@ -130,8 +116,8 @@ def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
             raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
         proposals = possible(proposals, {column.name: column.values for column in log.columns})
     if not proposals.channels:
-        names = ", ".join(column.name for column in longest.columns[:8])
-        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion (it has {names})")
+        names = counted([column.name for column in longest.columns])
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
     proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
     place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
@@ -140,13 +126,6 @@ def examine(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
 def paths_of(name: str) -> tuple[Path, Path, Path]:
     """Data set, split and pipeline of that name, in ./conf and ./pipelines."""
     return Path("conf") / "dataset" / f"{name}.yaml", Path("conf") / "split" / f"{name}.yaml", Path("pipelines") / f"{name}.yaml"
-
-
-def refuse_existing(name: str, *, force: bool) -> None:
-    """Raise ConfigurationError where a file of the data set exists, and ``force`` is not given."""
-    existing = [str(file) for file in paths_of(name) if os.path.lexists(file)]
-    if existing and not force:
-        raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
 
 
 def is_parquet(log: Log) -> bool:
@@ -159,30 +138,34 @@ def rate_of(stamps: FloatArray) -> float:
     return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
 
 
-def _length(log: Log) -> int:
-    return int(log.runs[0].stop - log.runs[0].start) if log.runs else max(len(column.values) for column in log.columns)
+def _longest(logs: Sequence[Log]) -> Log:
+    """The longest log, with source and options for all.
 
-
-def _refuse_other_layouts(longest: Log, logs: Sequence[Log]) -> None:
+    Raises:
+        ConfigurationError: the logs differ in format.
+        DataError: they differ in layout.
+    """
+    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
+    if len(formats) > 1:
+        raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
+    longest = max(logs, key=lambda log: log.runs[0].stop - log.runs[0].start if log.runs else max(len(one.values) for one in log.columns))
+    expected = _layout(longest)
     for log in logs:
-        layouts = [(key, log.options.get(key, default), longest.options.get(key, default)) for key, default in LAYOUT.items()]
-        for key, own, other in (*layouts, ("times", _clock(log), _clock(longest))):
-            if own != other:
-                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {other!r}; write both alike, or make a data set of each")
-
-
-def _clock(log: Log) -> str | None:
-    return None if log.clock is None else f"{log.clock.column} in {log.clock.unit}"
-
-
-def _common(longest: Log, logs: Sequence[Log]) -> dict[str, Any]:
-    """Source and options for all files: marks of missing samples, and times that restart."""
+        for key, own in _layout(log).items():
+            if own != expected[key]:
+                alike = "write both alike, or make a data set of each"
+                raise DataError(f"'{log.file}' has {key} {own!r}, '{longest.file}' {expected[key]!r}; {alike}")
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
     options |= {"missing": marks} if marks else {}
     if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
         options["time_restarts"] = True
-    return {"options": options, "source": "text_log" if any(log.source == "text_log" for log in logs) else longest.source}
+    return replace(longest, options=options, source="text_log" if any(log.source == "text_log" for log in logs) else longest.source)
+
+
+def _layout(log: Log) -> dict[str, Any]:
+    times = None if log.clock is None else f"{log.clock.column} in {log.clock.unit}"
+    return {key: log.options.get(key, default) for key, default in LAYOUT.items()} | {"times": times}
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
@@ -191,9 +174,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
-        for run in log.runs if log.seconds is not None else ():
-            assert log.seconds is not None
-            stamps = log.seconds[run]
+        stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
+        for stamps in stamps_of_runs:
             steps = np.diff(stamps)
             if steps.max(initial=0.0) > BRIDGED:
                 start = stamps[np.argmax(steps)]
@@ -207,13 +189,13 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     Raises:
         ConfigurationError: they lie in several folders, two have the same stem, or no pattern separates them from other files.
     """
-    folders = sorted({file.resolve().parent for file in files})
-    if len(folders) > 1:
-        listed = ", ".join(map(str, folders))
+    folder, *further = sorted({file.resolve().parent for file in files})
+    if further:
+        listed = ", ".join(map(str, (folder, *further)))
         raise ConfigurationError(f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder")
-    folder, names = folders[0], sorted({file.name for file in files})
+    names = sorted({file.name for file in files})
     stems = [Path(name).stem for name in names]
-    doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
+    doubled = [stem for stem in stems if stems.count(stem) > 1]
     if doubled:
         raise ConfigurationError(f"two files are called '{doubled[0]}'; a recording's name must be unique")
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
@@ -225,9 +207,7 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     beside = sorted(file.name for file in folder.iterdir() if file.is_file() and file.name not in names)
     others = [Path(name).stem for name in matching(beside, pattern)]
     if others and source not in TABLES:
-        raise ConfigurationError(
-            f"'{folder}' holds other files of that name ('{others[0]}'); put those of the data set into a folder of their own"
-        )
+        raise ConfigurationError(f"'{folder}' holds other files of that name ('{others[0]}'); use a folder of the data set's files alone")
     return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
 
 
@@ -236,50 +216,47 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
 
     Of a long drive the minutes in which columns change most are taken.
     """
-    columns, rate = _on_one_clock(log)
-    if rate is None:
-        return columns, None
-    n_rows = len(columns[0][2])
-    cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
-    factor = max(math.floor(rate / EVIDENCE_HZ), 1)
-    whole = (n_rows - 2 * cut) // factor * factor
-    slower = [(name, unit, values[cut : cut + whole].reshape(-1, factor).mean(axis=1)) for name, unit, values in columns]
-    kept = _busiest([values for _, _, values in slower], round(LONGEST_EVIDENCE * rate / factor), max(round(60.0 * rate / factor), 1))
-    return [(name, unit, values[kept]) for name, unit, values in slower], rate / factor
+    columns = [column for column in log.columns if column.stamps is None or len(column.stamps) > 1]
+    samples, rate = _on_one_clock(log, columns)
+    if rate is not None:
+        n_rows = samples.shape[1]
+        cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
+        factor = max(math.floor(rate / EVIDENCE_HZ), 1)
+        whole = (n_rows - 2 * cut) // factor * factor
+        samples, rate = samples[:, cut : cut + whole].reshape(len(columns), -1, factor).mean(axis=2), rate / factor
+        samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
+    return [(own.name, plain_unit(own.unit) or "", values) for own, values in zip(columns, samples, strict=True)], rate
 
 
-def _on_one_clock(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None]:
-    units = [plain_unit(column.unit) or "" for column in log.columns]
-    if log.columns[0].stamps is not None:
-        timed = [
-            (own, unit, own.stamps) for own, unit in zip(log.columns, units, strict=True) if own.stamps is not None and len(own.stamps) > 1
-        ]
-        begin, end = (float(np.median([stamps[edge] for _, _, stamps in timed])) for edge in (0, -1))
-        rate = plain_rate(min(max(rate_of(stamps) for _, _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
+def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
+    """Samples of the columns, (C, T), and their rate [Hz]."""
+    timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
+    if timed:
+        begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))
+        rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
         grid = np.arange(begin, end, 1.0 / rate)
-        return [(own.name, unit, np.interp(grid, stamps, own.values)) for own, unit, stamps in timed], rate
+        return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
-    rows = [(own.name, unit, own.values[run]) for own, unit in zip(log.columns, units, strict=True)]
     if log.seconds is None:
-        return rows, None
+        return np.stack([column.values[run] for column in columns]), None
     stamps = log.seconds[run]
-    columns = [(name, unit, bridged(values, stamps, BRIDGED)) for name, unit, values in rows]
+    rows = [bridged(column.values[run], stamps, BRIDGED) for column in columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     rate = plain_rate(1.0 / step, RATE_TOLERANCE)
     grid = np.arange(stamps[0], stamps[-1], 1.0 / rate)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
     if is_even or len(grid) > 4 * len(stamps):
-        return columns, rate
-    return [(name, unit, np.interp(grid, stamps, values)) for name, unit, values in columns], rate
+        return np.stack(rows), rate
+    return np.stack([np.interp(grid, stamps, values) for values in rows]), rate
 
 
-def _busiest(columns: Sequence[FloatArray], most: int, minute: int) -> slice:
-    """Rows of the stretch in which the columns change most."""
-    if len(columns[0]) <= most:
-        return slice(None)
-    starts = np.arange(0, len(columns[0]) - minute, minute)
+def _busiest(columns: FloatArray, most: int, minute: int) -> FloatArray:
+    """The rows in which the columns change most, (C, at most ``most``)."""
+    if columns.shape[1] <= most:
+        return columns
+    starts = np.arange(0, columns.shape[1] - minute, minute)
     with np.errstate(invalid="ignore", divide="ignore"):
         changes = [[np.nanstd(values[start : start + minute]) / np.nanstd(values) for start in starts] for values in columns]
     activity = np.nan_to_num(changes, posinf=0.0).sum(axis=0)
     first = int(starts[np.argmax(np.convolve(activity, np.ones(most // minute), mode="valid"))])
-    return slice(first, first + most)
+    return columns[:, first : first + most]

@@ -16,6 +16,7 @@ from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import VEHICLE, Examined
 from vehest.run.printing import echo
+from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import UNITS
 
 LEAVE_OUT = "-"
@@ -72,13 +73,18 @@ def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -
             raise ConfigurationError(f"no question has the key '{key}'; open questions: {', '.join(keys) or 'none'}")
         given[key] = answer
     if interactive:
-        questions += _vehicle_questions(examined)
+        known = {key for key, value in examined.vehicle.items() if value is not None}
+        known |= set() if "handwheel" in examined.proposals.by_channel else {"steering_ratio"}
+        questions += [Question(key, text, "", hint="a number, or nothing") for key, text in VEHICLE.items() if key not in known]
+    left = []
     for question in questions:
         if question.key in given:
             examined = _answered(examined, question, given[question.key])
         elif interactive:
             examined = _ask_at_terminal(question, examined)
-    return examined, () if interactive else tuple(question for question in questions if question.key not in given)
+        else:
+            left.append(question)
+    return examined, tuple(left)
 
 
 def questions_of(examined: Examined) -> Iterator[Question]:
@@ -106,12 +112,6 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         signs = ", ".join(f"{one.column} {one.sign:+d}" for one in lateral)
         evidence = (f"signs that agree with each other, as they would all reversed: {signs}",)
         yield Question("left_right", text, "yes", ("no",), evidence, "yes or no")
-
-
-def _vehicle_questions(examined: Examined) -> list[Question]:
-    has_handwheel = "handwheel" in examined.proposals.by_channel
-    wanted = [key for key in VEHICLE if examined.vehicle[key] is None and (has_handwheel or key != "steering_ratio")]
-    return [Question(key, VEHICLE[key], "", hint="a number, or nothing") for key in wanted]
 
 
 def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
@@ -146,7 +146,9 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))
     if key == "time":
-        return _with_time_unit(examined, answer)
+        if answer not in UNITS:
+            raise ConfigurationError(f"'{answer}' is none of {', '.join(UNITS)}")
+        return replace(examined, logs=tuple(_with_time_unit(log, answer) for log in examined.logs))
     if key in VEHICLE:
         return replace(examined, vehicle={**examined.vehicle, key: _number(answer, key)})
     if key == "radius":
@@ -158,15 +160,11 @@ def _answered(examined: Examined, question: Question, answer: str) -> Examined:
     return replace(examined, proposals=replace(proposals, channels=_declared(proposals.channels, key, answer)))
 
 
-def _with_time_unit(examined: Examined, unit: str) -> Examined:
-    if unit not in UNITS:
-        raise ConfigurationError(f"'{unit}' is none of {', '.join(UNITS)}")
-    logs = list(examined.logs)
-    for position, log in enumerate(logs):
-        if log.clock is not None and log.seconds is not None:
-            clock, factor = replace(log.clock, unit=unit, asked=False), UNITS[unit] / UNITS[log.clock.unit]
-            logs[position] = replace(log, clock=clock, seconds=log.seconds * factor)
-    return replace(examined, logs=tuple(logs))
+def _with_time_unit(log: Log, unit: str) -> Log:
+    if log.clock is None or log.seconds is None:
+        return log
+    factor = UNITS[unit] / UNITS[log.clock.unit]
+    return replace(log, clock=replace(log.clock, unit=unit, asked=False), seconds=log.seconds * factor)
 
 
 def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple[Proposal, ...]:
@@ -184,9 +182,9 @@ def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple
 
 def _declaration(one: Proposal) -> str:
     """A column's channel, unit, sign and factor in the form of an answer."""
-    words = [one.channel, one.unit]
-    words += [f"{one.sign:+d}"] if one.sign != 1 or one.factor != 1.0 else []
-    return " ".join([*words, *([f"{one.factor:.5g}"] if one.factor != 1.0 else [])])
+    factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
+    sign = [f"{one.sign:+d}"] if factor or one.sign != 1 else []
+    return " ".join([one.channel, one.unit, *sign, *factor])
 
 
 def _parsed(answer: str, own: Proposal) -> Proposal:
@@ -201,8 +199,7 @@ def _parsed(answer: str, own: Proposal) -> Proposal:
     if sign not in ("", "1", "+1", "-1"):
         raise ConfigurationError(f"'{answer}': the sign must be 1 or -1, not '{sign}'")
     factor_of = _number(factor, f"'{answer}': the factor") if factor else own.factor
-    declared = replace(own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked="")
-    return declared.with_evidence("as answered")
+    return replace(own, channel=name, unit=unit, sign=int(sign or own.sign), factor=factor_of, asked="").with_evidence("as answered")
 
 
 def _number(text: str, quantity: str) -> float:

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
-from vehest.data.errors import ConfigurationError, printable
+from vehest.data.contents import Contents
+from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
+from vehest.estimators.registry import estimator_names
 from vehest.run.config import compose_config
+from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import Draft, draft
-from vehest.run.own_car.families import Plan, pipeline_of, plan_of
-from vehest.run.own_car.inspect import Examined, paths_of, refuse_existing
+from vehest.run.own_car.inspect import Examined, paths_of
 from vehest.run.own_car.questions import Question
-from vehest.run.usable import SCORED
+from vehest.run.usable import SCORED, car_parameters, usability
 
 LEARNT = 0.7  # of the recordings: training and validation
 SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
 PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
+STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
+HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
+PRETRAINED = "training.start_from=pretrained"
+PRETRAINED_HZ = 20.0
+MINUTES = (0.5, 1.0, 2.0, 5.0)
+"""Of reference, parts of the pipeline where there are more."""
 DATASET_COMMENTS = {
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
@@ -46,115 +55,158 @@ ASSUMED = """The car's parameters are made of wheelbase and mass: centre of grav
 cornering stiffness of an axle 10/rad times its load. Write yours where you know them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """Outcome of `vehest new`.
+@dataclass(frozen=True)
+class Plan:
+    """Overrides of each sweep of a pipeline with its description, estimators that are tried, and others with what each lacks."""
 
-    Args:
-        draft: the data set.
-        plan: estimators to try; None where there is no reference or none can be used.
-        open: questions without an answer, those of the vehicle left out.
-        files: path -> text, written unless ``dry_run``.
-        dry_run: whether nothing was written.
-    """
-
-    draft: Draft
-    plan: Plan | None
-    open: tuple[Question, ...]
-    files: Mapping[Path, str]
-    dry_run: bool
-
-    def next_commands(self) -> list[str]:
-        """Commands to go on with."""
-        name, file = self.draft.examined.name, self.draft.examined.files[0]
-        commands = [f"vehest data check {name}", f"vehest data usable {name}"]
-        if self.plan is not None:
-            return [*commands, f"vehest run {name} --minutes 15"]
-        if file.is_dir() or not self.draft.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
-            return commands
-        return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
-
-    def as_plain(self) -> dict[str, Any]:
-        """For JSON."""
-        own, examined = self.draft, self.draft.examined
-        found = examined.proposals
-        channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
-        return {
-            "name": examined.name,
-            "files": [str(file) for file in examined.files],
-            "source": examined.log.source,
-            "recordings": [one.id for one in own.contents],
-            "rate_hz": min(one.rate_hz for one in own.contents),
-            "seconds": own.seconds,
-            "time": None if examined.log.clock is None else asdict(examined.log.clock),
-            "channels": [one | {"asked": one["asked"] or None} for one in channels],
-            "left_right": found.left_right or None,
-            "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
-            "unused": list(found.unused),
-            "open": [question.as_plain() for question in self.open],
-            "vehicle": dict(examined.vehicle),
-            "steering_ratio_found": None if own.ratio is None else {"value": own.ratio[0], "uncertainty": own.ratio[1]},
-            "has_reference": "vy_ref" in own.channels,
-            "estimators": [] if self.plan is None else list(self.plan.estimators),
-            "lacking": {} if self.plan is None else dict(self.plan.lacking),
-            "findings": [f"{one.channel}: {one.message}" if one.channel else one.message for one in own.remarks],
-            "notes": list(own.notes),
-            "written": [str(file) for file in self.files],
-            "next": self.next_commands(),
-            "dry_run": self.dry_run,
-        }
-
-    def in_words(self) -> list[str]:
-        """For a terminal, a line each."""
-        own, lines = self.draft, []
-        if own.ratio is not None:
-            value, spread = own.ratio
-            doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
-            lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
-        lines += [f"{name} {late.evidence}" for name, late in own.late.items()]
-        lines += [f"note: {note}" for note in own.notes]
-        lines += [f"warning: {one.channel + ': ' if one.channel else ''}{one.message}" for one in own.remarks]
-        lines += ["open, taken as proposed:"] if self.open else []
-        lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in self.open]
-        lines += _limits(own)
-        if self.plan is not None:
-            lines += [f"left out: {name}: {lack}" for name, lack in self.plan.lacking.items()]
-        tried = "" if self.plan is None else ", ".join(self.plan.estimators)
-        purposes = ("channels, units and signs of the columns", "ranges for training, validation and test", f"estimators: {tried}")
-        for file, purpose in zip(self.files, purposes, strict=False):
-            lines.append(f"{'would write' if self.dry_run else 'wrote'} {file}: {purpose}")
-        return [*lines, "next:", *(f"  {command}" for command in self.next_commands())]
+    sweeps: list[tuple[list[str], str]] = field(default_factory=list)
+    estimators: list[str] = field(default_factory=list)
+    lacking: dict[str, str] = field(default_factory=dict)
 
 
-def write(examined: Examined, left: Sequence[Question] = (), *, force: bool = False, dry_run: bool = False) -> Outcome:
+def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = False) -> tuple[dict[str, Any], list[str]]:
     """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
 
     Args:
         examined: logs after the answers.
         left: questions without an answer.
-        force: whether existing files may be replaced.
         dry_run: whether to write nothing.
 
+    Returns:
+        The outcome for JSON and for a terminal.
+
     Raises:
-        ConfigurationError: a file exists, and ``force`` is not given.
         MissingError: the disk is full, or a folder cannot be written to.
         VehestError: the data set cannot be read.
     """
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else None
+    plan = _plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else Plan()
     texts = [_dataset_text(made, left)]
-    if plan is not None and plan.sweeps:
+    if plan.sweeps:
         split = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
         texts += [_yaml(split, [f"{name}: {SPLIT_HEAD}"]), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
     files = dict(zip(paths_of(name), texts, strict=False))
     if not dry_run:
-        refuse_existing(name, force=force)
         with ExitStack() as stack:
             for file, text in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
-    return Outcome(made, plan if len(texts) > 1 else None, tuple(left), files, dry_run)
+    following = _next_commands(made, plan)
+    plain = _plain(made, plan, left) | {"written": [str(file) for file in files], "next": following, "dry_run": dry_run}
+    purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
+    lines = _words(made, plan, left)
+    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
+        lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
+    return plain, [*lines, "next:", *(f"  {command}" for command in following)]
+
+
+def _next_commands(made: Draft, plan: Plan) -> list[str]:
+    name, file = made.examined.name, made.examined.files[0]
+    commands = [f"vehest data check {name}", f"vehest data usable {name}"]
+    if plan.sweeps:
+        return [*commands, f"vehest run {name} --minutes 15"]
+    if file.is_dir() or not made.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
+        return commands
+    return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
+
+
+def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
+    examined, found = made.examined, made.examined.proposals
+    channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
+    return {
+        "name": examined.name,
+        "files": [str(file) for file in examined.files],
+        "source": examined.log.source,
+        "recordings": [one.id for one in made.contents],
+        "rate_hz": min(one.rate_hz for one in made.contents),
+        "seconds": made.seconds,
+        "time": None if examined.log.clock is None else asdict(examined.log.clock),
+        "channels": [one | {"asked": one["asked"] or None} for one in channels],
+        "left_right": found.left_right or None,
+        "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
+        "unused": list(found.unused),
+        "open": [question.as_plain() for question in left],
+        "vehicle": dict(examined.vehicle),
+        "steering_ratio_found": None if made.ratio is None else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
+        "has_reference": "vy_ref" in made.channels,
+        "estimators": plan.estimators,
+        "lacking": plan.lacking,
+        "findings": made.remarks,
+        "notes": made.notes,
+    }
+
+
+def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
+    lines = []
+    if made.ratio is not None:
+        value, spread = made.ratio
+        doubt = "; a guess only, measure it" if spread > 0.1 * abs(value) else ""
+        lines.append(f"steering ratio {value:.3g} ± {spread:.2g} by slow corners and the wheelbase{doubt}")
+    lines += [f"{name} {late.evidence}" for name, late in made.late.items()]
+    lines += [f"note: {note}" for note in made.notes]
+    lines += [f"warning: {remark}" for remark in made.remarks]
+    lines += ["open, taken as proposed:"] if left else []
+    lines += [f"  {question.key}: {question.proposed or 'nothing'} ({question.text})" for question in left]
+    return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
+
+
+def _plan_of(contents: Sequence[Contents], vehicle: Mapping[str, float | None]) -> Plan:
+    """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
+    plan, values = Plan(), _car(vehicle)
+    known = {"learned_ukf_variant"}  # only a paper's study compares it
+    for family in yaml.safe_load(Path(__file__).with_name("families.yaml").read_text(encoding="utf-8")):
+        names, overrides = family["estimators"], family.get("overrides", "")
+        known.update(names)
+        if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
+            continue  # the next entry trains the same family from scratch
+        unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
+        car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
+        words = overrides.replace("{car}", car).format(**values).split()
+        lacks = {name: f"the car's {' and '.join(unknown)}" if unknown else _lack(name, words, contents) for name in names}
+        tried = [name for name in names if not lacks[name]]
+        plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
+        if tried:
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], family["about"]))
+            plan.estimators.extend(tried)
+    others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
+    plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; add it as you need it"))
+    return plan if plan.sweeps else Plan()
+
+
+def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
+    """Parameters of the car; with wheelbase and mass the others are assumed."""
+    wheelbase, mass = vehicle["wheelbase"] or 0.0, vehicle["mass"] or 0.0
+    half, stiffness = 0.5 * wheelbase, 0.5 * STIFFNESS * mass * GRAVITY
+    values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
+    values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
+    values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
+    return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
+
+
+def _lack(name: str, words: Sequence[str], contents: Sequence[Contents]) -> str:
+    """Channels that an estimator lacks; empty if none."""
+    first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
+    try:
+        found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
+    except VehestError as error:
+        return str(error)
+    return ", ".join([*found.missing.in_words(), *(f"{channel} without gaps" for channel in found.gaps)]) or found.to_give
+
+
+def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
+    """A pipeline for study and split of a name: all recordings, then parts with less of the minutes of reference."""
+    parts: dict[str, Any] = {"all": {"title": "all recordings", "split": name, "sweeps": [words for words, _ in plan.sweeps]}}
+    scratch = ["estimator=ksnn", "estimator.n_local=2", "estimator.n_hidden=2", "training.max_epochs=100"]
+    for own in MINUTES if "ksnn" in plan.estimators else ():
+        if own < 0.8 * minutes:
+            part = {"title": f"{own:g} min of reference", "split": name, "overrides": [f"++split.minutes={own:g}"]}
+            parts[f"minutes_{own:g}"] = part | {"sweeps": [["estimator=zero,static_map"], scratch]}
+            if any(PRETRAINED in words for words, _ in plan.sweeps):
+                tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
+                parts[f"minutes_{own:g}_tuned"] = part | tuned
+    study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
+    return study | {"evaluation": {"rate_hz": 20}, "parts": parts}
 
 
 def _limits(own: Draft) -> list[str]:
@@ -175,16 +227,15 @@ def _limits(own: Draft) -> list[str]:
 
 def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
     examined = made.examined
-    head = [
-        f"Recordings of {examined.name}: columns with the evidence for their channels; `vehest data check {examined.name}` checks them."
-    ]
+    name = examined.name
+    head = [f"Recordings of {name}: columns with the evidence for their channels; `vehest data check {name}` checks them."]
     head += [f"Open, not decided by the log: {question.text} Taken: {question.proposed or 'nothing'}." for question in left]
-    for name, late in made.late.items():
-        if not CHANNELS[name].is_reference:
+    for channel, late in made.late.items():
+        if not CHANNELS[channel].is_reference:
             head += [
-                f"{name} {late.evidence}.",
+                f"{channel} {late.evidence}.",
                 "An estimator in the car would get it as late; if only the log is, add to transforms:",
-                f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{name}]}}",
+                f"  - {{name: delay_correction, delay: {late.delay:.3f}, channels: [{channel}]}}",
             ]
     comments = dict(DATASET_COMMENTS)
     for one in examined.proposals.channels:
@@ -195,13 +246,11 @@ def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
 
 
 def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
-    head = [
-        f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}",
-        *([ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []),
-    ]
+    head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
+    head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
-    head += ["Left out, and what each lacks:"] if plan.lacking else []
-    return _yaml(pipeline_of(name, plan, minutes), [*head, *(f"  {own}: {lack}" for own, lack in plan.lacking.items())])
+    head += ["Left out, and what each lacks:", *(f"  {own}: {lack}" for own, lack in plan.lacking.items())]
+    return _yaml(_pipeline_of(name, plan, minutes), head)
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
