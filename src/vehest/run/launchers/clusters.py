@@ -3,7 +3,7 @@
 Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts in the driver's output root
 
 Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine, submitit a job whose time is up; both go
-on from the last checkpoint. Machines that do not share the output root get inputs through Ray's object store and return artefacts in `Done`.
+on from the last checkpoint. Machines that do not share the output root get inputs through Ray's object store and return artefacts.
 """
 
 from __future__ import annotations
@@ -36,6 +36,14 @@ from vehest.run.signals import StopSignals, TimeLimit
 from vehest.version import __version__
 
 TIMES = 3  # that a group is tried, if its tasks end without a report
+ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+ENVIRONMENT |= {"RAY_worker_niceness": "0", "RAY_task_oom_retries": str(TIMES - 1)}  # by default 15, and without end
+"""Of Ray, unless it is set otherwise."""
+QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
+STOP = "stop"  # file that asks all SLURM jobs to end
+PARAMETERS = {"account": "slurm_account", "constraint": "slurm_constraint", "memory_gb": "mem_gb", "minutes": "timeout_min"}
+PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
+"""Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
 
 
 class NotShared(Exception):
@@ -130,15 +138,8 @@ def unpack(packed: Files) -> None:
                 read_artefact(aside)
 
 
-# Ray
-
-ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
-ENVIRONMENT |= {"RAY_worker_niceness": "0", "RAY_task_oom_retries": str(TIMES - 1)}  # by default 15, and without end
-"""Unless it is set otherwise."""
-
-
 class RayLauncher:
-    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default at ``RAY_ADDRESS``, else on a Ray of its own."""
+    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default ``RAY_ADDRESS``, else a Ray of its own."""
 
     def __init__(self, address: str | None, jobs: int | None, output: Path, messages: Messages) -> None:
         self._address = address or os.environ.get("RAY_ADDRESS") or "local"
@@ -156,8 +157,6 @@ class RayLauncher:
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """See `Launcher`."""
-        if stop.requested():
-            return
         if self._ray is None:
             self._connect()
         waiting, running, stopping = deque(range(len(groups))), dict[Any, int](), False
@@ -202,9 +201,8 @@ class RayLauncher:
         self._ray, self._mark = ray, new_mark(self._output)
         self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
-        self._messages.line(
-            "note", "cluster", ray.get_runtime_context().gcs_address, f"{n_nodes} machine{'s' * (n_nodes > 1)}, {self.cores} cores"
-        )
+        machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
+        self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _print(self, data: Mapping[str, Any], **_: Any) -> None:
         """Print what Ray says of a lost worker or machine."""
@@ -230,9 +228,8 @@ class RayLauncher:
                 raise MissingError(f"a machine of the cluster cannot run tasks: {_line(error.cause or error)}") from error
             if self._stored is None:
                 self._stored = {}
-                self._messages.line(
-                    "note", "cluster", str(error.cause), "does not share the output root: recordings and artefacts are sent"
-                )
+                detail = "does not share the output root: recordings and artefacts are sent"
+                self._messages.line("note", "cluster", str(error.cause), detail)
             return None
         except errors.RayError as error:
             return Done(position, Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"))
@@ -252,15 +249,6 @@ def _run(spec: TaskSpec, *copies: Files) -> Done:
 
 def _line(error: BaseException) -> str:
     return (str(error) or type(error).__name__).splitlines()[0][:200]
-
-
-# SLURM
-
-QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
-STOP = "stop"  # file that asks all jobs to end
-PARAMETERS = {"account": "slurm_account", "constraint": "slurm_constraint", "memory_gb": "mem_gb", "minutes": "timeout_min"}
-PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
-"""Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
@@ -318,8 +306,6 @@ class SlurmLauncher:
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """See `Launcher`."""
-        if stop.requested():
-            return
         if self._executor is None:
             import submitit
 

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,7 @@ def launch(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, repo
         report(position, None)
         begun = time.monotonic()
         with stop.deferred():
-            outcome = guarded(task, stop.requested, lambda progress, at=position: report(at, progress))  # type: ignore[misc]
+            outcome = guarded(task, stop.requested, partial(report, position))
         yield Done(position, outcome, time.monotonic() - begun)
 
 
