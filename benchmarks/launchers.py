@@ -31,8 +31,8 @@ from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
 from vehest.run.launchers.base import Launcher
+from vehest.run.launchers.clusters import RayLauncher
 from vehest.run.launchers.local import LocalLauncher
-from vehest.run.launchers.on_ray import RayLauncher
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import sweep_of

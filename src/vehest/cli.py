@@ -14,7 +14,7 @@ import typer
 
 from vehest.data.errors import ConfigurationError, printable
 from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
-from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
+from vehest.run.launchers.base import LAUNCHERS, LauncherOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
 

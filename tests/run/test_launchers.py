@@ -19,12 +19,9 @@ from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.base import chosen_launcher
+from vehest.run.launchers.base import LauncherOptions, LaunchProgress, chosen_launcher
+from vehest.run.launchers.clusters import NotShared, pack, run_task, slurm_parameters, task_of, unpack, versions_here
 from vehest.run.launchers.local import LocalLauncher
-from vehest.run.launchers.on_slurm import slurm_parameters
-from vehest.run.launchers.options import LauncherOptions
-from vehest.run.launchers.progress import LaunchProgress
-from vehest.run.launchers.task import NotShared, pack, run_task, task_of, unpack, versions_here
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
@@ -57,13 +54,13 @@ def trained(own: TrainJob, seconds: float, text: str = "weights") -> Artefact:
 
 def test_progress_counts_and_estimates_the_end():
     progress = LaunchProgress(10)
-    progress.runs(0)
-    progress.runs(1)
+    progress.running.add(0)
+    progress.running.add(1)
     begun = {"done": "0", "running": "2", "waiting": "8", "failed": "0", "core hours": "0.000", "cores": "2", "left": ""}
     assert progress.row(2) == begun
     progress.ended(0, 10.0, failed=False)
     progress.ended(1, 20.0, failed=True)
-    ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "30 s"}
+    ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "0:00:30"}
     assert progress.row(4) == ended
     assert LaunchProgress(1).row(4) == {}
 

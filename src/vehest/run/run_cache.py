@@ -28,7 +28,7 @@ from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
 from vehest.run.config_files import conf_folders, find_pipeline, packaged_pipelines
 from vehest.run.console import WARNING, Messages
-from vehest.run.launchers.options import LauncherOptions
+from vehest.run.launchers.base import LauncherOptions
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.terminal import TerminalSummary
 

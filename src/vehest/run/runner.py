@@ -28,9 +28,8 @@ from vehest.run.failures import Failure
 from vehest.run.faults import FaultSettings
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
-from vehest.run.launchers.base import Launcher
+from vehest.run.launchers.base import Launcher, LaunchProgress
 from vehest.run.launchers.local import LocalLauncher
-from vehest.run.launchers.progress import LaunchProgress
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker, log_member, rmse_of_tests
@@ -288,7 +287,7 @@ class Runner:
         if isinstance(news, Waiting):
             self._print_waiting(news)
         else:
-            of_all.runs(at)
+            of_all.running.add(at)
             bars.fit(groups[at].name, news)
             bars.count(of_all.row(cores))
 

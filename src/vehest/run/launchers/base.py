@@ -1,18 +1,35 @@
-"""Launchers have one interface: this machine's cores, a Ray cluster and a SLURM queue."""
+"""Chooses where groups run, this machine's cores, a Ray cluster or a SLURM queue, and counts how far they are.
+
+Imports nothing heavy: the command line reads its options here.
+"""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from vehest.data.errors import ConfigurationError, MissingError
-from vehest.run.console import Messages
-from vehest.run.group import Group
-from vehest.run.launchers.local import Done, LocalLauncher, Reporter, default_jobs
-from vehest.run.launchers.options import LAUNCHERS, LauncherOptions
-from vehest.run.signals import StopSignals, TimeLimit
+
+if TYPE_CHECKING:
+    from vehest.run.console import Messages
+    from vehest.run.group import Group
+    from vehest.run.launchers.local import Done, Reporter
+    from vehest.run.signals import StopSignals, TimeLimit
+
+LAUNCHERS = ("local", "ray", "slurm")
+
+
+@dataclass(frozen=True)
+class LauncherOptions:
+    """Where trainings run: one of `LAUNCHERS`, the address of a cluster, and resources of SLURM jobs as ``NAME=VALUE``."""
+
+    launcher: str = "local"
+    address: str | None = None
+    slurm: Sequence[str] = ()
 
 
 class Launcher(Protocol):
@@ -48,16 +65,44 @@ def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, me
     if options.slurm and name != "slurm":
         raise ConfigurationError(f"--slurm is for --launcher slurm, not for {name}")
     if name == "local":
+        from vehest.run.launchers.local import LocalLauncher, default_jobs
+
         return LocalLauncher(jobs or default_jobs())
-    from vehest.run.launchers.on_ray import RayLauncher
-    from vehest.run.launchers.on_slurm import SlurmLauncher, slurm_parameters
+    from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher, slurm_parameters
 
     if name == "slurm" and options.address not in (None, "local"):
         raise ConfigurationError(f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{options.address}'")
-    parameters = slurm_parameters(options.slurm)
-    package = {"ray": "ray", "slurm": "submitit"}[name]
+    parameters, package = slurm_parameters(options.slurm), "submitit" if name == "slurm" else "ray"
     if importlib.util.find_spec(package) is None:
         raise MissingError(f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'")
     if name == "slurm":
         return SlurmLauncher(options.address or "slurm", jobs, parameters, output, messages)
     return RayLauncher(options.address, jobs, output, messages)
+
+
+@dataclass
+class LaunchProgress:
+    """Counts the groups of a launch, and estimates when the last will be done."""
+
+    total: int
+    core_seconds: float = 0.0
+    done: int = 0
+    failed: int = 0
+    running: set[int] = field(default_factory=set)
+
+    def ended(self, position: int, seconds: float, *, failed: bool) -> None:
+        """A group has ended after so many seconds of a core."""
+        self.running.discard(position)
+        self.core_seconds += seconds
+        self.failed += failed
+        self.done += not failed
+
+    def row(self, cores: int) -> Mapping[str, str]:
+        """Heading -> value, nothing for a single group; time left as if groups took what ended ones did and running ones were half done."""
+        running, ended = len(self.running), self.done + self.failed
+        waiting = self.total - ended - running
+        ahead = (waiting + 0.5 * running) / max(1, min(cores, waiting + running))
+        left = timedelta(seconds=round(ahead * self.core_seconds / ended)) if ended else ""
+        counts = {"done": self.done, "running": running, "waiting": waiting, "failed": self.failed}
+        shown = {**counts, "core hours": f"{self.core_seconds / 3600:.3f}", "cores": cores, "left": left}
+        return {name: str(value) for name, value in shown.items()} if self.total > 1 else {}

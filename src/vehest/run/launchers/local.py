@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
@@ -38,11 +39,11 @@ class Done:
     made: Files = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
 class LocalLauncher:
     """Runs groups in so many processes of this machine; one runs everything in this one."""
 
-    def __init__(self, jobs: int = 1) -> None:
-        self.cores = jobs
+    cores: int = 1
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """See `Launcher`."""
@@ -53,10 +54,9 @@ class LocalLauncher:
 
 
 def launch(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-    """Run tasks, as many at a time as ``jobs`` says, and yield them as they end.
+    """Run tasks in their order, as many at a time as ``jobs`` says, and yield them as they end.
 
     Args:
-        tasks: started in this order.
         jobs: processes; 1 runs everything in this one.
         stop: when a signal came or the time is up, running tasks are asked to end and no other is started.
         report: called with the task's position and its progress (None when it starts), or what it waits for.
@@ -70,7 +70,7 @@ def launch(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, repo
         report(position, None)
         begun = time.monotonic()
         with stop.deferred():
-            outcome = guarded(task, stop.requested, lambda progress, at=position: report(at, progress))  # type: ignore[misc]
+            outcome = guarded(task, stop.requested, partial(report, position))
         yield Done(position, outcome, time.monotonic() - begun)
 
 
@@ -103,13 +103,10 @@ def _launch_in_processes(tasks: Sequence[Task], jobs: int, stop: StopSignals | T
                 for future in waiting:
                     future.cancel()
             for future in ended:
-                if future.cancelled():
-                    continue
-                error = future.exception()
-                done = future.result() if error is None else None
+                error = None if future.cancelled() else future.exception()
                 if error is not None:
                     yield Done(futures[future], Failure(f"a worker process ended unexpectedly ({error})"))
-                elif done is not None:
+                elif not future.cancelled() and (done := future.result()) is not None:
                     yield done
 
 

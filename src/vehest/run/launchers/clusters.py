@@ -1,0 +1,375 @@
+"""Groups as tasks of a Ray cluster, or as jobs of a SLURM queue through submitit; each can also be tried on this machine alone.
+
+Group -> TaskSpec -> `run_task` on a machine: same versions? same output root? -> Done -> artefacts in the driver's output root
+
+Keys of members make a task idempotent. Ray repeats one that is lost with its worker or machine, submitit a job whose time is up; both go
+on from the last checkpoint. Machines that do not share the output root get inputs through Ray's object store and return artefacts.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import shutil
+import signal
+import socket
+import tempfile
+import threading
+import time
+from collections import ChainMap, Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import chdir, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.files import remove_leftovers, written_aside
+from vehest.data.limits import Limits, current_limits, use_limits
+from vehest.run.artefacts import MANIFEST, commit, library_versions, read_artefact
+from vehest.run.console import Messages
+from vehest.run.failures import Failure
+from vehest.run.group import Group, Member, existing
+from vehest.run.launchers.local import POLL_SECONDS, Done, Files, Reporter, default_jobs, guarded
+from vehest.run.signals import StopSignals, TimeLimit
+from vehest.version import __version__
+
+TIMES = 3  # that a group is tried, if its tasks end without a report
+ENVIRONMENT = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+ENVIRONMENT |= {"RAY_worker_niceness": "0", "RAY_task_oom_retries": str(TIMES - 1)}  # by default 15, and without end
+"""Of Ray, unless it is set otherwise."""
+QUEUE_SECONDS = {"local": 0.2, "slurm": 2.0}
+STOP = "stop"  # file that asks all SLURM jobs to end
+PARAMETERS = {"account": "slurm_account", "constraint": "slurm_constraint", "memory_gb": "mem_gb", "minutes": "timeout_min"}
+PARAMETERS |= {"partition": "slurm_partition", "qos": "slurm_qos"}
+"""Name in ``--slurm NAME=VALUE`` -> parameter of submitit."""
+
+
+class NotShared(Exception):
+    """A machine, by its name, does not share the output root, and got no copies."""
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """A group with the driver's paths, relative ones by ``folder``; a machine that sees ``mark`` shares the output root."""
+
+    position: int
+    group: Group
+    folder: Path
+    mark: Path
+    versions: Mapping[str, str]
+    limits: Limits
+
+
+def new_mark(output: Path) -> Path:
+    """A new folder in an output root, which only its owner can read."""
+    folder = output.resolve() / "clusters"
+    folder.mkdir(parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(prefix="run-", dir=folder))
+
+
+def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
+    """What a machine is sent of a group."""
+    return TaskSpec(position, group, output if output.is_absolute() else Path.cwd(), mark, versions_here(), current_limits())
+
+
+def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
+    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none while machines are taken to share the root.
+
+    Raises:
+        MissingError: the machine has other versions, or copies cannot be written.
+        NotShared: it does not share the output root, and has no copies.
+    """
+    begun, here = time.monotonic(), versions_here()
+    unlike = [f"{name} {here.get(name, 'missing')} instead of {own}" for name, own in spec.versions.items() if here.get(name) != own]
+    if unlike:
+        raise MissingError(f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine")
+    shared = spec.mark.is_dir()
+    if not shared and copies is None:
+        raise NotShared(socket.gethostname())
+    spec.folder.mkdir(parents=True, exist_ok=True)
+    with chdir(spec.folder), use_limits(spec.limits):
+        if not shared:
+            unpack(copies or {})
+        outcome = guarded(spec.group.run, should_stop, lambda _: None)
+        made = {} if shared or isinstance(outcome, Failure) else pack(folders_of(outcome).difference(copies or ()))
+    return Done(spec.position, outcome, time.monotonic() - begun, made)
+
+
+def versions_here() -> dict[str, str]:
+    """What must be the same everywhere for results to be those of one machine."""
+    return {"vehest": f"{__version__} {commit()}".strip(), "python": platform.python_version(), **library_versions()}
+
+
+def inputs_of(group: Group) -> set[Path]:
+    """Folders of artefacts that a group reads, or of which it has some already."""
+    data = [job.data for job in group.jobs]
+    if group.evaluation is not None:
+        data += [group.evaluation.data, group.evaluation.references]
+    starts = {Path(start) for job in group.jobs if (start := job.training.get("start_from"))}
+    return folders_of(existing(group)) | {artefact.folder for own in data for artefact in own.values()} | starts
+
+
+def folders_of(members: Sequence[Member]) -> set[Path]:
+    """Folders of the artefacts of members."""
+    return {own.folder for member in members for own in (member.model, member.calibration, member.evaluation) if own is not None}
+
+
+def pack(folders: set[Path]) -> Files:
+    """The files of artefacts, their manifests included."""
+    return {own: {file.relative_to(own).as_posix(): file.read_bytes() for file in own.rglob("*") if file.is_file()} for own in folders}
+
+
+def unpack(packed: Files) -> None:
+    """Put artefacts in their places, each whole or not at all, unless they are there.
+
+    Raises:
+        DataError: files are not those that a manifest names.
+        MissingError: they cannot be written.
+    """
+    for folder, files in packed.items():
+        if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
+            remove_leftovers(folder.parent)
+            with written_aside(folder, replace_folder=True) as aside:
+                for name, content in files.items():
+                    (aside / name).parent.mkdir(parents=True, exist_ok=True)
+                    (aside / name).write_bytes(content)
+                read_artefact(aside)
+
+
+class RayLauncher:
+    """Runs groups on the Ray cluster at an address, ``auto`` for this machine's; by default ``RAY_ADDRESS``, else a Ray of its own."""
+
+    def __init__(self, address: str | None, jobs: int | None, output: Path, messages: Messages) -> None:
+        self._address = address or os.environ.get("RAY_ADDRESS") or "local"
+        self._jobs, self._output, self._messages = jobs, output, messages
+        self._ray: Any = None
+        self._task: Any = None
+        self._mark = Path()
+        self._stored: dict[Path, Any] | None = None  # artefacts in Ray's object store; none while machines are taken to share the root
+
+    @property
+    def cores(self) -> int:
+        """Cores of the cluster as it is now, ``jobs`` at most; 1 before it is connected."""
+        there = int(self._ray.cluster_resources().get("CPU", 1)) if self._ray else 1
+        return min(there, self._jobs or there)
+
+    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+        """See `Launcher`."""
+        if self._ray is None:
+            self._connect()
+        waiting, running, stopping = deque(range(len(groups))), dict[Any, int](), False
+        with stop.deferred():
+            while waiting or running:
+                if stop.requested() and not stopping:
+                    stopping = True
+                    waiting.clear()
+                    for task in running:
+                        self._ray.cancel(task)
+                while waiting and len(running) < self.cores:
+                    position = waiting.popleft()
+                    running[self._begin(position, groups[position])] = position
+                    report(position, None)
+                for task in self._ray.wait(list(running), timeout=POLL_SECONDS)[0] if running else []:
+                    position = running.pop(task)
+                    done = self._done(position, task)
+                    if done is not None:
+                        yield done
+                    elif not stopping:
+                        waiting.append(position)
+
+    def close(self) -> None:
+        """Leave the cluster, or end the Ray of one's own."""
+        if self._ray is not None:
+            self._mark.rmdir()
+            self._ray.shutdown()
+
+    def _connect(self) -> None:
+        os.environ.update(ENVIRONMENT | os.environ)
+        import ray
+
+        own: dict[str, Any] = {"num_cpus": self._jobs, "include_dashboard": False} if self._address == "local" else {}
+        handler = signal.getsignal(signal.SIGTERM)
+        try:
+            ray.init(address=self._address, log_to_driver=False, logging_level=logging.CRITICAL, **own)
+        except Exception as error:  # ConnectionError, RuntimeError, ValueError, … by what is wrong
+            raise MissingError(f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one") from error
+        finally:
+            signal.signal(signal.SIGTERM, handler)  # Ray replaces it
+        ray._private.worker.print_to_stdstream = self._print  # would go to standard output
+        self._ray, self._mark = ray, new_mark(self._output)
+        self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
+        n_nodes = sum(node["Alive"] for node in ray.nodes())
+        machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
+        self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
+
+    def _print(self, data: Mapping[str, Any], **_: Any) -> None:
+        """Print what Ray says of a lost worker or machine."""
+        self._messages.line("again", "ray", str(data["lines"][0]).partition("\n")[0])
+
+    def _begin(self, position: int, group: Group) -> Any:
+        spec, copies = task_of(position, group, self._output, self._mark), []
+        if self._stored is not None:
+            inputs = inputs_of(group)
+            self._stored |= {folder: self._ray.put(pack({folder})) for folder in inputs if folder not in self._stored}
+            copies = [self._stored[folder] for folder in inputs]
+        return self._task.options(name=group.name).remote(spec, *copies)
+
+    def _done(self, position: int, task: Any) -> Done | None:
+        """The outcome of a task; none if it was called off before it began, or needs copies."""
+        errors = self._ray.exceptions
+        try:
+            done: Done = self._ray.get(task)
+        except errors.TaskCancelledError:
+            return None
+        except errors.RayTaskError as error:
+            if not isinstance(error.cause, NotShared):
+                raise MissingError(f"a machine of the cluster cannot run tasks: {_line(error.cause or error)}") from error
+            if self._stored is None:
+                self._stored = {}
+                detail = "does not share the output root: recordings and artefacts are sent"
+                self._messages.line("note", "cluster", str(error.cause), detail)
+            return None
+        except errors.RayError as error:
+            return Done(position, Failure(f"{_line(error)} ({TIMES} times; --launcher local shows what ends it)"))
+        unpack(done.made)
+        return done
+
+
+def _run(spec: TaskSpec, *copies: Files) -> Done:
+    """The task that Ray runs, and cancels by SIGINT."""
+    cancelled = threading.Event()
+    handler = signal.signal(signal.SIGINT, lambda *_: cancelled.set())
+    try:
+        return run_task(spec, ChainMap(*copies) if copies else None, cancelled.is_set)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]
+
+
+def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
+    """What jobs ask the queue for.
+
+    Raises:
+        ConfigurationError: a word is not NAME=VALUE with a name of `PARAMETERS`, or its value is no positive number where it must be one.
+    """
+    found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in PARAMETERS or not value:
+            raise ConfigurationError(f"--slurm '{word}' must be NAME=VALUE with one of the names {', '.join(PARAMETERS)}")
+        found[PARAMETERS[name]] = _positive(name, value) if name in ("memory_gb", "minutes") else value
+    return {**found, "timeout_min": max(round(found["timeout_min"]), 1)}
+
+
+def _positive(name: str, text: str) -> float:
+    with suppress(ValueError):
+        if 0.0 < float(text) < float("inf"):
+            return float(text)
+    raise ConfigurationError(f"--slurm {name} must be a positive number, not '{text}'")
+
+
+class SlurmTask:
+    """A job; submitit calls `checkpoint` when its time is nearly up, and hands the outcome in again."""
+
+    def __call__(self, spec: TaskSpec) -> Done:
+        """Run a group until it is done or the driver asks for its end."""
+        return run_task(spec, None, (spec.mark / STOP).exists)
+
+    def checkpoint(self, spec: TaskSpec) -> Any:
+        """The same task again."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, spec)
+
+
+class SlurmLauncher:
+    """Runs groups as SLURM jobs, all in the queue at once, or on ``cluster`` local as processes of this machine."""
+
+    def __init__(self, cluster: str, jobs: int | None, parameters: Mapping[str, Any], output: Path, messages: Messages) -> None:
+        if cluster == "slurm" and shutil.which("sbatch") is None:
+            raise MissingError("there is no SLURM here (no sbatch); run this where jobs are submitted, or try it with --address local")
+        self._cluster, self._parameters, self._output, self._messages = cluster, parameters, output, messages
+        self._jobs = jobs or (default_jobs() if cluster == "local" else None)
+        self._executor: Any = None
+        self._running: dict[Any, int] = {}
+        self._lost: Counter[str] = Counter()  # jobs, by the name of their group
+
+    @property
+    def cores(self) -> int:
+        """Jobs at a time, as many as are allowed or else as run now."""
+        return self._jobs or max(1, sum(job.state == "RUNNING" for job in self._running))
+
+    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
+        """See `Launcher`."""
+        if self._executor is None:
+            import submitit
+
+            limit = {f"{self._cluster}_max_num_timeout": 100}  # times that a job whose time was up goes on
+            self._executor = submitit.AutoExecutor(new_mark(self._output), self._cluster, **limit)
+            self._executor.update_parameters(**self._parameters, slurm_array_parallelism=self._jobs)
+        waiting = list(range(len(groups)))
+        with stop.deferred():
+            while waiting or self._running:
+                if stop.requested():
+                    waiting = []
+                    self._call_off()
+                room = len(waiting) if self._cluster == "slurm" else self.cores - len(self._running)
+                self._running |= zip(self._begin(groups, waiting[:room]), waiting[:room], strict=True)
+                waiting = waiting[room:]
+                for job, position in self._running.items():
+                    if job.state in ("RUNNING", "COMPLETED"):
+                        report(position, None)
+                ended = [job for job in self._running if job.done()]
+                if self._running and not ended:
+                    time.sleep(QUEUE_SECONDS[self._cluster])
+                for job in ended:
+                    position = self._running.pop(job)
+                    done = self._done(position, job, groups[position].name)
+                    if done is not None:
+                        yield done
+                    elif not stop.requested():
+                        waiting.append(position)
+
+    def close(self) -> None:
+        """Call off what is left; logs of jobs that were lost stay."""
+        if self._executor is not None:
+            self._call_off()
+            if not self._lost:
+                shutil.rmtree(self._executor.folder, ignore_errors=True)
+
+    def _begin(self, groups: Sequence[Group], positions: Sequence[int]) -> Sequence[Any]:
+        specs = [task_of(position, groups[position], self._output, self._executor.folder) for position in positions]
+        try:
+            return self._executor.map_array(SlurmTask(), specs) if specs else []
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[-300:]
+            raise MissingError(f"SLURM takes no jobs ({reason}); check --slurm, and what this account may submit") from error
+
+    def _call_off(self) -> None:
+        """Ask jobs to end after their batch, and take back those that have not begun."""
+        (self._executor.folder / STOP).touch()
+        for job in [job for job in self._running if job.state in ("PENDING", "UNKNOWN")]:
+            job.cancel(check=False)
+            del self._running[job]
+
+    def _done(self, position: int, job: Any, name: str) -> Done | None:
+        """The outcome of a job; none if it ended without one."""
+        log = f"its log: {job.paths.stderr}"
+        try:
+            return job.result()  # type: ignore[no-any-return]
+        except RuntimeError as error:
+            self._lost[name] += 1
+            if not job.paths.result_pickle.exists():
+                why = f"its job ended without an outcome ({str(job.state).lower()}); {log}"
+                if self._lost[name] == TIMES:
+                    return Done(position, Failure(f"{why} ({TIMES} times)"))
+                self._messages.line("again", "train", name, why)
+                return None
+            lines = str(error).splitlines()
+            reason = next((line for line in reversed(lines) if "Error: " in line and "submitit" not in line), lines[0])
+            raise MissingError(f"a machine of the cluster cannot run jobs: {reason.strip()}; {log}") from error
