@@ -40,7 +40,7 @@ from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.sweep import STAGE as SWEEP
 from vehest.run.sweep import draw_sweep
-from vehest.run.tracking import Tracker, log_calibration, log_evaluation, test_figures
+from vehest.run.tracking import Tracker, log_scores, test_figures
 from vehest.run.train import TrainJob, learnt_spans, read_fit_metrics, trained_rate
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
@@ -264,9 +264,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         scoring = how.of(trained, calibration)
         artefact = runner.ensure(scoring.plan, partial(write_evaluation, scoring))
         if runner.tracker is not None:
-            if calibration is not None:
-                log_calibration(runner.tracker, calibration)
-            log_evaluation(runner.tracker, artefact, trained, how)
+            log_scores(runner.tracker, trained, calibration, artefact, how)
     return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact), **fault_figures(artefact.folder)}
 
 
