@@ -207,8 +207,7 @@ def _publication(
     gone = {part.name: f"part '{part.name}'" for part in study.parts if part.name not in comparisons}
     gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
     inputs = {artefact.label: artefact.inputs for artefact in runner.artefacts.values() if artefact.stage == INGEST}
-    keys = keys_of_study(study, jobs, gone, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])
-    return Publication(study.study, gone, keys)
+    return Publication(study.study, gone, keys_of_study(study, jobs, gone, runner, inputs))
 
 
 def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
