@@ -119,8 +119,8 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     [folder] = (place.folder / "outputs" / "train").iterdir()
     artefact = read_artefact(folder)
     assert run.data.tags["vehest.key"] == artefact.key
-    tracker.log(artefact, lambda: pytest.fail("it is logged already"))
-    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict)
+    tracker.log(artefact, lambda: pytest.fail("it is logged already"), {})
+    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict, {})
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
@@ -275,7 +275,7 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
     (tmp_path / MANIFEST).write_text("{}")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
     said: list[str] = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict)
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict, {})
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}")).values()
     assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}

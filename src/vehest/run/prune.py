@@ -12,7 +12,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import timedelta
@@ -58,15 +58,18 @@ class Unused:
 
 def unused_artefacts(output: Path) -> list[Unused]:
     """List everything in an output root that no current configuration can reuse, stage by stage."""
-    artefacts = {folder: _artefact_in(folder) for stage in CODES for folder in _entries(output / stage) if _is_artefact(folder, stage)}
+    artefacts = _artefacts(output)
     whole = [artefact for artefact in artefacts.values() if artefact is not None]
     present = {digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())}
     reasons = {folder: reason for folder, artefact in artefacts.items() if (reason := _reason(artefact, present))}
     for folder in _entries(output / CHECKPOINTS):  # without a model its training may go on
-        model = artefacts.get(output / train.STAGE / folder.name)
-        if output / train.STAGE / folder.name in reasons or (model is not None and model.status == "complete"):
+        model = output / train.STAGE / folder.name
+        if model in reasons or any(own.folder == model and own.status == "complete" for own in whole):
             reasons[folder] = SUPERFLUOUS
-    reasons |= dict.fromkeys(_leftovers(output), LEFT_OVER)
+    for path in (path for place in (*CODES, CHECKPOINTS, FINISHED) for path in _entries(output / place)):
+        parts_of = path.with_name(path.name.removeprefix(ingest.PARTS_PREFIX))
+        if is_left_over(path) or (parts_of != path and parts_of in artefacts):
+            reasons[path] = LEFT_OVER
     return [Unused(path, reason, *_size_and_age(path)) for path, reason in reasons.items()]
 
 
@@ -88,21 +91,17 @@ def remove_unused(unused: Sequence[Unused], on_removed: Callable[[Unused], None]
         on_removed(one)
 
 
-def _is_artefact(folder: Path, stage: str) -> bool:
-    """Whether a folder of a stage has a manifest that gives its name."""
-    file = folder / MANIFEST
-    try:
-        manifest = read_json(file)
-        return manifest["stage"] == stage and folder.name == f"{manifest['label']}-{manifest['key'][:12]}" and not file.is_symlink()
-    except (VehestError, KeyError, TypeError):
-        return False
-
-
-def _artefact_in(folder: Path) -> Artefact | None:
-    """The artefact of a folder; none where it is damaged."""
-    with suppress(VehestError):
-        return read_artefact(folder)
-    return None
+def _artefacts(output: Path) -> dict[Path, Artefact | None]:
+    """Artefacts whose manifest gives their own name; none where one is damaged otherwise."""
+    found: dict[Path, Artefact | None] = {}
+    for folder in (folder for stage in CODES for folder in _entries(output / stage)):
+        with suppress(VehestError, KeyError, TypeError):
+            manifest = read_json(folder / MANIFEST)
+            named = (manifest["stage"], f"{manifest['label']}-{manifest['key'][:12]}")
+            if named == (folder.parent.name, folder.name) and not (folder / MANIFEST).is_symlink():
+                found[folder] = None
+                found[folder] = read_artefact(folder)
+    return found
 
 
 def _reason(artefact: Artefact | None, present: set[str]) -> str:
@@ -118,15 +117,6 @@ def _reason(artefact: Artefact | None, present: set[str]) -> str:
             return OUTDATED
     orphaned = artefact.stage not in (ingest.STAGE, train.STAGE) and not present.issuperset(artefact.inputs.values())
     return ORPHANED if orphaned else ""
-
-
-def _leftovers(output: Path) -> Iterator[Path]:
-    """Files and folders of killed processes, and recordings kept for an ingest that is done."""
-    for place in (*CODES, CHECKPOINTS, FINISHED):
-        for path in _entries(output / place):
-            done = path.with_name(path.name.removeprefix(ingest.PARTS_PREFIX))
-            if is_left_over(path) or (done != path and _is_artefact(done, ingest.STAGE)):
-                yield path
 
 
 def _entries(place: Path) -> list[Path]:

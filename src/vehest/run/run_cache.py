@@ -211,11 +211,9 @@ def _configuration(pipeline: str) -> Iterator[Path]:
         yield from sorted(folder.rglob("*.yaml"))
     own = find_pipeline(pipeline) if pipeline else None
     if own is not None:
-        yield own
         content = read_yaml(own)
-        base = find_pipeline(str(content["based_on"])) if isinstance(content, dict) and "based_on" in content else None
-        if base is not None:
-            yield base
+        base = find_pipeline(str(content.get("based_on"))) if isinstance(content, dict) else None
+        yield from (file for file in (own, base) if file is not None)
 
 
 def _code() -> Iterator[Path]:

@@ -35,6 +35,9 @@ STORE = "mlflow.db"
 VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
 KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output", "vehest.study"
+Metrics = Callable[[], Mapping[str, float]]
+Figures = Mapping[str, Callable[[], Any]]
+"""File name -> function that draws a matplotlib figure, or gives none."""
 
 
 @dataclass(eq=False)
@@ -53,32 +56,21 @@ class Tracker:
         """Name of the local store in the output root; empty where nothing is tracked, or a server has the runs."""
         return STORE if self.config.get("name") == "mlflow" and not self.config.get("uri") else ""
 
-    def log(
-        self,
-        artefact: Artefact,
-        metrics: Callable[[], Mapping[str, float]],
-        figures: Mapping[str, Callable[[], Any]] | None = None,
-    ) -> None:
-        """Log an artefact as a run while no other process logs, unless it is logged.
-
-        Args:
-            artefact: its label is the run's name; metrics over epochs are in its ``history.csv``.
-            metrics: reads the final ones.
-            figures: file name -> function that draws a matplotlib figure, or nothing.
-        """
+    def log(self, artefact: Artefact, metrics: Metrics, figures: Figures) -> None:
+        """Log an artefact as a run while no other process logs, unless it is logged."""
         if self.config.get("name") != "mlflow" or not self.complete:
             return
         self.complete = False
         try:
             with held(Lock(self.output, "tracking", "mlflow"), self.should_stop) as mine:
                 if mine:
-                    self._log(artefact, metrics, figures or {})
+                    self._log(artefact, metrics, figures)
                     self.complete = True
         except Exception as error:  # results matter more than any failure of a tracking server
             why = next(iter(str(error).strip().splitlines()), type(error).__name__)[:160]
             self.warn(f"logging to MLflow at {self._address} failed ({why}); going on without tracking, the next run makes up for it")
 
-    def _log(self, artefact: Artefact, metrics: Callable[[], Mapping[str, float]], figures: Mapping[str, Callable[[], Any]]) -> None:
+    def _log(self, artefact: Artefact, metrics: Metrics, figures: Figures) -> None:
         from mlflow.entities import Metric, Param
 
         client, run = self._client, self._run_of(artefact)
@@ -197,7 +189,7 @@ def log_scores(
 ) -> None:
     """Log a calibration with its figures, and an evaluation with its metrics and traces over each test set."""
     if calibration is not None:
-        tracker.log(calibration, partial(calibration_figures, calibration.folder))
+        tracker.log(calibration, partial(calibration_figures, calibration.folder), {})
     if evaluation is not None and how is not None:
         drawn = {f"traces_{name}.png": partial(_trace_figure, evaluation, model, how, name) for name in how.split.tests}
         tracker.log(evaluation, partial(test_figures, evaluation), drawn)
