@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import platform
-import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +21,9 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import file_name, remove_leftovers, sha256_of, written_aside
@@ -33,9 +34,8 @@ from vehest.version import __version__
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 MANIFEST = "manifest.json"
-TIMINGS = "timings.csv"  # what a stage took; no part of its content, since it is never the same twice
+TIMINGS = "timings.csv"  # durations, which differ each time and are no part of the content
 FORMAT = 1
-DIGEST = re.compile(r"[0-9a-f]{64}")
 Status = Literal["complete", "interrupted"]
 
 
@@ -107,7 +107,7 @@ class Artefact:
 class Output:
     """Digest and length of a file's bytes."""
 
-    sha256: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     bytes: int
 
 
@@ -154,8 +154,6 @@ def read_artefact(folder: Path) -> Artefact:
     manifest = validated(Manifest, content, f"'{path}'")
     files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
     for name, output in manifest.outputs.items():
-        if not DIGEST.fullmatch(output.sha256):
-            raise DataError(f"'{path}': the digest of {name[:80]!r} is not 64 hexadecimal digits; run the stage '{manifest.stage}' again")
         if files.get(name) != output.bytes:
             raise DataError(f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again")
     about = {**vars(manifest), "outputs": {name: output.sha256 for name, output in manifest.outputs.items()}}

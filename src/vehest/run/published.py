@@ -152,11 +152,11 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
         overrides: ``root=FOLDER``, where raw files lie outside ``VEHEST_DATA``.
 
     Raises:
-        ConfigurationError: an override that would change what comes out.
+        ConfigurationError: an override that would change the results.
         MissingError: a name is neither a pipeline's nor that of a published study; or nothing is published.
     """
     if content_overrides(overrides):
-        raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes what comes out; results are published without overrides")
+        raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
     pipelines: dict[str, Study | None] = {}
     for name in names or sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")):
         if not names or (find_pipeline(name) is None and (RESULTS / name / PROVENANCE).is_file()):
@@ -172,12 +172,10 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
 def _pipeline_of(study: str) -> Study | None:
     """The pipeline whose outcome goes to results/STUDY; the one of the same name first."""
     for name in sorted(pipeline_names(), key=lambda name: name != study):
-        try:
+        with suppress(VehestError):
             pipeline = read_study(name)
-        except VehestError:
-            continue
-        if pipeline.study == study and pipeline.publish:
-            return pipeline
+            if pipeline.study == study and pipeline.publish:
+                return pipeline
     return None
 
 

@@ -3,7 +3,7 @@
 command, files of conf/, pipelines/ and code, environment -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
 
 A record in the output root holds a hash of these, stamps of the raw files, the digests of all artefacts and the printed summary. While
-nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide what is up to date.
+nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide which artefacts are up to date.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 3
-_ENVIRONMENT = re.compile(r"\$\{\s*oc\.env\s*:\s*([A-Za-z_]\w*)")
-_RESOLVERS = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:")
+_RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 
 @dataclass(frozen=True)
@@ -163,9 +162,9 @@ class RunCache:
                     texts.append(content.decode("utf-8", "replace"))
         except (OSError, VehestError, ImportError, ValueError):
             return ""
-        if any(resolver != "oc.env" for text in texts for resolver in _RESOLVERS.findall(text)):
-            return ""  # its value may differ each time
-        for variable in sorted({variable for text in texts for variable in _ENVIRONMENT.findall(text)}):
+        for resolver, variable in sorted({pair for text in texts for pair in _RESOLVED.findall(text)}):
+            if resolver != "oc.env":
+                return ""  # its value may differ each time
             digest.update(repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape"))
         return digest.hexdigest()
 
@@ -202,11 +201,7 @@ def _next_time(printed: Iterable[tuple[str, str, str, str]], made: Iterable[Arte
 
 
 def _configuration(pipeline: str) -> Iterator[Path]:
-    """Files of the configuration and of the pipeline, with the one that it is based on.
-
-    Raises:
-        VehestError: the pipeline cannot be read.
-    """
+    """Files of the configuration and of the pipeline, with the one that it is based on."""
     for folder in [*conf_folders(), packaged_pipelines()]:
         yield from sorted(folder.rglob("*.yaml"))
     own = find_pipeline(pipeline) if pipeline else None

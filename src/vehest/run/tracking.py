@@ -2,7 +2,7 @@
 
 Member -> `log_member` -> artefacts without a run -> `Tracker.log` -> MLflow's store
 
-One process writes. When the store does not answer, work goes on without it, and the next run logs what is missing.
+One process writes. When the store does not answer, work goes on without it, and the next run logs the missing artefacts.
 """
 
 from __future__ import annotations
