@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
-from rich.filesize import decimal
-
 from vehest.data.errors import VehestError
 from vehest.data.files import aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
@@ -53,7 +51,7 @@ class Unused:
 
     def in_words(self) -> list[str]:
         """Path, size, age and reason, for a terminal."""
-        return [str(self.path), decimal(self.size), str(timedelta(seconds=round(self.age))), self.reason]
+        return [str(self.path), f"{self.size / 1e6:.3f} MB", str(timedelta(seconds=round(self.age))), self.reason]
 
 
 def unused_artefacts(output: Path) -> list[Unused]:

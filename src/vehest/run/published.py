@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -157,15 +157,16 @@ def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list
     """
     if content_overrides(overrides):
         raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
+    published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
+    if not (names or published):
+        raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
     pipelines: dict[str, Study | None] = {}
-    for name in names or sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")):
-        if not names or (find_pipeline(name) is None and (RESULTS / name / PROVENANCE).is_file()):
+    for name in names or published:
+        if not names or (find_pipeline(name) is None and name in published):
             pipelines[name] = _pipeline_of(name)
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    if not pipelines:
-        raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
     return [_verdict(study, pipeline, overrides) for study, pipeline in pipelines.items()]
 
 
@@ -200,28 +201,21 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
         with suppress(MissingError):
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
-    today = keys_of_study(study, jobs, published.absent, runner, inputs)
-    changes = [*_changes(published.keys, today), *_found_since(study, jobs, published, runner)]
+    then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
+    changes = [Change(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
+    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
+    changes += [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
+    changes += _found_since(study, jobs, published, runner)
     note = f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
     return Verdict(study.study, "stale" if changes else "up to date", tuple(changes), note)
 
 
-def _changes(then: Mapping[str, Mapping[str, str]], today: Keys) -> list[Change]:
-    changes = []
-    for what in (own for own in then if own in today):
-        compared = CAUSES if DATA in today[what] else (CODE, CONFIGURATION)  # raw files that are missing are not compared
-        changes += [Change(what, cause) for cause in compared if then[what].get(cause) != today[what].get(cause)]
-    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
-    return changes + [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-
-
 def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner) -> list[Change]:
     """Parts and data sets that a study had to go on without, and whose raw files are here today."""
-    wanted = {part.name: jobs[part.name][0].config for part in study.parts} or _by_dataset(jobs[""])
-    look: Callable[[Config], object] = runner.look_for_files if study.parts else plan_ingest
+    configs = {part.name: jobs[part.name][0].config for part in study.parts} or _by_dataset(jobs[""])
     found = []
-    for name in sorted(set(wanted) & set(published.absent)):
+    for name in sorted(configs.keys() & set(published.absent)):
         with suppress(MissingError):
-            look(wanted[name])
+            runner.look_for_files(configs[name]) if study.parts else plan_ingest(configs[name])
             found.append(Change(f"{name}, which was not here", DATA))
     return found
