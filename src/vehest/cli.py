@@ -620,7 +620,7 @@ def prune(
     These are artefacts of other versions, damaged or half-written ones, and those whose inputs are gone. Models and recordings of current
     versions stay with any settings, and so do files that vehest has not made.
     """
-    from vehest.run.prune import remove_unused, size_in_words, unused_artefacts
+    from vehest.run.prune import remove_unused, unused_artefacts
 
     config = _compose("estimate", overrides or [])
     if as_json and not (yes or dry_run):
@@ -628,7 +628,7 @@ def prune(
     found = unused_artefacts(Path(str(config["output"])))
     total = sum(one.size for one in found)
     shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), [one.in_words() for one in found])] if found else []
-    emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {size_in_words(total)}" if found else "nothing to remove"])
+    emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove"])
     removed: list[str] = []
     if found and not dry_run:
         if not yes and not sys.stdin.isatty():

@@ -1,4 +1,4 @@
-"""Pruning finds what no present key can name, and nothing else."""
+"""Pruning lists artefacts that no current configuration can reuse, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
 from vehest.run import calibrate, downsample, evaluate, ingest, report, train
 from vehest.run.artefacts import Artefact, StagePlan, make
-from vehest.run.prune import BROKEN, DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
+from vehest.run.prune import DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
 
 
 class Root:
@@ -64,17 +64,18 @@ def test_what_todays_code_has_made_stays(root):
 def test_a_report_of_calibrated_models_stays(root):
     inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
     root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
+    root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=1")
     assert root.found() == {}
 
 
 def test_what_other_code_has_made_is_found(root):
     old = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {"drives/lap": "gone"}, "0" * 16)
-    older = root.add("ingest", "drives", {"source": "tabular"}, {}, "0" * 16)
+    older = root.add("ingest", "drives", {"source": "tabular"}, {}, "ingest=0 tabular=1")
     assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
 
 
 def test_a_model_of_an_estimator_that_is_not_installed_stays(root):
-    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "0" * 16)
+    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
     assert root.found() == {}
 
 
@@ -120,14 +121,6 @@ def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not
     for folder in (parts, unfinished):
         folder.mkdir()
     assert root.found() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}
-
-
-def test_a_record_of_a_study_that_lost_an_artefact_is_found(root):
-    (root.output / "finished").mkdir()
-    for name, folder in (("whole", root.model.folder), ("lost", root.model.folder.with_name("two-0123456789ab"))):
-        made = {folder.relative_to(root.output).as_posix(): ""}
-        (root.output / "finished" / f"{name}.json").write_text(json.dumps({"made": made}))
-    assert root.found() == {"finished/lost.json": BROKEN}
 
 
 def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):

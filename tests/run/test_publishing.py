@@ -212,7 +212,7 @@ def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked: Place) -> None
     [
         (("report",), 2, "no pipeline is named; there are:"),
         ((*CHECK, "smal"), 4, "there is no pipeline 'smal'; did you mean pipelines/small.yaml?"),
-        ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes what comes out"),
+        ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes the results"),
     ],
 )
 def test_what_cannot_be_checked_is_one_line(checked: Place, words: tuple[str, ...], code: int, message: str) -> None:

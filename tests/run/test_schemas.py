@@ -31,11 +31,12 @@ from vehest.estimators.model_files import Description, load_model, read_descript
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, find, make, read_artefact
 from vehest.run.config import Root, compose_config
+from vehest.run.console import Messages
 from vehest.run.downsample import write_downsample
 from vehest.run.estimate import preparation_of
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.ingest import recording_file
-from vehest.run.publishing import PROVENANCE, Published, publish, published_in
+from vehest.run.publishing import PROVENANCE, Publication, Published, publish_study, published_in
 from vehest.run.study import read_study
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.sources.base import open_source
@@ -211,9 +212,9 @@ def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path
         ({"key": ...}, "key is missing"),
         ({"status": "done"}, "status 'done' is not one of: complete, interrupted"),
         ({"outputs": []}, "outputs must be a mapping"),
-        ({"outputs": {"a.txt": {"sha256": "0"}}}, "outputs.a.txt.bytes is missing"),
-        ({"outputs": {"a.txt": {"sha256": "0", "bytes": "1"}}}, "outputs.a.txt.bytes must be a whole number"),
-        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "is not 64 hexadecimal digits"),
+        ({"outputs": {"a.txt": {"sha256": "0" * 64}}}, "outputs.a.txt.bytes is missing"),
+        ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": "1"}}}, "outputs.a.txt.bytes must be a whole number"),
+        ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "outputs.a.txt.sha256: string should match pattern"),
         ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": 2}}}, "is gone or truncated"),
         ({"config": "a"}, "config must be a mapping"),
         ({"inputs": {"a": 3}}, "inputs.a must be text"),
@@ -245,7 +246,7 @@ def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").write_text("a")
     (artefact.folder / "a.txt").unlink()
     (artefact.folder / "a.txt").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(DataError, match="is a link"):
+    with pytest.raises(DataError, match="or is a link"):
         read_artefact(artefact.folder)
 
 
@@ -414,14 +415,15 @@ def test_a_published_study_that_is_damaged_shows_nothing(tmp_path: Path) -> None
     assert published_in(tmp_path) == Published(kinds={"a": "real"}, parts=("b",))
 
 
-def test_nothing_is_published_through_a_link(tmp_path: Path) -> None:
+@pytest.mark.parametrize("link", ["results", "results/study"])
+def test_nothing_is_published_through_a_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: str) -> None:
+    monkeypatch.chdir(tmp_path)
     report = made(tmp_path / "out")
     (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "results").symlink_to(tmp_path / "elsewhere")
-    (tmp_path / "study").symlink_to(tmp_path / "elsewhere")
-    for folder in (tmp_path / "results" / "study", tmp_path / "study"):
-        with pytest.raises(ConfigurationError, match="through a link"):
-            publish(report, folder, {})
+    Path(link).parent.mkdir(exist_ok=True)
+    Path(link).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ConfigurationError, match="through a link"):
+        publish_study(Publication("study", {}, {}), report, Messages(silent=True))
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

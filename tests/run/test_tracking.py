@@ -39,8 +39,6 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
     parent = runs.pop("small")
     assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
     trained = runs["ksnn-linear_no_bias_p2-seed0"]
-    (learnt,) = trained.inputs.dataset_inputs
-    assert (learnt.dataset.name, learnt.tags[0].value) == ("mine", "training")
     assert trained.data.tags["mlflow.source.name"].startswith("vehest run small")
     assert trained.data.params["estimator.n_local"] == "2"
     assert trained.data.params["training.learning_rate"] == "0.001"
@@ -48,11 +46,6 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
     kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
     assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
-    (output,) = client.get_run(trained.info.run_id).outputs.model_outputs
-    (used,) = client.get_run(evaluated.info.run_id).inputs.model_inputs
-    assert output.model_id == used.model_id
-    model = client.get_logged_model(output.model_id)
-    assert (model.model_type, str(model.status)) == ("ksnn", "READY")
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
     assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
 
@@ -60,7 +53,7 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
 def test_training_goes_on_when_the_tracking_server_is_away(place):
     code, _, err = place("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
     assert code == 0
-    assert err.count("does not answer") == 1
+    assert err.count("logging to MLflow") == 1
     assert "going on without tracking" in err
 
 
@@ -82,7 +75,7 @@ def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Pla
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
         code, _, err = place("run", "small", "--jobs", "1")
         assert code == 0, err
-        assert err.count("does not answer") == 1
+        assert err.count("logging to MLflow") == 1
     assert not (place.folder / "outputs" / "finished").exists()
     code, _, err = place("run", "small", "--jobs", "1")
     assert code == 0, err
@@ -126,8 +119,8 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     [folder] = (place.folder / "outputs" / "train").iterdir()
     artefact = read_artefact(folder)
     assert run.data.tags["vehest.key"] == artefact.key
-    tracker.log(artefact, lambda: pytest.fail("it is logged already"))
-    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict)
+    tracker.log(artefact, lambda: pytest.fail("it is logged already"), {})
+    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict, {})
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
@@ -237,7 +230,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
         client = MlflowClient(address)
         code, _, err = place("run", "small", "--jobs", "1", f"tracking.uri={address}")
         assert code == 0, err
-        assert "does not answer" not in err
+        assert "logging to MLflow" not in err
         runs = _runs(client)
         assert len(runs) == 13
         trained = runs["ksnn-linear_no_bias_p2-seed1"]
@@ -258,7 +251,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
         code, out, err = place(*again)
         watcher.join()
     assert code == 0, err
-    assert err.count("does not answer") == 1
+    assert err.count("logging to MLflow") == 1
     assert "going on without tracking" in err
     assert "KS-NN linear no bias, P = 2" in out
     assert len(list((place.folder / "again" / "train").iterdir())) == 4
@@ -272,7 +265,7 @@ def test_a_server_that_hears_and_never_answers_is_given_up(place: Place, monkeyp
         uri = f"http://127.0.0.1:{deaf.getsockname()[1]}"
         code, _, err = place("train", "split=mine", "training.max_epochs=1", f"tracking.uri={uri}")
     assert code == 0
-    assert err.count("does not answer") == 1
+    assert err.count("logging to MLflow") == 1
 
 
 def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
@@ -282,7 +275,7 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
     (tmp_path / MANIFEST).write_text("{}")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
     said: list[str] = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict)
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict, {})
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}")).values()
     assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}

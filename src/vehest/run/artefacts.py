@@ -1,4 +1,4 @@
-"""Artefacts: one folder a stage, with a manifest, complete or not there at all.
+"""Artefacts: one folder a stage, with a manifest; a folder is complete, or it does not exist.
 
 StagePlan -> `find`, or `make` under its lock -> Artefact
 
@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import platform
-import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping
@@ -21,8 +20,10 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
-from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import file_name, remove_leftovers, sha256_of, written_aside
@@ -33,45 +34,35 @@ from vehest.version import __version__
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 MANIFEST = "manifest.json"
-TIMINGS = "timings.csv"  # what a stage took; no part of its content, since it is never the same twice
+TIMINGS = "timings.csv"  # durations, which differ each time and are no part of the content
 FORMAT = 1
-DIGEST = re.compile(r"[0-9a-f]{64}")
 Status = Literal["complete", "interrupted"]
 
 
 @dataclass(frozen=True)
 class StagePlan:
-    """An artefact before it is made.
-
-    Args:
-        stage: name of the stage.
-        label: start of the folder's name, for people.
-        config: the part of the configuration that determines the content, plain values.
-        inputs: input name -> digest.
-        code: version of the stage's code.
-        output: the output root.
-    """
+    """An artefact before it is made."""
 
     stage: str
-    label: str
-    config: Mapping[str, Any]
-    inputs: Mapping[str, str]
-    code: str
-    output: Path
+    label: str  # start of the folder's name
+    config: Mapping[str, Any]  # the part of the configuration that determines the content, plain values
+    inputs: Mapping[str, str]  # name -> digest
+    code: str  # version of the stage's code
+    output: Path  # the output root
 
     @property
     def content(self) -> dict[str, Any]:
-        """What determines the content."""
+        """Everything that determines the content."""
         return {"stage": self.stage, "config": self.config, "inputs": dict(self.inputs), "code": self.code}
 
     @property
     def key(self) -> str:
-        """Hash of what determines the content."""
+        """Hash of everything that determines the content."""
         return hashlib.sha256(json.dumps(self.content, sort_keys=True, default=str).encode()).hexdigest()
 
     @property
     def folder(self) -> Path:
-        """Where the artefact belongs."""
+        """Folder of the artefact."""
         return self.output / file_name(self.stage) / self._folder_name
 
     @property
@@ -81,7 +72,7 @@ class StagePlan:
 
     @property
     def checkpoint_folder(self) -> Path:
-        """Where an unfinished run of this stage keeps its state."""
+        """Folder of the state of an unfinished run of this stage."""
         return self.output / "checkpoints" / self._folder_name
 
     @property
@@ -91,32 +82,23 @@ class StagePlan:
 
 @dataclass(frozen=True)
 class Artefact:
-    """A folder that a stage has made.
-
-    Args:
-        folder: where it is.
-        stage, label, key, config, inputs, code: of its `StagePlan`.
-        status: ``complete``, or ``interrupted`` where a fit was stopped with its best so far.
-        outputs: file -> sha256.
-        provenance: time, seconds, versions, machine.
-        skipped: whether it was there already.
-    """
+    """A folder that a stage has made from its `StagePlan`."""
 
     folder: Path
     stage: str
     label: str
     key: str
-    status: Status
-    outputs: Mapping[str, str]
+    status: Status  # ``interrupted`` where a fit was stopped with its best so far
+    outputs: Mapping[str, str]  # file -> sha256
     config: Mapping[str, Any]
     inputs: Mapping[str, str]
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    skipped: bool = False
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # time, seconds, versions, machine
+    skipped: bool = False  # whether it existed already
     code: str = ""
 
     @property
     def digest(self) -> str:
-        """Hash of the content, times aside, for the stages that build on it."""
+        """Hash of the content without times, an input of later stages."""
         content = {name: digest for name, digest in self.outputs.items() if name != TIMINGS}
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -125,7 +107,7 @@ class Artefact:
 class Output:
     """Digest and length of a file's bytes."""
 
-    sha256: str
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
     bytes: int
 
 
@@ -159,7 +141,7 @@ def read_artefact(folder: Path) -> Artefact:
 
     Raises:
         MissingError: there is no manifest.
-        DataError: the manifest is damaged, or a file it names is gone or has another size.
+        DataError: the manifest is damaged, or names a file that is not in the folder, is a link or has another size.
     """
     path = folder / MANIFEST
     try:
@@ -170,47 +152,27 @@ def read_artefact(folder: Path) -> Artefact:
         raise DataError(f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again")
     check_format(content.get("format", 0), FORMAT, f"'{path}'", oldest=0)
     manifest = validated(Manifest, content, f"'{path}'")
-    for name, entry in manifest.outputs.items():
-        _check_output(folder, name, entry, manifest.stage)
-    about = {**vars(manifest), "outputs": {name: entry.sha256 for name, entry in manifest.outputs.items()}}
+    files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
+    for name, output in manifest.outputs.items():
+        if files.get(name) != output.bytes:
+            raise DataError(f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again")
+    about = {**vars(manifest), "outputs": {name: output.sha256 for name, output in manifest.outputs.items()}}
     del about["format"]
     return Artefact(folder, skipped=True, **about)
 
 
-def _check_output(folder: Path, name: str, entry: Output, stage: str) -> None:
-    """Check that a file of a manifest has its size and lies in the folder itself.
-
-    Raises:
-        DataError: it does not.
-    """
-    manifest, again = f"'{folder / MANIFEST}'", f"run the stage '{stage}' again"
-    parts = PurePosixPath(name).parts
-    too_long = any(len(part.encode("utf-8", "surrogatepass")) > 255 for part in parts)
-    if (
-        not parts
-        or too_long
-        or PurePosixPath(*parts).as_posix() != name
-        or parts[0] == "/"
-        or ".." in parts
-        or "\\" in name
-        or "\0" in name
-    ):
-        raise DataError(f"{manifest}: outputs names {name[:80]!r}, which is no file inside the folder; {again}")
-    if not DIGEST.fullmatch(entry.sha256):
-        raise DataError(f"{manifest}: the digest of '{name}' is not 64 hexadecimal digits; {again}")
-    path = folder.joinpath(*parts)
-    if any(folder.joinpath(*parts[: n + 1]).is_symlink() for n in range(len(parts))):
-        raise DataError(f"'{path}' is a link; an artefact holds its files itself: {again}")
-    if not path.is_file() or path.stat().st_size != entry.bytes:
-        raise DataError(f"'{path}' is gone or truncated; {again}")
+def _files(folder: Path) -> list[Path]:
+    """Files inside a folder; links are neither followed nor listed."""
+    files = [Path(parent, name) for parent, _, names in os.walk(folder) for name in names]
+    return sorted(file for file in files if file.is_file() and not file.is_symlink())
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-    """Run a stage: ``write`` fills a folder aside, which gets its manifest and is then moved to its place.
+    """Run a stage: ``write`` fills an empty folder, which gets its manifest and then its final name.
 
     Args:
         plan: of the artefact.
-        write: fills an empty folder; returns ``interrupted`` if it was stopped.
+        write: fills the folder; returns ``interrupted`` if it was stopped.
 
     Raises:
         MissingError: the disk is full or not writable.
@@ -221,7 +183,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
     with written_aside(plan.folder, replace_folder=True) as aside:
         aside.mkdir()
         status = write(aside) or "complete"
-        files = sorted(file for file in aside.rglob("*") if file.is_file())
+        files = _files(aside)
         manifest = {
             "format": FORMAT,
             "label": plan.label,
@@ -242,7 +204,7 @@ def ensured(
     should_stop: Callable[[], bool],
     on_wait: Callable[[Waiting], None],
 ) -> Artefact | None:
-    """Make an artefact, or take the one that another process is making; none if ``should_stop`` ended the waiting for it.
+    """Make an artefact under its lock, or take the one of another process; none if ``should_stop`` ended the wait for it.
 
     Raises:
         VehestError: as `make` does.

@@ -1,8 +1,7 @@
 """Locks across processes: one process at a time makes an artefact.
 
 The operating system drops a lock when its holder ends. The files stay: removing one while another process waits for it would make two
-locks. While a process waits it holds no other lock, except that of the tracking store, under which nothing waits; so two runs never wait
-for each other.
+locks. A process that waits holds no other lock, except that of the tracking store, under which nothing waits: so there is no deadlock.
 """
 
 from __future__ import annotations
@@ -25,21 +24,15 @@ POLL_SECONDS = 0.05
 
 @dataclass(frozen=True)
 class Waiting:
-    """A lock that another process holds: stage and label of the artefact, and the holder, for people."""
+    """The lock of an artefact that another process holds."""
 
     stage: str
     label: str
-    holder: str
+    holder: str  # for people
 
 
 class Lock:
-    """A lock across processes; it ends with the process that holds it.
-
-    Args:
-        output: the output root.
-        stage: of the artefact.
-        name: unique in its stage; need not suit a file.
-    """
+    """A lock of an output root, by a stage and a name that is unique in it; it ends with the process that holds it."""
 
     def __init__(self, output: Path, stage: str, name: str) -> None:
         self.stage, self.name = stage, name
@@ -47,11 +40,7 @@ class Lock:
         self._lock = FileLock(self._path, fallback_to_soft=False)  # a file that only stands for a lock would outlive its process
 
     def take(self) -> bool:
-        """Take the lock if it is free.
-
-        Raises:
-            MissingError: the output root cannot be written to.
-        """
+        """Take the lock if it is free; raises MissingError where the output root cannot be written to."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(blocking=False)
@@ -65,13 +54,13 @@ class Lock:
 
     @property
     def holder(self) -> str:
-        """The process that took the lock last, for people."""
+        """The process that took the lock last."""
         with suppress(OSError, UnicodeDecodeError):
             return self._path.read_text(encoding="utf-8").strip() or "another process"
         return "another process"
 
     def release(self) -> None:
-        """Release the lock; nothing happens where it is not held."""
+        """Release the lock, if it is held."""
         self._lock.release()
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,7 +32,7 @@ from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.report import code_of_report
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study
 from vehest.run.train import code_of_training
 from vehest.sources.base import kind_of
 
@@ -46,39 +46,39 @@ MOST_NAMED = 6
 State = Literal["up to date", "stale", "not known"]
 
 
-def keys_of_study(
-    study: Study,
-    jobs: Jobs,
-    absent: Collection[str],
-    dataset_config: Callable[[str, Config], Config],
-    inputs_of: Callable[[Config], Mapping[str, str] | None],
-) -> Keys:
+def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
     """Keys of everything that determines the results of a study.
 
     Args:
         study: with its parts or data sets.
         jobs: of the study.
         absent: parts or data sets that it goes on without.
-        dataset_config: name of a data set and a job's configuration -> configuration of its ingest.
-        inputs_of: configuration of an ingest -> raw file or library -> digest or version; none where raw files are missing.
+        runner: composes the configurations of data sets.
+        inputs: data set -> raw file or library -> digest or version; without those whose raw files are missing.
     """
-    keys: Keys = {}
+    ingests = _ingests(study, jobs, absent, runner)
+    keys = {f"ingest {name}": _of_ingest(config["dataset"], inputs.get(name)) for name, config in ingests.items()}
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
     if study.datasets:
-        configs = [job.config for job in jobs[""]]
-        shown = [config for config in configs if config["dataset"]["name"] not in absent]
-        keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in shown}
-        about |= {"datasets": [_titled(config) for config in configs]}
-        return keys | {"report": _of_report(study, about)}
-    for part in study.parts:
-        if part.name in absent:
-            continue
-        own = [job.config for job in jobs[part.name]]
-        ingests = [dataset_config(name, own[0]) for name in dataset_names(own[0]["split"])]
-        keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in ingests if _ingest_name(config) not in keys}
-        keys |= {f"{part.name}: {name}" if part.name else name: entry for name, entry in _of_jobs(own)}
-        about[f"part {part.name}"] = [part.title, *training_facts(own), resampling_fact(own), *(_titled(config) for config in ingests)]
-    return keys | {"report": _of_report(study, about)}
+        about["datasets"] = [_titled(job.config) for job in jobs[""]]
+    for part in (part for part in study.parts if part.name not in absent):
+        configs = [job.config for job in jobs[part.name]]
+        keys |= {f"{part.name}: {name}" if part.name else name: entry for name, entry in _of_jobs(configs)}
+        titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
+        about[f"part {part.name}"] = [part.title, *training_facts(configs), resampling_fact(configs), *titles]
+    return keys | {"report": {CODE: code_of_report(study.report), CONFIGURATION: _hash(about)}}
+
+
+def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
+    """Data set -> the configuration of its ingest."""
+    if study.datasets:
+        return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
+    firsts = [jobs[part.name][0].config for part in study.parts if part.name not in absent]
+    return {name: runner.dataset_config(name, config) for config in firsts for name in dataset_names(config["split"])}
+
+
+def _by_dataset(jobs: Sequence[Job]) -> dict[str, Config]:
+    return {str(job.config["dataset"]["name"]): job.config for job in jobs}
 
 
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
@@ -100,19 +100,10 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
 
 
-def _of_ingest(config: Config, inputs: Mapping[str, str] | None) -> dict[str, str]:
-    dataset = config["dataset"]
+def _of_ingest(dataset: Mapping[str, Any], inputs: Mapping[str, str] | None) -> dict[str, str]:
     content = {key: value for key, value in dataset.items() if key not in PROSE}
     entry = {CODE: code_of_ingest(dataset), CONFIGURATION: _hash(content)}
     return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
-
-
-def _of_report(study: Study, about: Mapping[str, Any]) -> dict[str, str]:
-    return {CODE: code_of_report(study.report), CONFIGURATION: _hash(about)}
-
-
-def _ingest_name(config: Config) -> str:
-    return f"ingest {config['dataset']['name']}"
 
 
 def _titled(config: Config) -> list[str]:
@@ -126,27 +117,20 @@ def _hash(content: Any) -> str:
 
 @dataclass(frozen=True)
 class Change:
-    """Something that differs from when results were published: for example ``train ksnn``, and one of `CAUSES`."""
+    """Something that differs from when results were published."""
 
-    what: str
-    cause: str
+    what: str  # ``train ksnn``
+    cause: str  # one of `CAUSES`
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The state of a published study.
-
-    Args:
-        study: its name.
-        state: of its results.
-        changes: why they are stale.
-        note: on parts that could not be compared, or why the state is not known; may be empty.
-    """
+    """The state of a published study."""
 
     study: str
     state: State
-    changes: tuple[Change, ...] = ()
-    note: str = ""
+    changes: tuple[Change, ...] = ()  # why its results are stale
+    note: str = ""  # on parts that could not be compared, or why the state is not known
 
     def in_words(self) -> str:
         """One line."""
@@ -161,39 +145,38 @@ class Verdict:
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
-    """Compare the recorded keys of published studies with those of today.
+    """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
 
     Args:
         names: of studies, or pipelines by name or path; if empty, all studies that are published in ./results.
         overrides: ``root=FOLDER``, where raw files lie outside ``VEHEST_DATA``.
 
     Raises:
-        ConfigurationError: an override that would change what comes out.
+        ConfigurationError: an override that would change the results.
         MissingError: a name is neither a pipeline's nor that of a published study; or nothing is published.
     """
     if content_overrides(overrides):
-        raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes what comes out, and what is published was made without it")
+        raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
+    published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))
+    if not (names or published):
+        raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
     pipelines: dict[str, Study | None] = {}
-    for name in names or sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}")):
-        if not names or (find_pipeline(name) is None and (RESULTS / name / PROVENANCE).is_file()):
+    for name in names or published:
+        if not names or (find_pipeline(name) is None and name in published):
             pipelines[name] = _pipeline_of(name)
         else:
             pipeline = read_study(name)
             pipelines[pipeline.study] = pipeline
-    if not pipelines:
-        raise MissingError(f"no study is published in '{RESULTS}'; run one whose pipeline says publish: true")
     return [_verdict(study, pipeline, overrides) for study, pipeline in pipelines.items()]
 
 
 def _pipeline_of(study: str) -> Study | None:
     """The pipeline whose outcome goes to results/STUDY; the one of the same name first."""
     for name in sorted(pipeline_names(), key=lambda name: name != study):
-        try:
+        with suppress(VehestError):
             pipeline = read_study(name)
-        except VehestError:
-            continue
-        if pipeline.study == study and pipeline.publish:
-            return pipeline
+            if pipeline.study == study and pipeline.publish:
+                return pipeline
     return None
 
 
@@ -212,42 +195,27 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> Ve
 
 
 def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
-    first = next(iter(jobs.values()))[0].config
-    runner = Runner(Path(str(first["output"])), Messages(silent=True), StopSignals())
-    missing: list[str] = []
-
-    def inputs_of(config: Config) -> Mapping[str, str] | None:
-        try:
-            return plan_ingest(config).inputs
-        except MissingError:
-            missing.append(str(config["dataset"]["name"]))
-            return None
-
-    today = keys_of_study(study, jobs, published.absent, runner.dataset_config, inputs_of)
-    changes = [*_changes(published.keys, today), *_found_since(study, jobs, published, runner)]
+    runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(silent=True), StopSignals())
+    ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
+    for name, config in ingests.items():
+        with suppress(MissingError):
+            inputs[name] = plan_ingest(config).inputs
+    missing = [name for name in ingests if name not in inputs]
+    then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
+    changes = [Change(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
+    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
+    changes += [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
+    changes += _found_since(study, jobs, published, runner)
     note = f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
     return Verdict(study.study, "stale" if changes else "up to date", tuple(changes), note)
 
 
-def _changes(then: Mapping[str, Mapping[str, str]], today: Keys) -> list[Change]:
-    changes = []
-    for what in (own for own in then if own in today):
-        compared = CAUSES if DATA in today[what] else (CODE, CONFIGURATION)  # raw files that are missing are not compared
-        changes += [Change(what, cause) for cause in compared if then[what].get(cause) != today[what].get(cause)]
-    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
-    return changes + [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-
-
 def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner) -> list[Change]:
-    """Parts and data sets that a study had to go on without and could show today."""
-    if study.datasets:
-        wanted = {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
-    else:
-        wanted = {part.name: jobs[part.name][0].config for part in study.parts}
-    look: Callable[[Config], object] = plan_ingest if study.datasets else runner.look_for_files
+    """Parts and data sets that a study had to go on without, and whose raw files are here today."""
+    configs = {part.name: jobs[part.name][0].config for part in study.parts} or _by_dataset(jobs[""])
     found = []
-    for name in sorted(set(wanted) & set(published.absent)):
+    for name in sorted(configs.keys() & set(published.absent)):
         with suppress(MissingError):
-            look(wanted[name])
+            runner.look_for_files(configs[name]) if study.parts else plan_ingest(configs[name])
             found.append(Change(f"{name}, which was not here", DATA))
     return found

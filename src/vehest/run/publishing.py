@@ -1,4 +1,4 @@
-"""Publishes a study's report in results/, and reads what is published.
+"""Publishes a study's report in results/, and reads the record of a published one.
 
 report -> `publish_study` -> results/STUDY, provenance.json with keys -> `published_in`
 """
@@ -26,35 +26,22 @@ PROVENANCE = "provenance.json"
 
 @dataclass(frozen=True)
 class Publication:
-    """A study whose report goes to results/<study>.
-
-    Args:
-        study: its name.
-        absent: name of a part or data set that the study went on without -> the same for people.
-        keys: what determines its outcome (`vehest.run.published.keys_of_study`).
-    """
+    """A study whose report goes to results/<study>."""
 
     study: str
-    absent: Mapping[str, str] = field(default_factory=dict)
-    keys: dict[str, dict[str, str]] = field(default_factory=dict)
+    absent: Mapping[str, str]  # name of a part or data set that the study went on without -> the same for people
+    keys: dict[str, dict[str, str]]  # `vehest.run.published.keys_of_study`
 
 
 @dataclass(frozen=True)
 class Published:
-    """The part of a published study's provenance.json that later runs compare.
-
-    Args:
-        kinds: data set -> ``real`` or ``simulated``.
-        parts: that it shows.
-        absent: parts or data sets that it went on without.
-        keys: what determined its outcome; empty where they were not recorded yet.
-    """
+    """The part of a published study's provenance.json that later runs compare."""
 
     __pydantic_config__ = FURTHER_KEYS
-    kinds: dict[str, str] = field(default_factory=dict)
+    kinds: dict[str, str] = field(default_factory=dict)  # data set -> ``real`` or ``simulated``
     parts: tuple[str, ...] = ()
-    absent: tuple[str, ...] = ()
-    keys: dict[str, dict[str, str]] = field(default_factory=dict)
+    absent: tuple[str, ...] = ()  # parts or data sets that it went on without
+    keys: dict[str, dict[str, str]] = field(default_factory=dict)  # empty where they were not recorded yet
 
 
 def published_in(folder: Path) -> Published | None:
@@ -66,11 +53,14 @@ def published_in(folder: Path) -> Published | None:
 
 
 def publish_study(publication: Publication | None, report: Artefact, messages: Messages) -> Path | None:
-    """Publish a study, unless the published one shows data that this run could not read; returns where it is published, if it is.
+    """Copy a study's report without pages and times to results/STUDY, with keys in its provenance; returns the folder, if it is published.
+
+    A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
+    stays that of the first run with these results.
 
     Raises:
         MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else.
+        ConfigurationError: the folder holds something else, or is reached through a link.
     """
     if publication is None:
         return None
@@ -81,21 +71,13 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
         messages.warn(f"not published: '{folder}' shows {lost[0]}, and this run could not read it")
         return None
     with held(Lock(report.folder.parents[1], "publish", publication.study), lambda: False):
-        changed = publish(report, folder, publication.keys)
-    if changed:
-        messages.line("done", "publish", str(folder))
+        if _publish(report, folder, publication.keys):
+            messages.line("done", "publish", str(folder))
     return folder
 
 
-def publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
-    """Copy a report without pages and times to ``folder``; returns whether anything there changed.
-
-    The provenance gets the keys. Where they and every other file are the same, it stays that of the first run with these results.
-
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else, or is reached through a link.
-    """
+def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
+    """Publish a report, unless that changes nothing."""
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
     wanted = {name: digest for name, digest in report.outputs.items() if name != TIMINGS and not name.endswith(PAGE_ENDING)}

@@ -3,7 +3,7 @@
 command, files of conf/, pipelines/ and code, environment -> `RunCache.load` -> Record -> printed; finished run -> `RunCache.save`
 
 A record in the output root holds a hash of these, stamps of the raw files, the digests of all artefacts and the printed summary. While
-nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide what is up to date.
+nothing has changed, the next run prints that summary; otherwise it runs in full, where keys decide which artefacts are up to date.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
 FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 3
-_ENVIRONMENT = re.compile(r"\$\{\s*oc\.env\s*:\s*([A-Za-z_]\w*)")
-_RESOLVERS = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:")
+_RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 
 @dataclass(frozen=True)
@@ -56,44 +55,26 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Ran:
-    """A study or sweep that is done.
-
-    Args:
-        summary: to print.
-        folder: of its report.
-        skipped: whether the report was there already.
-        published: folder in results/, if it was published.
-        failed: error to end with.
-    """
+    """A study or sweep that is done."""
 
     summary: TerminalSummary
-    folder: Path
-    skipped: bool
-    published: Path | None = None
-    failed: JobsFailedError | None = None
+    folder: Path  # of its report
+    skipped: bool  # whether the report existed already
+    published: Path | None = None  # folder in results/
+    failed: JobsFailedError | None = None  # error to end with
 
 
 @dataclass(frozen=True)
 class Record:
-    """A finished study.
+    """A finished study."""
 
-    Args:
-        key: of its `RunCache`.
-        raw: folder of raw files -> `stamp_of`.
-        made: folder of an artefact in the output root -> digest; the report last.
-        lines: that the next run in full would print: status, stage, label, detail.
-        summary: printed at the end.
-        publication: what is published.
-        store: MLflow's local store in the output root; empty where there is none.
-    """
-
-    key: str
-    raw: dict[str, str]
-    made: dict[str, str]
-    lines: tuple[tuple[str, str, str, str], ...]
+    key: str  # of its `RunCache`
+    raw: dict[str, str]  # folder of raw files -> `stamp_of`
+    made: dict[str, str]  # folder of an artefact in the output root -> digest; the report last
+    lines: tuple[tuple[str, str, str, str], ...]  # that the next run in full would print: status, stage, label, detail
     summary: TerminalSummary
     publication: Publication | None
-    store: str
+    store: str  # MLflow's local store in the output root; empty where there is none
 
 
 class RunCache:
@@ -105,9 +86,8 @@ class RunCache:
         overrides: of the command.
 
     Attributes:
-        file: of the record; none where the output root cannot be told from overrides and environment alone.
-        key: hash of the command and of all files and variables that determine its meaning, as they were when this was made; empty if files
-            alone do not tell.
+        file: of the record; none where the output root depends on more than overrides and environment.
+        key: hash of the command and of all files and variables that determine its meaning; empty if these are not all that does.
     """
 
     def __init__(self, command: str, name: str, overrides: Sequence[str]) -> None:
@@ -128,9 +108,10 @@ class RunCache:
             record = validated(Record, read_json(self.file), f"'{self.file}'")
             if record.key != self.key or any(stamp_of(path) != stamp for path, stamp in record.raw.items()):
                 return None
-            whole = all(_is_whole(read_artefact(output / folder), digest) for folder, digest in record.made.items())
+            made = {folder: read_artefact(output / folder) for folder in record.made}
         except VehestError:
             return None
+        whole = all(artefact.status == "complete" and artefact.digest == record.made[folder] for folder, artefact in made.items())
         return record if whole and (output / record.store).exists() else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
@@ -145,22 +126,9 @@ class RunCache:
         return Ran(record.summary, report.folder, True, published)
 
     def save(
-        self,
-        runner: Runner,
-        report: Artefact,
-        summary: TerminalSummary,
-        raw: Mapping[str, str],
-        publication: Publication | None = None,
+        self, runner: Runner, report: Artefact, summary: TerminalSummary, raw: dict[str, str], publication: Publication | None
     ) -> None:
-        """Record a finished study, unless runs are left to track or files changed meanwhile.
-
-        Args:
-            runner: that made all artefacts.
-            report: the last of them.
-            summary: printed at the end.
-            raw: `stamps_of` the raw files, from before they were read.
-            publication: what is published.
-        """
+        """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: `stamps_of`, from before reading."""
         tracker, output = runner.tracker, runner.output
         if self.file is None or not self.key or output != self.file.parents[1] or self._key() != self.key:
             return
@@ -169,7 +137,7 @@ class RunCache:
         made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
         record = Record(
             key=self.key,
-            raw=dict(raw),
+            raw=raw,
             made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
             lines=tuple(_next_time(runner.messages.printed, made)),
             summary=summary,
@@ -194,35 +162,27 @@ class RunCache:
                     texts.append(content.decode("utf-8", "replace"))
         except (OSError, VehestError, ImportError, ValueError):
             return ""
-        if any(resolver != "oc.env" for text in texts for resolver in _RESOLVERS.findall(text)):
-            return ""  # its value may differ each time
-        for variable in sorted({variable for text in texts for variable in _ENVIRONMENT.findall(text)}):
+        for resolver, variable in sorted({pair for text in texts for pair in _RESOLVED.findall(text)}):
+            if resolver != "oc.env":
+                return ""  # its value may differ each time
             digest.update(repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape"))
         return digest.hexdigest()
 
 
 def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Folder of raw files of each data set -> its stamp.
-
-    Args:
-        datasets: name -> configuration.
-    """
+    """Folder of raw files of each data set -> its stamp, from the configuration of each by name."""
     return {str(dataset["path"]): stamp_of(str(dataset["path"])) for dataset in datasets.values() if "path" in dataset}
 
 
 def stamp_of(path: str) -> str:
-    """Hash of names, sizes, times and inodes of all files below a folder, links followed.
-
-    The time of the last change of an inode shows that a file was replaced by one of the same size and date.
-    """
+    """Hash of names, sizes, times and inodes of all files below a folder, links followed; times of inodes show replaced files."""
     entries: list[tuple[str, int, int, int, int]] = []
     visited: set[str] = set()
     for folder, folders, names in os.walk(Path(path).expanduser(), followlinks=True):
-        real = os.path.realpath(folder)
-        if real in visited:
+        if os.path.realpath(folder) in visited:
             folders.clear()
             continue
-        visited.add(real)
+        visited.add(os.path.realpath(folder))
         for file in (os.path.join(folder, name) for name in names):
             with suppress(OSError):  # a link to nothing
                 about = os.stat(file)
@@ -230,14 +190,10 @@ def stamp_of(path: str) -> str:
     return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _is_whole(artefact: Artefact, digest: str) -> bool:
-    return artefact.status == "complete" and artefact.digest == digest
-
-
-def _next_time(said: Iterable[tuple[str, str, str, str]], made: Iterable[Artefact]) -> Iterator[tuple[str, str, str, str]]:
+def _next_time(printed: Iterable[tuple[str, str, str, str]], made: Iterable[Artefact]) -> Iterator[tuple[str, str, str, str]]:
     """The lines that the next run in full would print: artefacts are up to date, notes and warnings stay."""
     names = {(artefact.stage, artefact.label) for artefact in made}
-    for status, stage, label, detail in said:
+    for status, stage, label, detail in printed:
         if (stage, label) in names and status in ("done", "skip", "note"):
             yield "skip", stage, label, "up to date"
         elif (status in ("note", WARNING) and stage != "calibrate") or stage == "split":
@@ -245,20 +201,14 @@ def _next_time(said: Iterable[tuple[str, str, str, str]], made: Iterable[Artefac
 
 
 def _configuration(pipeline: str) -> Iterator[Path]:
-    """Files of the configuration and of the pipeline, with the one that it is based on.
-
-    Raises:
-        VehestError: the pipeline cannot be read.
-    """
+    """Files of the configuration and of the pipeline, with the one that it is based on."""
     for folder in [*conf_folders(), packaged_pipelines()]:
         yield from sorted(folder.rglob("*.yaml"))
     own = find_pipeline(pipeline) if pipeline else None
     if own is not None:
-        yield own
         content = read_yaml(own)
-        base = find_pipeline(str(content["based_on"])) if isinstance(content, dict) and "based_on" in content else None
-        if base is not None:
-            yield base
+        base = find_pipeline(str(content.get("based_on"))) if isinstance(content, dict) else None
+        yield from (file for file in (own, base) if file is not None)
 
 
 def _code() -> Iterator[Path]:

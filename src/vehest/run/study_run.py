@@ -40,7 +40,7 @@ from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.sweep import STAGE as SWEEP
 from vehest.run.sweep import draw_sweep
-from vehest.run.tracking import Tracker, log_calibration, log_evaluation, test_figures
+from vehest.run.tracking import Tracker, log_scores, test_figures
 from vehest.run.train import TrainJob, learnt_spans, read_fit_metrics, trained_rate
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
@@ -207,8 +207,7 @@ def _publication(
     gone = {part.name: f"part '{part.name}'" for part in study.parts if part.name not in comparisons}
     gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
     inputs = {artefact.label: artefact.inputs for artefact in runner.artefacts.values() if artefact.stage == INGEST}
-    keys = keys_of_study(study, jobs, gone, runner.dataset_config, lambda config: inputs[str(config["dataset"]["name"])])
-    return Publication(study.study, gone, keys)
+    return Publication(study.study, gone, keys_of_study(study, jobs, gone, runner, inputs))
 
 
 def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
@@ -264,9 +263,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         scoring = how.of(trained, calibration)
         artefact = runner.ensure(scoring.plan, partial(write_evaluation, scoring))
         if runner.tracker is not None:
-            if calibration is not None:
-                log_calibration(runner.tracker, calibration)
-            log_evaluation(runner.tracker, artefact, trained, how)
+            log_scores(runner.tracker, trained, calibration, artefact, how)
     return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact), **fault_figures(artefact.folder)}
 
 
