@@ -70,14 +70,14 @@ def keys_of_study(
         keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in shown}
         about |= {"datasets": [_titled(config) for config in configs]}
         return keys | {"report": _of_report(study, about)}
-    for part in study.parts:
-        if part.name in absent:
+    for name, part in study.parts.items():
+        if name in absent:
             continue
-        own = [job.config for job in jobs[part.name]]
-        ingests = [dataset_config(name, own[0]) for name in dataset_names(own[0]["split"])]
+        own = [job.config for job in jobs[name]]
+        ingests = [dataset_config(dataset, own[0]) for dataset in dataset_names(own[0]["split"])]
         keys |= {_ingest_name(config): _of_ingest(config, inputs_of(config)) for config in ingests if _ingest_name(config) not in keys}
-        keys |= {f"{part.name}: {name}" if part.name else name: entry for name, entry in _of_jobs(own)}
-        about[f"part {part.name}"] = [part.title, *training_facts(own), resampling_fact(own), *(_titled(config) for config in ingests)]
+        keys |= {f"{name}: {what}" if name else what: entry for what, entry in _of_jobs(own)}
+        about[f"part {name}"] = [part.title, *training_facts(own), resampling_fact(own), *(_titled(config) for config in ingests)]
     return keys | {"report": _of_report(study, about)}
 
 
@@ -243,7 +243,7 @@ def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner)
     if study.datasets:
         wanted = {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
     else:
-        wanted = {part.name: jobs[part.name][0].config for part in study.parts}
+        wanted = {name: jobs[name][0].config for name in study.parts}
     look: Callable[[Config], object] = plan_ingest if study.datasets else runner.look_for_files
     found = []
     for name in sorted(set(wanted) & set(published.absent)):
