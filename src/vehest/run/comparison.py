@@ -41,7 +41,6 @@ class Comparison:
     faults of all.
     """
 
-    title: str  # empty in a study that is not in parts
     jobs: Sequence[Job]
     groups: Sequence[Group] = ()  # trainings that fit one batch
     facts: Sequence[str] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
@@ -128,7 +127,7 @@ class Comparison:
         for jobs in of_training.values():
             if (training := jobs[0].training) is not None:
                 faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
-                groups.setdefault((training.group, faults, jobs[0].batch), []).append(training)
+                groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
         return [
             Group(own, split, replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None, force, label)
             for (_, faults, label), own in groups.items()

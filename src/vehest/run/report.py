@@ -67,7 +67,7 @@ def draw_report(
         about=study.about,
         command=study.command,
         titles={name: part.title for name, part in study.parts.items()},
-        parts={name: _part_artefacts(study, part) for name, part in shown.items()},
+        parts={name: _part_artefacts(study, study.parts[name].title, part) for name, part in shown.items()},
         absent=[name for name in study.parts if name not in comparisons],
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
@@ -170,7 +170,7 @@ def _recordings(comparisons: Mapping[str, Comparison], ingested: Sequence[Artefa
     return found | {f"{own.label}/{Path(name).stem}": digest for own in ingested for name, digest in own.outputs.items()}
 
 
-def _part_artefacts(study: Study, part: Comparison) -> PartArtefacts:
+def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
     models, tables = [], []
     for member in part.members:
         assert member.model is not None
@@ -192,7 +192,7 @@ def _part_artefacts(study: Study, part: Comparison) -> PartArtefacts:
     e = part.evaluation
     return PartArtefacts(
         study=study.study,
-        title=part.title or study.title,
+        title=title or study.title,
         about=study.about,
         command=study.command,
         split=e.split,

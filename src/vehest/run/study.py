@@ -39,7 +39,7 @@ from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import faults_of
 from vehest.run.train import TrainJob, new_estimator
 from vehest.studies.registry import study_module
-from vehest.studies.sweep import is_of_fault, short_names, shown_value
+from vehest.studies.sweep import Value, short_names, shown_value
 
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
 SAME_IN_A_PART = ("split", "evaluation", "downsample")
@@ -48,7 +48,6 @@ ONE_VALUE = ("split", "evaluation", "faults", "root", "output", "tracking", "lim
 Sweeps = Annotated[tuple[Annotated[tuple[str, ...], "a list of overrides"], ...], "a list of lists of overrides"]
 Faults = Annotated[tuple[dict[str, int | float | str | None], ...], "a list of faults"]
 Names = Annotated[tuple[str, ...], "a list of names"]
-Value = bool | int | float | str
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,6 @@ class Job:
 
     config: Config  # as composed for ``train`` or ``eval``; rates may be lowered to those of recordings
     label: str = ""  # its settings as a sweep names them; empty for the estimator's name and variant
-    batch: str = ""  # the same without its fault, for trainings that are evaluated under several
     values: Mapping[str, Value] = field(default_factory=dict)  # keys that a sweep varies -> its own values
     combination: int = 0  # of these values
     failure: Failure | None = None  # why it cannot be done, or failed
@@ -133,7 +131,7 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
             where = f"part '{key}'" if key else "it"
             raise ConfigurationError(f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides")
     takes = getattr(study_module(read.report), "TAKES", "")
-    if takes not in (given[0], "folds") or (takes == "folds" and given != ["split"]):
+    if given != ["split" if takes == "folds" else takes]:
         draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(takes, takes)
         raise ConfigurationError(f"'{file}': the study module '{read.report}' draws its report from {draws}")
     parts = _folds_of(parts[""], file) if takes == "folds" else parts
@@ -306,22 +304,16 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
     """A combination of values; the seed is each job's own."""
     values = {key_of(override): _value(override) for override in overrides if key_of(override) in swept}
-    label = _label(values)
+    names = short_names(list(values))
+    label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
     try:
         config = compose_config("eval", overrides)
         estimator = new_estimator(config["estimator"])
         settings_from_config(estimator.training_type, config["training"], "training")
         faults_of(config)
     except ConfigurationError as error:
-        return Job({}, label or "this", "", values, number, failure_of(error))
-    trained = _label({key: value for key, value in values.items() if not is_of_fault(key)})
-    return Job(config, label or estimator.full_title, trained or estimator.full_title, values, number)
-
-
-def _label(values: Mapping[str, Value]) -> str:
-    """Settings for people, ``n_local=2, bias=true``."""
-    names = short_names(list(values))
-    return ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
+        return Job({}, label or "this", values, number, failure_of(error))
+    return Job(config, label or estimator.full_title, values, number)
 
 
 def _value(override: str) -> Value:

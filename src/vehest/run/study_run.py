@@ -137,8 +137,7 @@ def _planned(study: Study, jobs: Jobs, runner: Runner) -> dict[str, Comparison]:
     for name, part in study.parts.items():
         try:
             runner.look_for_files(_first(jobs[name]))
-            own = [replace(job) for job in jobs[name]]  # keys of published results hold rates before they are lowered
-            found[name] = Comparison(part.title, own)
+            found[name] = Comparison([replace(job) for job in jobs[name]])  # published keys hold rates before they are lowered
         except MissingError as error:
             if not part.optional:
                 raise
@@ -265,7 +264,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
 
 def _only_group(config: Config, runner: Runner) -> Group:
     """The training of a configuration, at a rate that the recordings have."""
-    comparison = Comparison("", [Job(config)])
+    comparison = Comparison([Job(config)])
     comparison.plan(runner)
     return comparison.groups[0]
 
