@@ -85,6 +85,7 @@ class Comparison:
             split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
             notes = dict.fromkeys(note for job in usable for note in _fit_to_recordings(job, split, contents))
             print_notes(notes, runner)
+            self._print_failures(usable, runner)
             checked = self.usable
             for job in checked:
                 try:
@@ -109,7 +110,7 @@ class Comparison:
                 f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
                 f"{known} shows what each estimator needs"
             )
-        self._print_failures(usable, runner)
+        self._print_failures(checked, runner)
         self.groups = self._groups(split, runner.force, evaluated=evaluated)
         if evaluated:
             configs = [job.config for job in checked]
@@ -119,15 +120,14 @@ class Comparison:
 
     def _groups(self, split: Split, force: frozenset[str], *, evaluated: bool) -> list[Group]:
         """Combinations of a sweep that differ in their fault alone share a training."""
-        of_training: dict[str, list[Job]] = {}
+        of_training: dict[str, tuple[TrainJob, list[Job]]] = {}
         for job in self.usable:
             if job.training is not None:
-                of_training.setdefault(job.training.plan.key, []).append(job)
+                of_training.setdefault(job.training.plan.key, (job.training, []))[1].append(job)
         groups: dict[Any, list[TrainJob]] = {}
-        for jobs in of_training.values():
-            if (training := jobs[0].training) is not None:
-                faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
-                groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
+        for training, jobs in of_training.values():
+            faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
+            groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
         return [
             Group(own, split, replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None, force, label)
             for (_, faults, label), own in groups.items()
