@@ -14,7 +14,7 @@ import pytest
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
-from vehest.data.splits import Split
+from vehest.data.splits import Span, Split
 from vehest.run import console
 from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
@@ -30,7 +30,7 @@ from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
 FINE = Messages(silent=True)
-SPLIT = Split("none", (), (), {})
+SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 
 def job(output: Path, seed: int = 0, *, variant: str = "small", epochs: int = 10, **training: object) -> TrainJob:

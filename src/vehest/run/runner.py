@@ -185,7 +185,7 @@ class Runner:
         while waiting:
             progress, alone = LaunchProgress(len(waiting)), []
             with self.messages.bars() as bars:
-                report = partial(self._report, waiting, progress, bars, self.launcher.cores)
+                report = partial(self._report, waiting, progress, bars)
                 for done in self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
                     group, outcome = waiting[done.position], done.outcome
                     progress.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
@@ -239,16 +239,14 @@ class Runner:
                 log_member(self.tracker, member, group.evaluation)
         return {member.job.plan.key: member for member in outcome}
 
-    def _report(
-        self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, cores: int, at: int, news: Progress | Waiting | None
-    ) -> None:
+    def _report(self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, at: int, news: Progress | Waiting | None) -> None:
         """Draw the progress of a group, or print for whom it waits."""
         if isinstance(news, Waiting):
             self._print_waiting(news)
         else:
             of_all.runs(at)
             bars.fit(groups[at].name, news)
-            bars.count(of_all.row(cores))
+            bars.count(of_all.row(self.launcher.cores))
 
     def _print_waiting(self, waiting: Waiting) -> None:
         self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")

@@ -38,7 +38,7 @@ from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.failures import Failure, failure_of
 from vehest.run.faults import faults_of
 from vehest.run.train import TrainJob, new_estimator
-from vehest.studies.registry import study_module
+from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, short_names, shown_value
 
 FORMS = "it needs study, report and one of: split and sweeps; parts, each with split and sweeps; datasets, each once"
@@ -130,6 +130,8 @@ def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
         if not part.split or not part.sweeps or not all(part.sweeps):
             where = f"part '{key}'" if key else "it"
             raise ConfigurationError(f"'{file}': {where} needs split and sweeps; sweeps must be a list of lists of overrides")
+    if read.report not in study_names():
+        raise ConfigurationError(f"'{file}': there is no study module '{read.report}'; there are: {', '.join(study_names())}")
     takes = getattr(study_module(read.report), "TAKES", "")
     if given != ["split" if takes == "folds" else takes]:
         draws = {"split": "split and sweeps", "folds": "split and sweeps, where the split has folds"}.get(takes, takes)
