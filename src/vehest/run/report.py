@@ -228,8 +228,8 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
 
 def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Artefact, TerminalSummary]:
     """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
-    evaluation, configs = comparison.evaluation, {job.combination: job.config for job in comparison.jobs if "estimator" in job.config}
-    conditions = dict.fromkeys(fault.condition for config in configs.values() if (fault := chosen_fault(config)) is not None)
+    evaluation, configs = comparison.evaluation, [job.config for job in comparison.jobs if "estimator" in job.config]
+    conditions = dict.fromkeys(fault.condition for config in configs if (fault := chosen_fault(config)) is not None)
     under = [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"] if conditions else []
     artefacts = SweepArtefacts(
         name=study.study,
@@ -242,7 +242,7 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
         data_titles=comparison.data_titles,
         facts=[*comparison.facts, *under],
         failures=comparison.failed,
-        patented=any(config["estimator"]["name"] == "ksnn" for config in configs.values()),
+        patented=any(config["estimator"]["name"] == "ksnn" for config in configs),
     )
     table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
     made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]

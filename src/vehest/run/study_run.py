@@ -1,6 +1,6 @@
 """Runs studies, sweeps, single trainings and evaluations, from a command's overrides to what is printed and published.
 
-jobs (`study`) -> `Comparison.check`, `plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
+jobs (`study`) -> `Comparison.plan` -> `Runner.run` -> `collect` -> report -> results/ and `RunCache.save`
 """
 
 from __future__ import annotations
