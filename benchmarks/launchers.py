@@ -50,7 +50,7 @@ def groups_of(output: Path, number: int) -> list[Group]:
     split = runner.split(config)
     data = runner.data_for(split, float(config["estimator"]["rate_hz"]), config)
     evaluation = runner.evaluation(config, data)
-    return [Group([plan_training({**config, "seed": seed}, split, data)], evaluation, split=split) for seed in range(number)]
+    return [Group([plan_training({**config, "seed": seed}, split, data)], split, evaluation) for seed in range(number)]
 
 
 def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:

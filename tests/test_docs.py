@@ -30,7 +30,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import UNITS
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices
-from vehest.run.study import PartFile, PipelineFile, jobs_of, read_study
+from vehest.run.study import Part, PipelineFile, jobs_of, read_study
 from vehest.sources.base import COMMON_KEYS, open_source, source_names
 from vehest.studies.artefacts import METRIC_COLUMNS
 
@@ -327,7 +327,7 @@ def test_pages_know_every_name():
     for name in UNITS:
         assert f"`{name}`" in evaluation, f"docs/evaluation.md does not explain {name}"
     assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(evaluation.split())
-    for name in {*(field.name for kind in (PipelineFile, PartFile) for field in fields(kind)), *GROUPS}:
+    for name in {*(field.name for kind in (PipelineFile, Part) for field in fields(kind)), *GROUPS}:
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 

@@ -136,7 +136,7 @@ def test_missing_files_are_said_before_anything_is_made(across) -> None:
 
 def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
     parts = read_study("folds_of_mine").parts
-    assert [(part.name, part.overrides) for part in parts] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]
+    assert [(name, part.overrides) for name, part in parts.items()] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import pytest
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
+from vehest.data.splits import Span, Split
 from vehest.run import console
 from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
@@ -26,6 +27,7 @@ from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
 FINE = Messages(silent=True)
+SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 
 def job(output: Path, seed: int = 0, *, variant: str = "small", epochs: int = 10, **training: object) -> TrainJob:
@@ -37,7 +39,7 @@ def job(output: Path, seed: int = 0, *, variant: str = "small", epochs: int = 10
         "validation": [],
     }
     plan = StagePlan("train", f"net-{variant}-seed{seed}", config, {}, "code", output)
-    return TrainJob(plan, config["estimator"], {**config["training"], **training}, None, seed, {})  # type: ignore[arg-type]
+    return TrainJob(plan, config["estimator"], {**config["training"], **training}, SPLIT, seed, {})
 
 
 def trained(own: TrainJob, seconds: float, text: str = "weights") -> Artefact:
@@ -101,14 +103,14 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
 
 
 def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
-    spec = replace(task_of(0, Group([job(tmp_path)]), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
+    spec = replace(task_of(0, Group([job(tmp_path)], SPLIT), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
     with pytest.raises(MissingError, match=r"torch .* instead of 1\.0; install the same versions"):
         run_task(spec, {}, lambda: False)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_machine_without_the_output_root_does_nothing_before_it_gets_copies(tmp_path):
-    spec = task_of(0, Group([job(tmp_path / "out")]), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
+    spec = task_of(0, Group([job(tmp_path / "out")], SPLIT), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
     with pytest.raises(NotShared):
         run_task(spec, None, lambda: False)
     assert not list(tmp_path.iterdir())
@@ -149,7 +151,7 @@ def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
 def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
     launcher = chosen_launcher(LauncherOptions(), 1, tmp_path, FINE)
     assert isinstance(launcher, LocalLauncher)
-    group = Group([job(tmp_path)])
+    group = Group([job(tmp_path)], SPLIT)
     (done,) = launcher.launch([group], StopSignals(), lambda *_: None)
     assert isinstance(done.outcome, Failure)
 

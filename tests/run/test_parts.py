@@ -158,16 +158,16 @@ def test_files_of_a_part_that_must_be_there_are_missed_in_one_line(parts_place):
 
 def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
     both, turned = read_study("both"), read_study("turned")
-    assert [part.split for part in both.parts] == ["forth", "back", "other"]
-    assert [part.split for part in turned.parts] == ["back", "back", "other"]
-    assert [part.sweeps for part in turned.parts] == [part.sweeps for part in both.parts]
+    assert [part.split for part in both.parts.values()] == ["forth", "back", "other"]
+    assert [part.split for part in turned.parts.values()] == ["back", "back", "other"]
+    assert [part.sweeps for part in turned.parts.values()] == [part.sweeps for part in both.parts.values()]
     assert (turned.study, turned.title, turned.publish) == ("turned", "Both ways", False)
 
 
 def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
     simulated, official = read_study("ksnn"), read_study("ksnn_revs")
-    shared = [part for part in simulated.parts if not part.name.startswith("same_")]
-    changed = {part.split: other.split for part, other in zip(shared, official.parts, strict=True) if part != other}
+    shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]
+    changed = {part.split: other.split for part, other in zip(shared, official.parts.values(), strict=True) if part != other}
     assert changed == {
         "cross_vehicle_1_sim": "cross_vehicle_1",
         "cross_vehicle_2_sim": "cross_vehicle_2",
@@ -175,7 +175,7 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
     }
     assert all(
         dataclasses.replace(part, split="") == dataclasses.replace(other, split="")
-        for part, other in zip(official.parts, shared, strict=True)
+        for part, other in zip(official.parts.values(), shared, strict=True)
     )
 
 
@@ -194,9 +194,9 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
 
 
 def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_static_map_beside_it():
-    for part in read_study("ksnn").parts:
-        said = {name for sweep in part.sweeps for name in sweep[0].removeprefix("estimator=").split(",")}
-        assert {"zero", "static_map"} <= said or part.name == "ferrari_whole", part.name
+    for name, part in read_study("ksnn").parts.items():
+        estimators = {own for sweep in part.sweeps for own in sweep[0].removeprefix("estimator=").split(",")}
+        assert {"zero", "static_map"} <= estimators or name == "ferrari_whole", name
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_parts_that_make_no_sense_are_refused(parts_place, change, message):
     [
         ({"based_on": "turned", "study": "x"}, "is based on another pipeline itself"),
         ({"based_on": "no_such", "study": "x"}, "there is no pipeline 'no_such'"),
-        ({"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}}, "has no part 'scheme_3'"),
+        ({"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}}, "part 'scheme_3' needs split and sweeps"),
         (
             {"based_on": "both", "study": "x", "parts": {"scheme_1": "back"}},
             "parts.scheme_1 must be a group of options, not 'back'; options: split",

@@ -248,7 +248,7 @@ def test_dry_run_tells_and_makes_nothing(place):
         (("evaluation.rate_hz=10,20",), "'evaluation.rate_hz' takes one value"),
         (("seed=1", "seed=2"), "'seed' is named twice"),
         (("estimator.depth=1,2",), "unknown option 'estimator.depth'"),
-        (("estimator=gru", "estimator.n_states=0,-1"), "no combination can be trained; n_states=0: "),
+        (("estimator=gru", "estimator.n_states=0,-1"), "estimator.n_states must be"),
     ],
 )
 def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):

@@ -14,8 +14,7 @@ from vehest.run.downsample import code_of_downsampling
 from vehest.run.evaluate import code_of_evaluation
 from vehest.run.evaluate_faults import code_under_faults
 from vehest.run.ingest import code_of_ingest
-from vehest.run.report import code_of_report
-from vehest.run.sweep import code_of_sweep
+from vehest.run.report import SWEEP_CODE, code_of_report
 from vehest.run.train import code_of_training
 from vehest.sources.base import source_names
 from vehest.studies.registry import study_names
@@ -30,7 +29,7 @@ def trainings() -> dict[str, str]:
 
 
 def test_versions_are_names_and_numbers_without_modules_and_hashes():
-    texts = [code_of_downsampling(), code_of_sweep(), *trainings().values()]
+    texts = [code_of_downsampling(), SWEEP_CODE, *trainings().values()]
     texts += [code_of_ingest({"source": name}) for name in source_names()]
     texts += [code_of_report(name) for name in study_names()]
     texts += [code(name) for name in estimator_names() for code in (code_of_calibration, code_of_evaluation)]

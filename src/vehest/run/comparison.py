@@ -1,17 +1,17 @@
 """A comparison of estimators on one split, from its jobs to what a report draws.
 
-jobs -> `check` (rates, required channels) -> `plan` (trainings in groups that fit one batch) -> `Runner.run` -> `collect`
+jobs -> `plan` (rates, required channels, trainings in groups that fit one batch) -> `Runner.run` -> `collect`
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from vehest.data.contents import Contents
-from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact
 from vehest.run.config import GIVEN, Config
@@ -37,28 +37,16 @@ Note = tuple[str, str]
 class Comparison:
     """Jobs on one split, and what becomes of them.
 
-    Args:
-        title: for people; none in a study that is not in parts.
-        jobs: of a study, or labelled ones of a sweep: each of these is evaluated under its own faults and may fail alone, while those of a
-            study are all evaluated under the faults of all.
-
-    Attributes:
-        notes: rates that were lowered; none before jobs are checked.
-        facts: the budget of each training scheme, how recordings were prepared, and the notes, a line each.
-        groups: trainings that fit one batch, with their evaluation.
-        evaluation: split, references and protocol of all of them.
-        data_titles: data set -> title, for people.
-        found: key of a training -> its trained and evaluated member.
+    Labelled jobs of a sweep are each evaluated under their own faults and may fail alone; those of a study are all evaluated under the
+    faults of all.
     """
 
-    title: str
     jobs: Sequence[Job]
-    notes: list[Note] | None = None
-    facts: Sequence[str] = ()
-    groups: Sequence[Group] = ()
-    evaluation: Evaluation = field(init=False)
+    groups: Sequence[Group] = ()  # trainings that fit one batch
+    facts: Sequence[str] = ()  # the budget of each training scheme, how recordings were prepared, rates that were lowered
+    evaluation: Evaluation = field(init=False)  # split, references and protocol of all jobs
     data_titles: Mapping[str, str] = field(default_factory=dict)
-    found: Mapping[str, Member] = field(default_factory=dict)
+    found: Mapping[str, Member] = field(default_factory=dict)  # key of a training -> its trained and evaluated member
 
     @property
     def usable(self) -> list[Job]:
@@ -82,55 +70,24 @@ class Comparison:
         """Name of what is left out -> why."""
         return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
 
-    def check(self, runner: Runner) -> None:
-        """Fit jobs to the recordings of their split, which are ingested for it, and find jobs that lack something; no samples are read.
-
-        Raises:
-            ConfigurationError: a setting makes no sense.
-            DataError: no job can be done, or the evaluation is to read estimates more often than recordings are sampled.
-            DryRunStop: in a dry run, if recordings would have to be made, after printing what would be trained.
-        """
-        usable = self.usable
-        self._print_failures([job for job in self.jobs if job not in usable], runner)
-        try:
-            split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
-        except DryRunStop:
-            runner.print_trainings(_names(usable), ["evaluate"])
-            raise
-        limit, notes = slowest(contents), dict[Note, None]()
-        for job in usable:
-            job.config, lowered = lower_rate(job.config, "evaluation", limit)
-            try:
-                job.config, more = lower_rate(job.config, "estimator", limit)
-                reason = lack(job.config, split, contents)
-                if reason:
-                    raise DataError(reason)
-                notes |= dict.fromkeys([*lowered, *more])
-            except DataError as error:
-                job.failure = failure_of(error)
-        self.notes = list(notes)
-        print_notes(notes, runner)
-        self._print_failures(usable, runner)
-        if not self.usable:
-            reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))
-            raise DataError(f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}")
-
     def plan(self, runner: Runner) -> None:
-        """Plan the trainings of checked jobs, with the data they need, which are made on the way.
+        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way.
 
         Raises:
-            ConfigurationError: the split has no test ranges, or two trainings have one name.
-            DataError: there are no data for any job.
+            ConfigurationError: a setting makes no sense, or two trainings have one name.
+            DataError: no job can be done, or the evaluation is to read estimates more often than recordings are sampled.
             DryRunStop: in a dry run, if data would have to be made, after printing what would be trained.
         """
         usable, names = self.usable, dict[Any, Any]()
-        first = usable[0].config
-        split = runner.split(first)
-        if not any(split.tests.values()):
-            raise ConfigurationError(f"split '{split.name}' has no test ranges to compare estimators on")
+        self._print_failures(self.jobs, runner)
+        evaluated = "evaluation" in usable[0].config
         try:
-            self.evaluation = runner.evaluation(first, {})
-            for job in usable:
+            split, contents = runner.split(usable[0].config), runner.contents(usable[0].config)
+            notes = dict.fromkeys(note for job in usable for note in _fit_to_recordings(job, split, contents))
+            print_notes(notes, runner)
+            self._print_failures(usable, runner)
+            checked = self.usable
+            for job in checked:
                 try:
                     data = runner.data_for(split, new_estimator(job.config["estimator"]).settings.rate_hz, job.config)
                     training = plan_training(job.config, split, data)
@@ -141,34 +98,40 @@ class Comparison:
                     if not job.label and not isinstance(error, DataError):
                         raise
                     job.failure = failure_of(error)
+            if evaluated and checked:
+                self.evaluation = runner.evaluation(usable[0].config, {})
         except DryRunStop:
-            runner.print_trainings(_names(usable), ["evaluate"])
+            runner.would_train(_names(self.usable))
             raise
         if not self.usable:
-            raise DataError("; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None)))
-        self._print_failures(usable, runner)
-        self.groups = self._groups(runner.force)
-        configs, notes = [job.config for job in usable], [f"{what} {text}" for what, text in self.notes or ()]
-        self.facts = [*training_facts(configs), resampling_fact(configs), *notes]
-        datasets = {name: runner.dataset_config(name, first)["dataset"] for name in split.datasets}
-        self.data_titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
+            reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))
+            known = ", ".join(f"'vehest data usable {name}'" for name in split.datasets)
+            raise DataError(
+                f"none of these estimators can be used with the recordings of split '{split.name}'; {reasons}; "
+                f"{known} shows what each estimator needs"
+            )
+        self._print_failures(checked, runner)
+        self.groups = self._groups(split, runner.force, evaluated=evaluated)
+        if evaluated:
+            configs = [job.config for job in checked]
+            self.facts = [*training_facts(configs), resampling_fact(configs), *(f"{what} {text}" for what, text in notes)]
+            datasets = {name: runner.dataset_config(name, usable[0].config)["dataset"] for name in split.datasets}
+            self.data_titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
 
-    def _groups(self, force: frozenset[str]) -> list[Group]:
-        """Trainings that fit one batch; combinations of a sweep that differ in their fault alone share a training."""
-        of_training: dict[str, list[Job]] = {}
+    def _groups(self, split: Split, force: frozenset[str], *, evaluated: bool) -> list[Group]:
+        """Combinations of a sweep that differ in their fault alone share a training."""
+        of_training: dict[str, tuple[TrainJob, list[Job]]] = {}
         for job in self.usable:
             if job.training is not None:
-                of_training.setdefault(job.training.plan.key, []).append(job)
-        groups: dict[tuple[Any, ...], Group] = {}
-        for jobs in of_training.values():
-            label, training = jobs[0].batch, jobs[0].training
-            assert training is not None
+                of_training.setdefault(job.training.plan.key, (job.training, []))[1].append(job)
+        groups: dict[Any, list[TrainJob]] = {}
+        for training, jobs in of_training.values():
             faults = all_of(faults_of(job.config) for job in (jobs if jobs[0].label else self.usable))
-            how = replace(self.evaluation, data=training.data, faults=faults)
-            key = (training.group, faults, label)
-            group = groups.get(key, Group([], how, force, label, how.split))
-            groups[key] = replace(group, jobs=[*group.jobs, training])
-        return list(groups.values())
+            groups.setdefault((training.group, faults, jobs[0].label), []).append(training)
+        return [
+            Group(own, split, replace(self.evaluation, data=own[0].data, faults=faults) if evaluated else None, force, label)
+            for (_, faults, label), own in groups.items()
+        ]
 
     def collect(self, members: Mapping[str, Member], failed: Mapping[str, Failure]) -> None:
         """Take what became of the trainings: key of each -> its member, or why it failed."""
@@ -180,6 +143,20 @@ class Comparison:
     def _print_failures(self, jobs: Sequence[Job], runner: Runner) -> None:
         for name, failure in named_failures(jobs) if len(self.jobs) > 1 else ():
             runner.messages.line("fail", "train", name, failure.message)
+
+
+def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[Contents]]) -> list[Note]:
+    """Lower the rates of a job to those of recordings; it fails where these lack something."""
+    job.config, notes = lower_rate(job.config, "evaluation", slowest(contents))
+    try:
+        job.config, more = lower_rate(job.config, "estimator", slowest(contents))
+        reason = lack(job.config, split, contents)
+        if reason:
+            raise DataError(reason)
+        return [*notes, *more]
+    except DataError as error:
+        job.failure = failure_of(error)
+        return []
 
 
 def slowest(contents: Mapping[str, Sequence[Contents]]) -> Contents:
@@ -195,36 +172,28 @@ def lower_rate(config: Config, group: str, limit: Contents) -> tuple[Config, lis
         ConfigurationError: a setting makes no sense.
     """
     rate, key, lowest = config.get(group, {}).get("rate_hz"), f"{group}.rate_hz", limit.rate_hz
-    if not isinstance(rate, int | float) or isinstance(rate, bool) or not rate > lowest * (1.0 + TOLERANCE):
+    if not isinstance(rate, int | float) or not rate > lowest * (1.0 + TOLERANCE):
         return config, []
-    name = group if group == "evaluation" else new_estimator(config["estimator"]).name
     sampled = f"recording '{limit.id}' is sampled at {lowest:g} Hz"
     if key in config.get(GIVEN, ()):
-        who = "the evaluation" if group == "evaluation" else f"'{name}'"
-        raise DataError(f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out and {who} takes that")
+        raise DataError(f"{key} asks for {rate:g} Hz, and {sampled}; give {key}={lowest:g} or less, or leave it out for that")
     lowered = {**config, group: {**config[group], "rate_hz": lowest}}
     if group == "evaluation":
-        return lowered, [(name, f"reads estimates at {lowest:g} Hz instead of {rate:g} Hz, since {sampled}")]
+        return lowered, [(group, f"reads estimates at {lowest:g} Hz instead of {rate:g} Hz, since {sampled}")]
+    name = new_estimator(config["estimator"]).name
     try:
-        new_estimator(lowered["estimator"])
+        settings = new_estimator(lowered["estimator"]).settings
     except ConfigurationError as error:
         raise DataError(f"estimator '{name}' cannot run at {lowest:g} Hz, and {sampled}: {error}") from None
+    samples = {"estimator.window": getattr(settings, "window", None)}  # a float counts seconds
+    samples |= {f"training.{key}": value for key, value in config["training"].items() if key == "steps" or key.endswith("_steps")}
     lengths = [
         f"; {key} of {number} samples lasts {number / lowest:.3g} s instead of {number / rate:.3g} s "
         f"({key}={max(1, round(number * lowest / rate))} keeps that)"
-        for key, number in _lengths(lowered)
+        for key, number in samples.items()
+        if isinstance(number, int) and number > 0
     ]
     return lowered, [(name, f"runs at {lowest:g} Hz instead of its {rate:g} Hz, since {sampled}{''.join(lengths)}")]
-
-
-def _lengths(config: Config) -> Iterator[tuple[str, int]]:
-    """Settings of estimator and training that count samples, and so last longer at a lower rate."""
-    window = getattr(new_estimator(config["estimator"]).settings, "window", None)
-    if isinstance(window, int):  # a float counts seconds
-        yield "estimator.window", window
-    for key, value in config["training"].items():
-        if (key == "steps" or key.endswith("_steps")) and isinstance(value, int) and value > 0:
-            yield f"training.{key}", value
 
 
 def print_notes(notes: Iterable[Note], runner: Runner) -> None:
@@ -286,20 +255,6 @@ def _names(jobs: Iterable[Job]) -> list[str]:
             stem = f"{estimator.name}-{estimator.variant}"
         seeds.setdefault(stem, []).append(str(job.config["seed"]))
     return [f"{stem} seed{'s' if len(own) > 1 else ''} {', '.join(own)}" for stem, own in seeds.items()]
-
-
-def failed_in(comparisons: Sequence[Comparison], runner: Runner) -> JobsFailedError | None:
-    """Print tracebacks of defects; returns the error of all failures, if there are any."""
-    reasons: dict[str, list[str]] = {}
-    for name, failure in (pair for own in comparisons for pair in named_failures(own.jobs)):
-        if failure.detail:
-            runner.messages.warn(f"{name}:\n{failure.detail}")
-        reasons.setdefault(failure.message, []).append(name)
-    if not reasons:
-        return None
-    listed = "; ".join(f"{' and '.join(names)}: {reason}" for reason, names in reasons.items())
-    jobs = [job for own in comparisons for job in own.jobs]
-    return JobsFailedError(f"{sum(job.failure is not None for job in jobs)} of {len(jobs)} jobs failed, the others are kept; {listed}")
 
 
 def resampling_fact(configs: Sequence[Config]) -> str:

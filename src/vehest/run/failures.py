@@ -12,17 +12,11 @@ from vehest.data.files import no_room
 
 @dataclass(frozen=True)
 class Failure:
-    """A job or command that failed.
+    """A job or command that failed."""
 
-    Args:
-        message: one line.
-        detail: traceback of a defect; empty for an expected error.
-        exit_code: of a command that runs this job alone.
-    """
-
-    message: str
-    detail: str = ""
-    exit_code: int = 1
+    message: str  # one line
+    detail: str = ""  # traceback of a defect
+    exit_code: int = 1  # of a command that runs this job alone
 
 
 def failure_of(error: Exception) -> Failure:

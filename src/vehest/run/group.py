@@ -28,36 +28,24 @@ Report = Callable[[Progress | Waiting], None]
 
 @dataclass(frozen=True)
 class Member:
-    """A training with its model, calibration and evaluation, as far as they exist.
-
-    Args:
-        finished: whether nothing of it is missing.
-    """
+    """A training with its model, calibration and evaluation, as far as they exist."""
 
     job: TrainJob
     model: Artefact | None = None
     evaluation: Artefact | None = None
     calibration: Artefact | None = None
-    finished: bool = False
+    finished: bool = False  # nothing of it is missing
 
 
 @dataclass(frozen=True)
 class Group:
-    """Members that fit one batch, and what is to be done with them.
-
-    Args:
-        jobs: in the order of the pipeline.
-        evaluation: none if they are trained only.
-        force: stages to run although their artefacts are there.
-        label: what its members have in common, for people; the estimator and its variant if empty.
-        split: whose validation range members are calibrated on; none if they are not calibrated.
-    """
+    """Members that fit one batch, and what is to be done with them."""
 
     jobs: Sequence[TrainJob]
-    evaluation: Evaluation | None = None
-    force: frozenset[str] = frozenset()
-    label: str = ""
-    split: Split | None = None
+    split: Split  # whose validation range members are calibrated on
+    evaluation: Evaluation | None = None  # none if they are only trained
+    force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
+    label: str = ""  # what members have in common; the estimator and its variant if empty
 
     @property
     def name(self) -> str:
@@ -114,7 +102,7 @@ def _member(
     if model is None or model.status != "complete":
         return Member(job, model)
     calibration = evaluation = None
-    calibrating = None if group.split is None else plan_calibrate(model, group.split, job.data, job.plan.output)
+    calibrating = plan_calibrate(model, group.split, job.data, job.plan.output)
     if calibrating is not None:
         calibration = made(calibrating.plan, partial(write_calibration, calibrating))
         if calibration is None:

@@ -61,11 +61,11 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
     if study.datasets:
         about["datasets"] = [_titled(job.config) for job in jobs[""]]
-    for part in (part for part in study.parts if part.name not in absent):
-        configs = [job.config for job in jobs[part.name]]
-        keys |= {f"{part.name}: {name}" if part.name else name: entry for name, entry in _of_jobs(configs)}
+    for part in (name for name in study.parts if name not in absent):
+        configs = [job.config for job in jobs[part]]
+        keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
         titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
-        about[f"part {part.name}"] = [part.title, *training_facts(configs), resampling_fact(configs), *titles]
+        about[f"part {part}"] = [study.parts[part].title, *training_facts(configs), resampling_fact(configs), *titles]
     return keys | {"report": {CODE: code_of_report(study.report), CONFIGURATION: _hash(about)}}
 
 
@@ -73,7 +73,7 @@ def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) 
     """Data set -> the configuration of its ingest."""
     if study.datasets:
         return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
-    firsts = [jobs[part.name][0].config for part in study.parts if part.name not in absent]
+    firsts = [jobs[name][0].config for name in study.parts if name not in absent]
     return {name: runner.dataset_config(name, config) for config in firsts for name in dataset_names(config["split"])}
 
 
@@ -212,7 +212,7 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
 
 def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner) -> list[Change]:
     """Parts and data sets that a study had to go on without, and whose raw files are here today."""
-    configs = {part.name: jobs[part.name][0].config for part in study.parts} or _by_dataset(jobs[""])
+    configs = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
     found = []
     for name in sorted(configs.keys() & set(published.absent)):
         with suppress(MissingError):

@@ -1,6 +1,7 @@
 """Last stage: evaluations, or recordings alone, to tables, figures and pages.
 
 comparisons, data sets -> StudyArtefacts -> the study's module -> report.md, report.html, tables, figures, metrics.csv
+comparison of a sweep -> table of jobs -> SweepArtefacts -> `vehest.studies.sweep` -> report.md, sweep.csv, summary.csv, heat maps
 """
 
 from __future__ import annotations
@@ -15,17 +16,20 @@ import pandas as pd
 import torch
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.splits import VALIDATION
 from vehest.estimators.kernels.blas import one_blas_thread
-from vehest.estimators.registry import estimator_class
+from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.run.comparison import Comparison
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
+from vehest.run.faults import FaultSettings, chosen_fault
+from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
-from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview
-from vehest.run.train import read_fit_metrics, recording_file
+from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
+from vehest.run.train import new_estimator, read_fit_metrics, recording_file
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
     AbsentDataset,
@@ -39,15 +43,17 @@ from vehest.studies.artefacts import (
 from vehest.studies.kit.reference_minutes import start_in_words
 from vehest.studies.kit.timings import timings_of_study
 from vehest.studies.registry import study_module
+from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
 
-STAGE = "report"
+STAGE, SWEEP = "report", "sweep"
 VERSION = "1"
+SWEEP_CODE = "sweep=1"
 OVERVIEW = "tables/overview.csv"
+SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
 def draw_report(
     study: Study,
-    command: str,
     comparisons: Mapping[str, Comparison],
     datasets: Sequence[StoredDataset | AbsentDataset],
     runner: Runner,
@@ -59,10 +65,10 @@ def draw_report(
         study=study.study,
         title=study.title,
         about=study.about,
-        command=command,
-        titles={part.name: part.title for part in study.parts},
-        parts={name: _part_artefacts(study, command, part) for name, part in shown.items()},
-        absent=[part.name for part in study.parts if part.name not in comparisons],
+        command=study.command,
+        titles={name: part.title for name, part in study.parts.items()},
+        parts={name: _part_artefacts(study, study.parts[name].title, part) for name, part in shown.items()},
+        absent=[name for name in study.parts if name not in comparisons],
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
     )
@@ -164,13 +170,13 @@ def _recordings(comparisons: Mapping[str, Comparison], ingested: Sequence[Artefa
     return found | {f"{own.label}/{Path(name).stem}": digest for own in ingested for name, digest in own.outputs.items()}
 
 
-def _part_artefacts(study: Study, command: str, part: Comparison) -> PartArtefacts:
+def _part_artefacts(study: Study, title: str, part: Comparison) -> PartArtefacts:
     models, tables = [], []
     for member in part.members:
         assert member.model is not None
         assert member.evaluation is not None
         tables.append(_table_of(member.evaluation.folder, METRICS))
-        estimator = estimator_class(str(member.job.estimator["name"])).from_config(member.job.estimator)
+        estimator = new_estimator(member.job.estimator)
         models.append(
             EvaluatedModel(
                 estimator=estimator.name,
@@ -186,9 +192,9 @@ def _part_artefacts(study: Study, command: str, part: Comparison) -> PartArtefac
     e = part.evaluation
     return PartArtefacts(
         study=study.study,
-        title=part.title or study.title,
+        title=title or study.title,
         about=study.about,
-        command=command,
+        command=study.command,
         split=e.split,
         protocol=e.protocol,
         kinds=e.kinds,
@@ -218,3 +224,78 @@ def _table_of(evaluation: Path, file: str) -> pd.DataFrame:
 
 def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True).assign(study=study)[list(METRIC_COLUMNS)]
+
+
+def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Artefact, TerminalSummary]:
+    """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
+    evaluation, configs = comparison.evaluation, [job.config for job in comparison.jobs if "estimator" in job.config]
+    conditions = dict.fromkeys(fault.condition for config in configs if (fault := chosen_fault(config)) is not None)
+    under = [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"] if conditions else []
+    artefacts = SweepArtefacts(
+        name=study.study,
+        command=study.command,
+        keys=list(comparison.jobs[0].values),
+        jobs=_job_table(comparison),
+        split=evaluation.split,
+        protocol=evaluation.protocol,
+        kinds=evaluation.kinds,
+        data_titles=comparison.data_titles,
+        facts=[*comparison.facts, *under],
+        failures=comparison.failed,
+        patented=any(config["estimator"]["name"] == "ksnn" for config in configs),
+    )
+    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
+    made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]
+    plan = StagePlan(
+        stage=SWEEP,
+        label=artefacts.name,
+        config={
+            "command": artefacts.command,
+            "keys": artefacts.keys,
+            "jobs": artefacts.jobs[["combination", "title", *artefacts.keys, "seed", "status"]].astype(object).to_dict("records"),
+            "failures": artefacts.failures,
+            "protocol": asdict(artefacts.protocol),
+            "kinds": artefacts.kinds,
+            "data_titles": artefacts.data_titles,
+            "facts": artefacts.facts,
+        },
+        inputs={f"{own.stage}/{own.folder.name}": own.digest for own in made},
+        code=SWEEP_CODE,
+        output=runner.output,
+    )
+
+    def write(folder: Path) -> None:
+        from vehest.report.document import write_document
+
+        write_document(build(artefacts), folder, page=False)
+        for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", table)):
+            written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
+
+    return runner.ensure(plan, write), summary_of_sweep(artefacts, table)
+
+
+def _job_table(comparison: Comparison) -> pd.DataFrame:
+    """One row a job, in the order of the command."""
+    split = comparison.evaluation.split
+    sets = [*([VALIDATION] if split.validation else []), *split.tests]
+    rows = []
+    for job in comparison.jobs:
+        member = None if job.failure is not None or job.training is None else comparison.found.get(job.training.plan.key)
+        title = new_estimator(job.config["estimator"]).full_title if "estimator" in job.config else ""  # else refused
+        row: dict[str, Any] = {"combination": job.combination, "title": title, **job.values, "seed": job.config["seed"]}
+        row |= {"status": DONE if member else FAILED, "error": job.failure.message if job.failure is not None else ""}
+        rows.append(row | _figures(member, sets, chosen_fault(job.config)))
+    return pd.DataFrame(rows)
+
+
+def _figures(member: Member | None, sets: Sequence[str], fault: FaultSettings | None) -> dict[str, Any]:
+    """Figures of a job, ``METRIC.SET``, while its fault lasts where it has one; NaN where it failed."""
+    columns = [f"{metric}.{name}" for name in sets for metric in SCORES]
+    if member is None or member.model is None or member.evaluation is None:
+        return dict.fromkeys(["n_parameters", "epochs", *columns], float("nan"))
+    table = _table_of(member.evaluation.folder, METRICS)
+    nominal = table[(table["subset"] == "all") & (table["condition"] == "nominal")]
+    own = {metric: float(nominal.loc[nominal["metric"] == metric, "value"].iloc[0]) for metric in ("n_parameters", "epochs")}
+    scored = nominal if fault is None else table[(table["subset"] == FAULTED) & (table["condition"] == fault.condition)]
+    found = dict(zip(scored["metric"] + "." + scored["test_set"], map(float, scored["value"]), strict=True))
+    return {**own, **{column: found.get(column, float("nan")) for column in columns}, "model": member.model.folder.name}

@@ -43,37 +43,23 @@ Value = TypeVar("Value")
 
 @dataclass(eq=False)
 class Runner:
-    """Runs stages into one output root.
-
-    Args:
-        output: the output root.
-        messages: prints what happens.
-        stop: signals.
-        jobs: processes.
-        force: stages to run although their artefacts are there.
-        dry_run: print what would run, run nothing.
-        tracker: logs runs; none for no tracking.
-        launcher: runs groups; none for this machine's cores.
-        until: reading of ``time.monotonic`` from which on no training is begun and running ones are stopped; none for no limit.
-        train_first: command to run first where a training is missing, so that none is made here; empty to make it.
-        artefacts: those found or made so far, by folder.
-    """
+    """Runs stages into one output root; in a dry run `DryRunStop` is raised where something would have to be made."""
 
     output: Path
     messages: Messages
     stop: StopSignals
-    jobs: int = 1
-    force: frozenset[str] = frozenset()
+    jobs: int = 1  # processes of an ingest
+    force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     dry_run: bool = False
     tracker: Tracker | None = None
-    until: float | None = None
-    launcher: Launcher | None = None
-    train_first: str = ""
-    artefacts: dict[Path, Artefact] = field(default_factory=dict)
+    launcher: Launcher = field(default_factory=LocalLauncher)
+    until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
+    train_first: str = ""  # command to run first where a training is missing; empty to train here
+    artefacts: dict[Path, Artefact] = field(default_factory=dict)  # those found or made so far, by folder
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)
 
     def _once(self, what: str, of: Any, make: Callable[[], Value]) -> Value:
-        """What ``make`` gives the first time that it is asked for."""
+        """The value of ``make``, which is called the first time alone."""
         key = what, json.dumps(of, sort_keys=True)
         if key not in self._known:
             self._known[key] = make()
@@ -81,11 +67,7 @@ class Runner:
         return value
 
     def ingest(self, config: Config) -> Artefact:
-        """The recordings of a data set at their native rate.
-
-        Raises:
-            DryRunStop: in a dry run, if they would have to be made.
-        """
+        """The recordings of a data set at their native rate."""
         plan = plan_ingest(config)
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
@@ -121,11 +103,7 @@ class Runner:
         return self._once("ingest", name, lambda: self.ingest(self.dataset_config(name, config)))
 
     def split(self, config: Config) -> Split:
-        """The split of a configuration; where it names or cuts recordings by rules, its data sets are ingested for it.
-
-        Raises:
-            DryRunStop: in a dry run, if they would have to be made.
-        """
+        """The split of a configuration; where it names or cuts recordings by rules, its data sets are ingested for it."""
 
         def recordings_of(name: str) -> Mapping[str, Reader]:
             ingested = self._ingested(name, config)
@@ -140,11 +118,7 @@ class Runner:
         return self._once("split", config["split"], make)
 
     def contents(self, config: Config) -> dict[str, tuple[Contents, ...]]:
-        """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read.
-
-        Raises:
-            DryRunStop: in a dry run, if they would have to be made.
-        """
+        """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
 
         def read(name: str) -> tuple[Contents, ...]:
             ingested = self._ingested(name, config)
@@ -164,11 +138,7 @@ class Runner:
         return Evaluation(split, data, references, kinds, protocol, self.output, faults)
 
     def ensure(self, plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-        """Make an artefact unless it is there.
-
-        Raises:
-            DryRunStop: in a dry run, if it would have to be made.
-        """
+        """Make an artefact unless it is there."""
         if plan.folder in self.artefacts:
             return self.artefacts[plan.folder]
         found = None if plan.stage in self.force else find(plan)
@@ -194,7 +164,6 @@ class Runner:
         Raises:
             MissingError: a command has to be run first, and not one member is there.
             Stopped: a signal came; finished artefacts stay.
-            DryRunStop: in a dry run, if anything would have to be made.
         """
         members: dict[str, Member] = {}
         waiting: list[Group] = []
@@ -203,21 +172,24 @@ class Runner:
             members |= self._received(group, [member for member in found if member.finished])
             missing = [member.job for member in found if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
+        failures: dict[str, Failure] = {}
         if waiting and self.train_first:
-            return members, self._untrained([job.plan for group in waiting for job in group.jobs], members)
+            plans, reason = [job.plan for group in waiting for job in group.jobs], f"run '{self.train_first}' first"
+            if not members:
+                raise MissingError(f"{plans[0].label} has not been trained and evaluated; {reason}")
+            failure = Failure(f"has not been trained and evaluated; {reason}", exit_code=MissingError.exit_code)
+            return members, {plan.key: failure for plan in plans}
         if waiting:
             self._announce(waiting, len(members))
-        failures: dict[str, Failure] = {}
-        launcher = self.launcher or LocalLauncher(self.jobs)
         while waiting:
             progress, alone = LaunchProgress(len(waiting)), []
             with self.messages.bars() as bars:
-                report = partial(self._report, waiting, progress, bars, launcher.cores)
-                for done in launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
+                report = partial(self._report, waiting, progress, bars)
+                for done in self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
                     group, outcome = waiting[done.position], done.outcome
                     progress.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
                     bars.close(group.name)
-                    bars.count(progress.row(launcher.cores))
+                    bars.count(progress.row(self.launcher.cores))
                     if not isinstance(outcome, Failure):
                         members |= self._received(group, outcome)
                         for member in outcome:
@@ -232,41 +204,27 @@ class Runner:
             waiting = alone
         return members, failures
 
-    def _untrained(self, missing: Sequence[StagePlan], members: Mapping[str, Member]) -> dict[str, Failure]:
-        reason = f"has not been trained and evaluated; run '{self.train_first}' first"
-        if not members:
-            raise MissingError(f"{missing[0].label} {reason}")
-        return {plan.key: Failure(reason, exit_code=MissingError.exit_code) for plan in missing}
-
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
         """Print what groups are going to do; a dry run ends here."""
-        uncalibrated = [group for group in waiting if group.split is not None and not group.split.validation]
         if self.dry_run:
-            for group in waiting:
-                calibrated = group.split is not None and group not in uncalibrated
-                then = [stage for stage, wanted in (("calibrate", calibrated), ("evaluate", group.evaluation)) if wanted]
-                self.print_trainings([job.plan.label for job in group.jobs], then)
-            to_do = sum(len(group.jobs) for group in waiting)
-            self.messages.line("plan", "train", f"{to_do} in all", f"{n_there} more are there")
+            labels = [job.plan.label for group in waiting for job in group.jobs]
+            self.would_train(labels)
+            self.messages.line("plan", "train", f"{len(labels)} in all", f"{n_there} more are there")
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
             if has_to_compile(name):
                 self.messages.line("once", "compile", name, "tens of seconds before its first training; later ones load it")
-        for split in dict.fromkeys(group.split.name for group in uncalibrated if group.split is not None):
+        for split in dict.fromkeys(group.split.name for group in waiting if not group.split.validation):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
 
-    def print_trainings(self, labels: Sequence[str], then: Sequence[str]) -> None:
-        """What a dry run would train."""
+    def would_train(self, labels: Sequence[str]) -> None:
+        """Print what a dry run leaves out."""
         for label in labels:
-            self.messages.line("plan", "train", label, f"then {' and '.join(then)}" if then else "")
+            self.messages.line("plan", "train", label)
 
     def _received(self, group: Group, outcome: Sequence[Member]) -> dict[str, Member]:
-        """Members as they are kept: printed, tracked, with this process's own copy of their jobs."""
-        planned = {job.plan.key: job for job in group.jobs}
-        received = {}
-        for other in outcome:
-            key = other.job.plan.key
-            received[key] = member = replace(other, job=planned[key])
+        """Members by the keys of their trainings, printed and tracked."""
+        for member in outcome:
             if member.finished and not self.dry_run:
                 drop_finished_checkpoint(member.job)
             if member.model is None:
@@ -278,18 +236,16 @@ class Runner:
                     self.messages.line(status, made.stage, made.label, detail)
             if self.tracker is not None:
                 log_member(self.tracker, member, group.evaluation)
-        return received
+        return {member.job.plan.key: member for member in outcome}
 
-    def _report(
-        self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, cores: int, at: int, news: Progress | Waiting | None
-    ) -> None:
+    def _report(self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, at: int, news: Progress | Waiting | None) -> None:
         """Draw the progress of a group, or print for whom it waits."""
         if isinstance(news, Waiting):
             self._print_waiting(news)
         else:
             of_all.running.add(at)
             bars.fit(groups[at].name, news)
-            bars.count(of_all.row(cores))
+            bars.count(of_all.row(self.launcher.cores))
 
     def _print_waiting(self, waiting: Waiting) -> None:
         self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
