@@ -385,13 +385,14 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; written files stay.
     """
-    from vehest.run.replay import ReplayWords, replay_log
+    from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
-    words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
     stop = StopSignals()
+    bus: dict[str, Any] = {"bus_rate": bus_rate, "interface": interface, "channel": channel, "identifier": identifier}
+    named: dict[str, Any] = {"model": model, "dbc": dbc, "dataset": dataset, "signals": signals, "out": out, "write_dbc": write_dbc}
     with stop.installed(), stop.deferred():
-        outcome = replay_log(words, overrides or [], stop.requested, note)
+        outcome = replay_log(log, overrides or [], stop.requested, note, speed=speed, quiet=quiet, **bus, **named)
     emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)

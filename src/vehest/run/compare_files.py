@@ -30,8 +30,7 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
 from vehest.run.estimate import estimate_recording, open_model, read_table
-from vehest.run.printing import TerminalTable, complain, note
-from vehest.run.terminal import SCORE_HEADER, score_cells
+from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, note, score_cells
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
 from vehest.sources.unit_spellings import plain_unit

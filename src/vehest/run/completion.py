@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from typing import Any
 
 from vehest.data.errors import VehestError
-from vehest.data.text_files import read_yaml
-from vehest.run.config_files import GROUPS, choices, conf_file, summary
+from vehest.data.text_files import parse_yaml
+from vehest.run.config_files import GROUPS, choices, conf_text, summary
 
 
 def complete_override(command: str, given: list[str], incomplete: str) -> list[tuple[str, str]]:
@@ -45,9 +46,7 @@ def _key_before(given: list[str], incomplete: str) -> str | None:
 
 def _content(command: str, given: list[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Groups of a command with their choices, and dotted options with their defaults."""
-    groups: dict[str, Any] = {}
-    options: dict[str, Any] = {}
-    _collect_root(command, groups, options)
+    groups, options = _root(command)
     groups |= {name: value for name, _, value in (word.partition("=") for word in given) if name in groups and value}
     for group, choice in groups.items():
         content = _yaml(f"{group}/{choice}.yaml")
@@ -56,14 +55,15 @@ def _content(command: str, given: list[str]) -> tuple[dict[str, Any], dict[str, 
     return groups, options
 
 
-def _collect_root(command: str, groups: dict[str, Any], options: dict[str, Any]) -> None:
+def _root(command: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Groups and options of a root file and of those that it includes."""
+    groups: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     content = _yaml(f"{command}.yaml")
     for entry in content.pop("defaults", []):
-        if isinstance(entry, dict):
-            groups |= {str(group): None if choice == "???" else choice for group, choice in entry.items()}
-        elif isinstance(entry, str) and entry != "_self_":
-            _collect_root(entry, groups, options)
-    options |= _options(content)
+        further = (entry, {}) if isinstance(entry, dict) else _root(entry) if entry != "_self_" else ({}, {})
+        groups, options = groups | further[0], options | further[1]
+    return groups, options | _options(content)
 
 
 def _options(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -78,9 +78,7 @@ def _options(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _yaml(name: str) -> dict[str, Any]:
-    file = conf_file(name)
-    try:
-        content = {} if file is None else read_yaml(file)
-    except VehestError:
-        content = {}
+    content = None
+    with suppress(VehestError):
+        content = parse_yaml(conf_text(name), name)
     return content if isinstance(content, dict) else {}

@@ -55,10 +55,8 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Named:
-    """A group of options that the schema of its ``name`` checks further."""
-
     __pydantic_config__ = FURTHER_KEYS
-    name: str
+    name: str  # whose schema checks the other options
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,7 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
-    """The resolved configuration of a command.
-
-    Args:
-        command: name of a root file in conf/, for example ``train``.
-        overrides: in Hydra's grammar, for example ``estimator=gru`` or ``training.patience=10``; no sweeps.
+    """The resolved configuration of a command, a root file in conf/, with overrides in Hydra's grammar, but no sweeps.
 
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
@@ -118,10 +112,9 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing
         raise ConfigurationError(_one_line(error, command)) from None
-    config = {str(key): value for key, value in resolved.items()}
-    validated(Root, config, "", error=ConfigurationError)
+    validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in parsed)]
-    return {**config, GIVEN: chosen} if chosen else config
+    return {str(key): value for key, value in resolved.items()} | ({GIVEN: chosen} if chosen else {})
 
 
 def _check(override: Override) -> None:
@@ -149,18 +142,11 @@ def _one_line(error: Exception, command: str) -> str:
         return f"unknown option '{unknown[1]}'{hint}"
     if missing := re.search(r"You must specify '([^']+)'", text):
         return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
-    if variable := re.search(r"Environment variable '([^']+)' not found", text):
-        return f"environment variable {variable[1]} is not set"
-    key = getattr(error, "full_key", None)
-    return f"{key}: {text.splitlines()[0]}" if key else " ".join(line.strip() for line in text.splitlines()[:2])
+    return " ".join(line.strip() for line in text.splitlines()[:2])
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """Parse overrides in Hydra's grammar.
-
-    Raises:
-        ConfigurationError: bad syntax.
-    """
+    """Overrides, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
     return [_parsed(text) for text in overrides]
 
 
@@ -178,11 +164,7 @@ def _parsed(text: str) -> Override:
 
 
 def count(overrides: Sequence[str]) -> int:
-    """Number of combinations of overrides with several values; of one override at most ``limits.jobs`` + 1 values count.
-
-    Raises:
-        ConfigurationError: bad syntax, or values that cannot be counted.
-    """
+    """Number of combinations that `expand` gives; of one override at most ``limits.jobs`` + 1 values count."""
     return math.prod(len(_values(override)) for override in parse(overrides))
 
 
@@ -212,20 +194,12 @@ def _values(override: Override) -> list[str]:
 
 
 def check_jobs(number: int, what: str) -> None:
-    """Refuse more jobs than ``limits.jobs``.
-
-    Raises:
-        ConfigurationError: there are more.
-    """
+    """Refuse more jobs than ``limits.jobs``."""
     check_limit("jobs", number, f"{what} for at least {number} jobs", ConfigurationError)
 
 
 def limits_of(overrides: Sequence[str]) -> Limits:
-    """The limits of conf/common.yaml, changed by overrides.
-
-    Raises:
-        ConfigurationError: bad syntax, an unknown limit or a wrong value.
-    """
+    """The limits of conf/common.yaml, changed by overrides."""
     own = list(dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits"))
     return limits_from_config(compose_config("eval", own)["limits"])
 
@@ -248,12 +222,8 @@ def option_hint(key: str) -> str:
 
 def has_key(config: Config, key: str) -> bool:
     """Whether a dotted key is in a configuration."""
-    node: Any = config
-    for part in key.split("."):
-        if not isinstance(node, dict) or part not in node:
-            return False
-        node = node[part]
-    return True
+    first, _, rest = key.partition(".")
+    return isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
 
 
 def as_yaml(config: Config) -> str:
@@ -263,11 +233,7 @@ def as_yaml(config: Config) -> str:
 
 
 def positive_rate(value: Any, name: str) -> float:
-    """A rate [Hz] of a configuration.
-
-    Raises:
-        ConfigurationError: it is no positive number.
-    """
+    """A rate [Hz] of a configuration; raises `ConfigurationError` unless it is a positive number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
         raise ConfigurationError(f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20")
     return float(value)

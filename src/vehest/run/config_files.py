@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from pathlib import Path
 
 GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "tracking")
@@ -40,9 +41,10 @@ def conf_folders() -> list[Path]:
     return [folder for folder in (local_conf(), packaged_conf(), papers_conf()) if folder is not None]
 
 
-def conf_file(name: str) -> Path | None:
-    """A configuration file by its path below conf/, from the first folder that has it."""
-    return next((folder / name for folder in conf_folders() if (folder / name).is_file()), None)
+def conf_text(name: str) -> str:
+    """The text of a file by its path below conf/, from the first folder that has it; empty where none has."""
+    file = next((folder / name for folder in conf_folders() if (folder / name).is_file()), None)
+    return "" if file is None else file.read_text(encoding="utf-8", errors="replace")
 
 
 def choices(group: str) -> list[str]:
@@ -52,22 +54,13 @@ def choices(group: str) -> list[str]:
 
 def summary(group: str, choice: str) -> str:
     """The first comment line of a choice's file, a sentence about it."""
-    for line in _lines(group, choice):
-        if line.startswith("#") and "@package" not in line:
-            return line.lstrip("# ").rstrip()
-        if line and not line.startswith("#"):
-            break
-    return ""
+    comments = takewhile(lambda line: not line or line.startswith("#"), conf_text(f"{group}/{choice}.yaml").splitlines())
+    return next((line.lstrip("# ").rstrip() for line in comments if line and "@package" not in line), "")
 
 
 def is_simulated(dataset: str) -> bool:
     """Whether the file of a data set declares it as simulated."""
-    return "source: simulated" in _lines("dataset", dataset)
-
-
-def _lines(group: str, choice: str) -> list[str]:
-    file = conf_file(f"{group}/{choice}.yaml")
-    return [] if file is None else file.read_text(encoding="utf-8", errors="replace").splitlines()
+    return "source: simulated" in conf_text(f"dataset/{dataset}.yaml").splitlines()
 
 
 def is_file_name(word: str) -> bool:

@@ -17,7 +17,9 @@ from rich.text import Text
 from vehest.data.errors import printable
 from vehest.training.context import Progress as FitProgress
 
+WARNING = "warn"
 MARKS = {
+    WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
     "skip": ("skipped", "dim"),
     "plan": ("would", "cyan"),
@@ -30,7 +32,6 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-WARNING = "warn"
 MOST_ROWS = 12  # of finished trainings above the bars
 MOST_BARS = 16  # of trainings that run at a time
 
@@ -52,30 +53,22 @@ class Messages:
         self.quiet = quiet or silent
         self.printed: list[tuple[str, str, str, str]] = []
 
-    def again(self, printed: Sequence[tuple[str, str, str, str]]) -> None:
-        """Print earlier lines and warnings once more."""
-        for status, stage, label, detail in printed:
-            if status == WARNING:
-                self.warn(detail)
-            else:
-                self.line(status, stage, label, detail)
-
-    def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
-        """Print the status of one artefact."""
-        self.printed.append((status, stage, label, detail))
-        if not self.quiet:
-            word, colour = MARKS[status]
-            shown = (f" {printable(detail)}" if detail else "", "dim")
-            self._print(Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown))
-
     def warn(self, text: str) -> None:
         """Print a warning."""
-        self.printed.append((WARNING, "", "", text))
-        self._print(Text.assemble(("warning", "yellow"), f" {printable(text, keep=chr(10))}"))
+        self.line(WARNING, "", "", text)
 
-    def _print(self, text: Text) -> None:
-        with suppress(OSError):  # a closed stream or a full disk does not end the work
-            self.console.print(text)
+    def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
+        """Print the status of one artefact, or a warning."""
+        self.printed.append((status, stage, label, detail))
+        word, colour = MARKS[status]
+        if status == WARNING:
+            text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
+        else:
+            shown = (f" {printable(detail)}" if detail else "", "dim")
+            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown)
+        if status == WARNING or not self.quiet:
+            with suppress(OSError):  # a closed stream or a full disk does not end the work
+                self.console.print(text)
 
     @contextmanager
     def bars(self) -> Iterator[Bars]:
@@ -104,10 +97,10 @@ class Bars:
 
     def __rich__(self) -> RenderableType:
         best = sorted(self._done.items(), key=lambda row: tuple(row[1].values()))[:MOST_ROWS]
-        rows: list[list[str | Text]] = [[Text(printable(name)), *(f"{value:.3f}" for value in figures.values())] for name, figures in best]
-        done = _grid(["done so far", *best[0][1]] if best else [], rows)
-        counts = _grid(list(self._counted), [list(self._counted.values())])
-        return Group(*done, self._progress, *counts)
+        figures = [("done so far", *best[0][1])] if best else []
+        figures += [(printable(name), *(f"{value:.3f}" for value in own.values())) for name, own in best]
+        counts = [tuple(self._counted), tuple(self._counted.values())] if self._counted else []
+        return Group(*([_grid(figures)] if figures else []), self._progress, *([_grid(counts)] if counts else []))
 
     def count(self, counted: Mapping[str, str]) -> None:
         """Show numbers below the bars, such as how many are done."""
@@ -140,9 +133,9 @@ class Bars:
             self._progress.remove_task(self._tasks.pop(name))
 
 
-def _grid(header: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> list[Table]:
-    """A table without borders; nothing without a header."""
-    table = Table(*header, box=None, header_style="dim", padding=(0, 2))
-    for row in rows if header else ():
-        table.add_row(*row)
-    return [table] if header else []
+def _grid(rows: Sequence[Sequence[str]]) -> Table:
+    """A table without borders, its header first."""
+    table = Table.grid(padding=(0, 2))
+    for number, row in enumerate(rows):
+        table.add_row(*(Text(cell) for cell in row), style="" if number else "dim")
+    return table

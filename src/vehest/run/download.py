@@ -12,12 +12,10 @@ from vehest.sources.download import Outcome, download_of
 
 
 def download_files(config: Config, runner: Runner) -> None:
-    """Fetch missing files of a data set, and record or compare the checksums of the others.
+    """Fetch missing files of a data set, and record or compare the checksums of the others; errors as of `Download.fetch`.
 
     Raises:
         ConfigurationError: the data set names no source of its files.
-        DataError: a file has other bytes than recorded.
-        MissingError: no data root is set, the server is out of reach or lacks a file, or the disk is full.
         DryRunStop: in a dry run, if a file would have to be fetched.
     """
     source = open_source(config["dataset"])
@@ -29,10 +27,9 @@ def download_files(config: Config, runner: Runner) -> None:
         )
     download = download_of(source)
     if runner.dry_run:
-        missing = download.missing()
-        for name in missing:
+        for name in download.missing():
             runner.messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
-        if missing:
+        if download.missing():
             runner.messages.line("plan", "ingest", source.name, "then")
             raise DryRunStop
         return

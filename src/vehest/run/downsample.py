@@ -17,11 +17,7 @@ VERSION = "1"
 
 
 def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
-    """The artefact of a downsampling.
-
-    Raises:
-        ConfigurationError: a rate, method or transform that makes no sense.
-    """
+    """The artefact of a downsampling; raises `ConfigurationError` for a rate, method or transform that makes no sense."""
     config = {"rate_hz": float(rate_hz), "method": options["method"], "transforms": list(options.get("transforms") or [])}
     transforms_of(config)
     return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of_downsampling(), output)
@@ -33,11 +29,7 @@ def code_of_downsampling() -> str:
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:
-    """Transform and resample every recording into ``folder``.
-
-    Raises:
-        DataError: a recording cannot be brought to that rate.
-    """
+    """Transform and resample every recording into ``folder``."""
     for name in ingested.outputs:
         write_recording(resampled(read_recording(ingested.folder / name), config["rate_hz"], config), folder / name)
 
@@ -57,5 +49,4 @@ def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, An
 
 def transforms_of(config: Mapping[str, Any]) -> list[Transform]:
     """The transforms of a downsampling, in order."""
-    first = [transform_from_config(entry) for entry in config["transforms"]]
-    return [*first, Resample(float(config["rate_hz"]), config["method"])]
+    return [*map(transform_from_config, config["transforms"]), Resample(float(config["rate_hz"]), config["method"])]

@@ -21,10 +21,10 @@ from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.run.comparison import Comparison
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
 from vehest.run.ingest import STAGE as INGEST
+from vehest.run.printing import TerminalSummary, summary_of_leaderboard, summary_of_overview
 from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
-from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview
 from vehest.run.train import read_fit_metrics, recording_file
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,

@@ -18,13 +18,13 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.split_files import dataset_names
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
-from vehest.run.calibrate import calibration_of, plan_calibrate, write_calibration
+from vehest.run.calibrate import calibration_of, plan_calibrate
 from vehest.run.comparison import Comparison, failed_in, lower_rate, plan_training, print_notes, slowest
 from vehest.run.config import Config, compose_config, key_of, positive_rate
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
 from vehest.run.evaluate import fault_figures, write_evaluation
-from vehest.run.faults import check_channels, faults_of
+from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
@@ -289,7 +289,7 @@ def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], ru
     if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
         job = plan_calibrate(model, split, data, runner.output)
         if job is not None:
-            found = runner.ensure(job.plan, partial(write_calibration, job))
+            found = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests
         found = calibration_of(model.folder, runner.output)
     if found is None:

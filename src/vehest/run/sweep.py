@@ -17,11 +17,11 @@ from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.comparison import Comparison
 from vehest.run.evaluate import COLUMNS, METRICS
-from vehest.run.faults import FaultSettings, chosen_fault
+from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
+from vehest.run.printing import TerminalSummary, summary_of_sweep
 from vehest.run.runner import Runner
 from vehest.run.study import Study
-from vehest.run.terminal import TerminalSummary, summary_of_sweep
 from vehest.run.train import new_estimator
 from vehest.studies.artefacts import read_frame
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
