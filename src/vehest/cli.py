@@ -389,10 +389,25 @@ def replay(
     from vehest.run.signals import StopSignals
 
     stop = StopSignals()
-    bus: dict[str, Any] = {"bus_rate": bus_rate, "interface": interface, "channel": channel, "identifier": identifier}
-    named: dict[str, Any] = {"model": model, "dbc": dbc, "dataset": dataset, "signals": signals, "out": out, "write_dbc": write_dbc}
     with stop.installed(), stop.deferred():
-        outcome = replay_log(log, overrides or [], stop.requested, note, speed=speed, quiet=quiet, **bus, **named)
+        outcome = replay_log(
+            log,
+            overrides or [],
+            stop.requested,
+            note,
+            model=model,
+            dbc=dbc,
+            dataset=dataset,
+            signals=signals,
+            speed=speed,
+            bus_rate=bus_rate,
+            interface=interface,
+            channel=channel,
+            identifier=identifier,
+            out=out,
+            write_dbc=write_dbc,
+            quiet=quiet,
+        )
     emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)

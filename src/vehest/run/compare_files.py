@@ -29,20 +29,20 @@ from vehest.evaluation.ranking import rank
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.estimate import estimate_recording, open_model, read_table
-from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, note, score_cells
+from vehest.run.estimate import estimate_recording, open_model, read_table, require_channels
+from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 SPELLINGS = {
-    "vy_ref": {"vy", "v", "v_y", "vlat", "lateralvelocity", "lateral_velocity", "v_lat", "vy_est", "vy_hat"},
-    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "sideslip_angle", "beta_est", "beta_hat", "slip_angle"},
+    "time": {"time", "t", "timestamp", "zeit"},
+    "vy_ref": {"vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"},
+    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "betaest", "betahat"},
 }
-"""Channel that a quantity is read as -> how a table may call it."""
-USUAL_UNITS = {"vy_ref": "m/s", "sideslip_ref": "rad"}
-TIMES = {"time", "t", "timestamp", "zeit"}
+"""Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
+USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 LEAST_SECONDS = 5.0
 
 
@@ -64,13 +64,7 @@ class ComparedFiles:
 
 
 def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
-    """Score estimates of other tools, and models, on one recording.
-
-    Raises:
-        ConfigurationError: two estimates have the same name.
-        MissingError: a file or model is not there.
-        DataError: a file cannot be used.
-    """
+    """Score estimates of other tools, and models, on one recording; raises `VehestError` where a file or model cannot be used."""
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
     config = compose_config("estimate", overrides)
@@ -102,34 +96,21 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
         with suppress(DataError):  # a table of another tool
             return read_estimate(file)
     names = column_names(file, {})
-    time = _column_like(names, TIMES)
-    found = {channel: _column_like(names, spellings) for channel, spellings in SPELLINGS.items()}
-    channel = next((channel for channel, column in found.items() if column is not None), None)
+    found: dict[str, dict[str, str]] = {}
+    for quantity, spellings in SPELLINGS.items():
+        for name in names:
+            if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
+                found.setdefault(quantity, {"column": name, "unit": _unit_in(name) or USUAL_UNITS[quantity]})
+    time, channel = found.pop("time", None), next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
-        raise DataError(f"'{file}' has no column {wanted} (it has {', '.join(names[:12])}{', …' if len(names) > 12 else ''})")
-    column = str(found[channel])
-    dataset = {
-        "name": file.stem,
-        "source": "tabular",
-        "kind": "real",
-        "vehicle": "unknown",
-        "time": {"column": time, "unit": _unit_in(time) or "s"},
-        "clock": "interpolate",
-        "gappy": [channel],
-        "channels": {channel: {"column": column, "unit": _unit_in(column) or USUAL_UNITS[channel]}},
-    }
-    table = read_single(dataset, file)
+        raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
+    options = {"name": file.stem, "source": "tabular", "vehicle": "unknown", "clock": "interpolate", "gappy": [channel]}
+    table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
     return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
-
-
-def _column_like(names: Sequence[str], spellings: set[str]) -> str | None:
-    """The first column of that name, without its unit in brackets and whatever its case."""
-    bare = {name: re.sub(r"[\[(].*?[\])]", "", name).strip().lower().replace(" ", "_") for name in names}
-    return next((name for name in names if bare[name] in spellings or bare[name].replace("_", "") in spellings), None)
 
 
 def _unit_in(name: str) -> str | None:
@@ -149,9 +130,7 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
         DataError: no reference, too little in common, or gaps within what is in common.
         ConfigurationError: there is nothing to compare, or a name is that of a baseline.
     """
-    for name in ("vx", "vy_ref"):
-        if name not in drive:
-            raise DataError(f"recording '{drive.id}' has no channel '{name}', which estimates are scored by")
+    require_channels(drive, ("vx", "vy_ref"), "estimates are scored by")
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
     if taken := {"zero", "static_map"} & set(estimates):
@@ -160,8 +139,8 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
     reference = resampled(drive.select(channels), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
     start, stop = _in_common(reference, estimates)
     span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
-    everyone = {**estimates, **_baselines(reference, start, stop)}
-    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in everyone.items()}
+    candidates = {**estimates, **_baselines(reference, start, stop)}
+    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in candidates.items()}
     ranking = rank({name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()}, reference.rate_hz)
     titles = {name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0]) for name in ranking.order}
     verdict = verdict_sentences(ranking, titles, "this recording")
@@ -177,21 +156,15 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
     """Start and end [s] of the part in which every estimate and the reference have values."""
-    known = np.flatnonzero(np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"]))
-    if not len(known):
-        raise DataError(f"recording '{reference.id}': channel 'vy_ref' has no sample")
-    start, stop = float(reference.time[known[0]]), float(reference.time[known[-1]])
-    for name, estimate in estimates.items():
-        there = np.flatnonzero(np.isfinite(estimate["vy"]))
-        if not len(there):
-            raise DataError(f"'{name}' has no estimate at all")
-        start, stop = max(start, float(estimate.time[there[0]])), min(stop, float(estimate.time[there[-1]]))
-        if stop - start < LEAST_SECONDS:
-            raise DataError(
-                f"'{name}' goes from {estimate.time[there[0]]:.6g} to {estimate.time[there[-1]]:.6g} s, which leaves less than "
-                f"{LEAST_SECONDS:g} s in common with the recording ({reference.time[known[0]]:.6g} to {reference.time[known[-1]]:.6g} s); "
-                f"are the clocks the same?"
-            )
+    known = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
+    times = {"the reference": reference.time[known]}
+    times |= {f"'{name}'": estimate.time[np.isfinite(estimate["vy"])] for name, estimate in estimates.items()}
+    if empty := [name for name, own in times.items() if not len(own)]:
+        raise DataError(f"{empty[0]} has no value at all")
+    start, stop = max(float(own[0]) for own in times.values()), min(float(own[-1]) for own in times.values())
+    if stop - start < LEAST_SECONDS:
+        ranges = ", ".join(f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items())
+        raise DataError(f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?")
     return start, stop
 
 

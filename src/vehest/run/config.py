@@ -55,8 +55,10 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Named:
+    """A group of options that the schema of its ``name`` checks further."""
+
     __pydantic_config__ = FURTHER_KEYS
-    name: str  # whose schema checks the other options
+    name: str
 
 
 @dataclass(frozen=True)

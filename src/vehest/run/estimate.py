@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from vehest.run.calibrate import trust_of
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.printing import complain, note
+from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
@@ -68,27 +67,19 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
         return given
     if name == PRETRAINED:
         return pretrained_folder()
-    models = sorted(output.glob("train/[!.]*"))
-    found = sorted(
-        (folder for folder in models if folder.is_dir() and folder.match(f"{given.name}*")), key=lambda folder: -folder.stat().st_mtime_ns
-    )
+    models = [folder for folder in sorted(output.glob("train/[!.]*")) if folder.is_dir()]
+    found = [folder for folder in models if folder.match(f"{given.name}*")]
     if not found:
-        known = [folder.name for folder in models]
-        listed = f" (there are: {', '.join(known[:8])}{', …' if len(known) > 8 else ''})" if known else "; train one first"
-        raise MissingError(f"there is no model '{name}', neither a folder nor in '{output / 'train'}'{listed}")
+        known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
+        raise MissingError(f"there is no model '{name}', neither a folder nor in {known}; train one first")
+    newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
     if len(found) > 1:
-        others = f"{', '.join(folder.name for folder in found[1:4])}{f' and {len(found) - 4} more' if len(found) > 4 else ''}"
-        say(f"'{name}' is taken for {found[0].name}, the newest; it could also be {others}")
-    return found[0]
+        say(f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}")
+    return newest
 
 
 def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Path, Estimator, Trust | None]:
-    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration.
-
-    Raises:
-        MissingError: there is none.
-        DataError: its files are damaged.
-    """
+    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration."""
     folder = find_model(name, output, say)
     model = load_model(folder)
     model.preparation = preparation_of(folder)
@@ -96,15 +87,12 @@ def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Pat
 
 
 def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> dict[str, Any]:
-    """Run a model on a recording and write the estimate.
+    """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
 
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
         out: table to write.
         strict: whether findings in the channels are an error; else they are printed as warnings.
-
-    Returns:
-        Figures of the estimate and a verdict.
 
     Raises:
         ConfigurationError: words or the file to write make no sense.
@@ -116,8 +104,6 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
     _check_table_name(out)
-    if out.is_dir():
-        raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     config = compose_config("estimate", overrides)
@@ -133,19 +119,18 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     for finding in findings:
         complain(f"warning: {finding}")
     write_estimate_table(result, out)
-    figures = {"verdict": _verdict(result, drive, trust), "findings": findings}
-    figures |= {"note": pretrained_note()} if name == PRETRAINED else {}
-    return {"out": str(out), "model": PRETRAINED if name == PRETRAINED else str(folder), **_summary(result), **figures}
+    return {
+        "out": str(out),
+        "model": PRETRAINED if name == PRETRAINED else str(folder),
+        **_summary(result),
+        "verdict": _verdict(result, drive, trust),
+        "findings": findings,
+        **({"note": pretrained_note()} if name == PRETRAINED else {}),
+    }
 
 
 def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model.
-
-    Raises:
-        MissingError: there is no model.
-        DataError: its files are damaged.
-        ConfigurationError: another stage made it.
-    """
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != TRAIN:
@@ -153,10 +138,9 @@ def model_artefact(folder: Path) -> Artefact:
         return artefact
     about = read_description(folder)
     outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
-    label = PRETRAINED if folder == pretrained_folder() else folder.resolve().name
     key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
     config = {"estimator": dict(about.settings), "train": [], "validation": []}
-    return Artefact(folder, TRAIN, label, key, "complete", outputs, config, {}, skipped=True)
+    return Artefact(folder, TRAIN, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True)
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
@@ -167,10 +151,7 @@ def preparation_of(model_folder: Path) -> dict[str, Any]:
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
     """Read a recording from its file, a table unless the data set says otherwise, as conf/estimate.yaml and overrides describe it.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be used as it is.
-        ConfigurationError: the file is of another format than the data set's.
+    Raises what `read_single` does, and `DataError` where a check finds an error that the data set does not accept.
     """
     config = compose_config("estimate", overrides)
     dataset = config["dataset"] if references else _without_references(config["dataset"])
@@ -194,11 +175,7 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
 
 
 def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
-    """Findings of the checks in the channels that a model reads, the gravest first.
-
-    Raises:
-        DataError: these channels contradict each other in sign or unit, so that no estimate can be right.
-    """
+    """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
     read = [name for name in model.channels if name in recording]
     findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
     for finding in findings:
@@ -221,37 +198,27 @@ def estimate_recording(model: Estimator, recording: Recording, trust: Trust | No
 
 
 def prepared_recording(model: Estimator, recording: Recording) -> Recording:
-    """The channels that a model reads, at its rate; see `estimate_recording`.
-
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
-    """
-    for name in model.channels:
-        if name not in recording:
-            raise DataError(
-                f"recording '{recording.id}' has no channel '{name}', which '{model.name}' needs (it reads {', '.join(model.channels)})"
-            )
+    """The channels that a model reads, at its rate; raises as `estimate_recording` does."""
+    require_channels(recording, model.channels, f"'{model.name}' needs (it reads {', '.join(model.channels)})")
     return resampled(recording.select(model.channels), model.settings.rate_hz, model.preparation)
 
 
-def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
-    """The estimate, unless it is empty.
+def require_channels(recording: Recording, channels: Sequence[str], use: str) -> None:
+    """Raises `DataError` where a recording lacks a channel that is needed for a use."""
+    for name in channels:
+        if name not in recording:
+            raise DataError(f"recording '{recording.id}' has no channel '{name}', which {use}")
 
-    Raises:
-        DataError: the recording is too short.
-    """
+
+def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
+    """The estimate; raises `DataError` where it is empty, since the recording is too short."""
     if np.isnan(estimate["vy"]).all():
         raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
     return estimate
 
 
 def write_estimate_table(estimate: Estimate, path: Path) -> None:
-    """Write an estimate as Parquet or CSV, by the file's ending.
-
-    Raises:
-        ConfigurationError: another ending.
-        MissingError: it cannot be written.
-    """
+    """Write an estimate as Parquet or CSV, by the file's ending."""
     _check_table_name(path)
     if path.suffix.lower() == ".parquet":
         write_estimate(estimate, path)
@@ -271,7 +238,7 @@ def _check_table_name(path: Path) -> None:
 
 def _summary(estimate: Estimate) -> dict[str, Any]:
     """Figures of an estimate, for people and scripts."""
-    degrees = [math.degrees(value) for value in estimate["sideslip"][~np.isnan(estimate["sideslip"])]] or [math.nan]
+    degrees = np.degrees(estimate["sideslip"])
     figures: dict[str, Any] = {
         "recording": estimate.recording_id,
         "estimator": estimate.estimator,
@@ -279,7 +246,7 @@ def _summary(estimate: Estimate) -> dict[str, Any]:
         "samples": len(estimate),
         "estimated": int((~np.isnan(estimate["vy"])).sum()),
         "quantities": {name: QUANTITIES[name] for name in estimate.channels},
-        "sideslip_deg": {"min": round(min(degrees), 3), "max": round(max(degrees), 3)},
+        "sideslip_deg": {"min": round(float(np.fmin.reduce(degrees)), 3), "max": round(float(np.fmax.reduce(degrees)), 3)},
     }
     if "band_sideslip" in estimate.channels:
         half = np.degrees(estimate["band_sideslip"][~np.isnan(estimate["band_sideslip"])])

@@ -105,6 +105,8 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class EvaluateJob:
+    """The evaluation of one model."""
+
     how: Evaluation
     model: Artefact
     calibration: Artefact | None = None

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span
@@ -16,7 +15,7 @@ from vehest.evaluation.metrics import accuracy, score
 from vehest.run.calibrate import Stretch, learn_trust
 from vehest.run.config import compose_config
 from vehest.run.downsample import resampled
-from vehest.run.estimate import find_model, prepared_recording, require_estimate
+from vehest.run.estimate import find_model, prepared_recording, require_channels, require_estimate
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.train import new_estimator
 from vehest.trust.record import Trust
@@ -34,9 +33,7 @@ def train_on(
     model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
     model.seed(seed)
     for recording in (*train, *validation):
-        for channel in (*model.channels, "vy_ref"):
-            if channel not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{channel}', which training '{model.name}' needs")
+        require_channels(recording, (*model.channels, "vy_ref"), f"training '{model.name}' needs")
     parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
     model.fit(FitData(*parts), settings)
     learnt, stopped = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in parts)
@@ -49,8 +46,7 @@ def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, flo
     protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
     parts = []
     for recording in recordings:
-        if "vy_ref" not in recording:
-            raise DataError(f"recording '{recording.id}' has no channel 'vy_ref' to score an estimate against")
+        require_channels(recording, ["vy_ref"], "estimates are scored by")
         needed = prepared_recording(model, recording.without_references())
         estimate = require_estimate(model, recording, model.estimate([needed])[0])
         parts.append(score(estimate, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))

@@ -6,8 +6,10 @@ data set -> source -> recording -> checks -> one Parquet file each
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,13 +36,7 @@ PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a 
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """The artefact of an ingest.
-
-    Raises:
-        MissingError: the raw files are not there.
-        ConfigurationError: the data set's configuration makes no sense.
-        DataError: a recording's name cannot be a file's.
-    """
+    """The artefact of an ingest; raises `VehestError` where raw files are missing or the data set's configuration makes no sense."""
     dataset: Mapping[str, Any] = config["dataset"]
     if missing := missing_keys(dict(dataset)):
         raise ConfigurationError(f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set")
@@ -91,8 +87,8 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         else:
             done += 1
             report(done, len(ids), "")
-    if not any(parts.iterdir() if parts.is_dir() else ()):
-        remove(parts)
+    with suppress(OSError):
+        parts.rmdir()  # unless something was made
     stop.raise_if_requested()
     if failures:
         error = DataError(failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""))
@@ -109,11 +105,7 @@ def _make_part(
 
 
 def _make(source: Source, recording_id: str, folder: Path) -> None:
-    """Read, check and write a recording.
-
-    Raises:
-        DataError: it is unusable, or a check finds an error that the data set does not accept.
-    """
+    """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
     recording = source.read(recording_id)
     for finding in checks_of_recording(recording):
         if finding.level == "error" and finding.check not in (source.dataset.get("accept") or []):
@@ -149,8 +141,7 @@ def recording_file(recording_id: str) -> str:
     Raises:
         DataError: the id cannot be a file's name, or would lead elsewhere.
     """
-    odd = any(character in "/\\" or ord(character) < 32 for character in recording_id)
-    if odd or not recording_id or recording_id.startswith(".") or len(os.fsencode(recording_id)) > LONGEST_ID:
+    if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id) or len(os.fsencode(recording_id)) > LONGEST_ID:
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
             f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
@@ -177,13 +168,12 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
     Raises:
         DataError: a recording is damaged.
     """
-    hours = 0.0
-    flagged: dict[str, list[str]] = {"spun": [], "left_road": [], "not_completed": []}
-    for name in sorted(ingested.outputs):
-        recording = read_recording(ingested.folder / name, ["vx"])
-        flags: Mapping[str, Any] = recording.provenance.get("flags", {})
-        hours += len(recording) / recording.rate_hz / 3600.0
-        for flag, holds in (("spun", flags.get("spun")), ("left_road", flags.get("left_road")), ("not_completed", not flags["completed"])):
-            if holds:
-                flagged[flag].append(recording.id)
-    return {"drives": len(ingested.outputs), "hours": hours, **flagged}
+    drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
+    flags = {drive.id: drive.provenance["flags"] for drive in drives}
+    return {
+        "drives": len(drives),
+        "hours": sum(len(drive) / drive.rate_hz for drive in drives) / 3600.0,
+        "spun": [name for name, own in flags.items() if own["spun"]],
+        "left_road": [name for name, own in flags.items() if own["left_road"]],
+        "not_completed": [name for name, own in flags.items() if not own["completed"]],
+    }

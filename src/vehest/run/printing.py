@@ -82,14 +82,14 @@ def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | Non
 def _print_table(shown: TerminalTable) -> None:
     """Print a table, 160 characters wide without a terminal; a title after an empty line."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
     if shown.title:
         echo("")
         echo(shown.title)
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(*(Text(printable(name)) for name in shown.header), box=None, header_style="bold", pad_edge=False)
+    table = Table(*(Column(Text(printable(name))) for name in shown.header), box=None, header_style="bold", pad_edge=False)
     for row in shown.rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     with console.capture() as captured:
