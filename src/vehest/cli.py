@@ -50,7 +50,7 @@ def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, 
     """Completion of a command's overrides."""
 
     def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-        from vehest.run.completion import complete_override
+        from vehest.run.config_files import complete_override
 
         given = [str(word) for word in context.params.get("overrides") or []]
         if context.params.get("check"):

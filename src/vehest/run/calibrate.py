@@ -119,9 +119,6 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
 
 def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
     """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
-    for stretch in stretches:
-        if "vy_ref" not in stretch.recording:
-            raise DataError(f"recording '{stretch.recording.id}' has no channel 'vy_ref' to calibrate bands by")
     found: list[Piece] = []
     estimates = estimator.estimate([stretch.recording.without_references() for stretch in stretches])
     for stretch, estimate in zip(stretches, estimates, strict=True):

@@ -29,7 +29,7 @@ from vehest.evaluation.ranking import rank
 from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.estimate import estimate_recording, open_model, read_table, require_channels
+from vehest.run.estimate import estimate_recording, open_model, read_table
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
@@ -130,13 +130,12 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
         DataError: no reference, too little in common, or gaps within what is in common.
         ConfigurationError: there is nothing to compare, or a name is that of a baseline.
     """
-    require_channels(drive, ("vx", "vy_ref"), "estimates are scored by")
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
     if taken := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
-    channels = [name for name in ("vx", "vy_ref", "ay", "yaw_rate") if name in drive]
-    reference = resampled(drive.select(channels), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
+    further = [name for name in ("ay", "yaw_rate") if name in drive]
+    reference = resampled(drive.select(["vx", "vy_ref", *further]), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
     start, stop = _in_common(reference, estimates)
     span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
     candidates = {**estimates, **_baselines(reference, start, stop)}
@@ -170,23 +169,22 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
     """v = 0, and the static map where the car turns enough to fit one."""
+    found = {"zero": np.zeros(len(reference))}
+    if "yaw_rate" in reference:
+        with suppress(DataError):
+            found["static_map"] = _held_out_map(reference, start, stop)
+    clock = (reference.rate_hz, reference.start_time)
+    return {name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)}) for name, vy in found.items()}
 
-    def made(name: str, vy: FloatArray) -> Estimate:
-        return Estimate(reference.id, name, reference.rate_hz, reference.start_time, {"vy": vy, "sideslip": np.zeros_like(vy)})
 
-    vy = np.zeros(len(reference))
-    zero = {"zero": made("zero", vy)}
-    if "yaw_rate" not in reference:
-        return zero
-    middle, vy = 0.5 * (start + stop), vy.copy()
+def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
+    """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
+    middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
     for fitted, held_out in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
         kept = {name: values[clean] for name, values in part.channels.items()}
         model = StaticMap(StaticMapSettings(reference.rate_hz))
-        try:
-            model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
-        except DataError:
-            return zero
+        model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
         vy[held_out] = model.lateral_velocity({name: reference[name][held_out] for name in model.channels})
-    return zero | {"static_map": made("static_map", vy)}
+    return vy

@@ -167,7 +167,7 @@ def _parsed(text: str) -> Override:
 
 def count(overrides: Sequence[str]) -> int:
     """Number of combinations that `expand` gives; of one override at most ``limits.jobs`` + 1 values count."""
-    return math.prod(len(_values(override)) for override in parse(overrides))
+    return math.prod(map(len, map(_values, parse(overrides))))
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -177,7 +177,7 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
         ConfigurationError: bad syntax, values that cannot be counted, or more combinations than ``limits.jobs``.
     """
     check_jobs(count(overrides), "these overrides stand")
-    return [list(job) for job in product(*(_values(override) for override in parse(overrides)))]
+    return [list(job) for job in product(*map(_values, parse(overrides)))]
 
 
 def _values(override: Override) -> list[str]:

@@ -180,9 +180,8 @@ def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -
     findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            raise DataError(
-                f"recording '{recording.id}': channels contradict each other: {finding.message} (or dataset.accept=[{finding.check}])"
-            )
+            told = f"channels contradict each other: {finding.message}"
+            raise DataError(f"recording '{recording.id}': {told} (or dataset.accept=[{finding.check}])")
     return [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
 
 
@@ -199,15 +198,7 @@ def estimate_recording(model: Estimator, recording: Recording, trust: Trust | No
 
 def prepared_recording(model: Estimator, recording: Recording) -> Recording:
     """The channels that a model reads, at its rate; raises as `estimate_recording` does."""
-    require_channels(recording, model.channels, f"'{model.name}' needs (it reads {', '.join(model.channels)})")
     return resampled(recording.select(model.channels), model.settings.rate_hz, model.preparation)
-
-
-def require_channels(recording: Recording, channels: Sequence[str], use: str) -> None:
-    """Raises `DataError` where a recording lacks a channel that is needed for a use."""
-    for name in channels:
-        if name not in recording:
-            raise DataError(f"recording '{recording.id}' has no channel '{name}', which {use}")
 
 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:

@@ -64,6 +64,7 @@ TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
 HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
 COLUMNS = (*HEAD, "metric", "value", "unit", "low", "high")
+ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
@@ -246,7 +247,7 @@ def _rows_under_faults(
     score, rate_hz = partial(job.score, spans), job.how.protocol.rate_hz
     for fault in job.how.faults:
         for subset, own in errors_under(fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle).items():
-            rows += _rows(head, own, units=UNITS_UNDER_FAULT, subset=subset, condition=fault.condition)
+            rows += _rows(head, own, subset=subset, condition=fault.condition)
     return rows
 
 
@@ -265,14 +266,13 @@ def _rows(
     head: Mapping[str, Any],
     figures: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]] | None = None,
-    units: Mapping[str, str] = UNITS,
     **columns: str,
 ) -> list[dict[str, Any]]:
     """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
     rows = []
     for metric, value in figures.items():
         low, high = (repr(float(end)) for end in intervals[metric]) if intervals and metric in intervals else ("", "")
-        row = {"metric": metric, "value": repr(float(value)), "unit": units[metric], "low": low, "high": high}
+        row = {"metric": metric, "value": repr(float(value)), "unit": ALL_UNITS[metric], "low": low, "high": high}
         rows.append({**head, **columns, **row})
     return rows
 

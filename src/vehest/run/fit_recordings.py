@@ -15,7 +15,7 @@ from vehest.evaluation.metrics import accuracy, score
 from vehest.run.calibrate import Stretch, learn_trust
 from vehest.run.config import compose_config
 from vehest.run.downsample import resampled
-from vehest.run.estimate import find_model, prepared_recording, require_channels, require_estimate
+from vehest.run.estimate import find_model, prepared_recording, require_estimate
 from vehest.run.evaluate import protocol_from_config
 from vehest.run.train import new_estimator
 from vehest.trust.record import Trust
@@ -32,8 +32,6 @@ def train_on(
     settings: Any = settings_from_config(model.training_type, training, "training")
     model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
     model.seed(seed)
-    for recording in (*train, *validation):
-        require_channels(recording, (*model.channels, "vy_ref"), f"training '{model.name}' needs")
     parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
     model.fit(FitData(*parts), settings)
     learnt, stopped = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in parts)
@@ -46,7 +44,6 @@ def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, flo
     protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
     parts = []
     for recording in recordings:
-        require_channels(recording, ["vy_ref"], "estimates are scored by")
         needed = prepared_recording(model, recording.without_references())
         estimate = require_estimate(model, recording, model.estimate([needed])[0])
         parts.append(score(estimate, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
