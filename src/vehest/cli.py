@@ -189,14 +189,14 @@ def ingest(
     jobs: Jobs = None,
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
-    from vehest.run.download import download_files
+    from vehest.run.ingest import download_files
     from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
         if download:
-            download_files(config, runner)
+            download_files(config, runner.messages, dry_run=dry_run)
         made = runner.ingest(config)
     emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
 

@@ -35,16 +35,10 @@ WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 
-Write = Callable[[Path], None]
-"""Fills the folder of an artefact."""
-
-
-def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path) -> tuple[StagePlan, Write] | None:
-    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range.
-
-    Raises:
-        DataError: the split names a recording that the data set does not have.
-    """
+def plan_calibrate(
+    model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path
+) -> tuple[StagePlan, Callable[[Path], None]] | None:
+    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range."""
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
@@ -138,8 +132,11 @@ def calibration_figures(folder: Path) -> dict[str, float]:
     bands = read_trust(folder).bands
     if bands is None:
         return {}
-    blocks = {"calibration_blocks": float(bands.n_blocks), "calibration_blocks_effective": bands.sideslip.effective_blocks}
-    return blocks | {"calibration_seconds": bands.seconds}
+    return {
+        "calibration_blocks": float(bands.n_blocks),
+        "calibration_blocks_effective": bands.sideslip.effective_blocks,
+        "calibration_seconds": bands.seconds,
+    }
 
 
 def trust_of(model_folder: Path, output: Path) -> Trust | None:

@@ -44,6 +44,7 @@ SPELLINGS = {
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 LEAST_SECONDS = 5.0
+RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     β is there, v = u tan β with the recording's u.
 
     Raises:
-        MissingError: there is no such file.
         DataError: it has neither v nor β, or no time, or cannot be read.
     """
     if file.suffix == ".parquet":
@@ -121,7 +121,7 @@ def _unit_in(name: str) -> str | None:
     return written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
 
 
-def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_hz: float = 20.0) -> ComparedFiles:
+def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> ComparedFiles:
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
@@ -135,7 +135,7 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
     if taken := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
     further = [name for name in ("ay", "yaw_rate") if name in drive]
-    reference = resampled(drive.select(["vx", "vy_ref", *further]), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
+    reference = resampled(drive.select(["vx", "vy_ref", *further]), min(RATE_HZ, drive.rate_hz), {"method": "polyphase", "transforms": []})
     start, stop = _in_common(reference, estimates)
     span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
     candidates = {**estimates, **_baselines(reference, start, stop)}

@@ -171,11 +171,7 @@ def count(overrides: Sequence[str]) -> int:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """All combinations of overrides with several values, the last one varying fastest.
-
-    Raises:
-        ConfigurationError: bad syntax, values that cannot be counted, or more combinations than ``limits.jobs``.
-    """
+    """All combinations of overrides with several values, the last one varying fastest; `ConfigurationError` above ``limits.jobs``."""
     check_jobs(count(overrides), "these overrides stand")
     return [list(job) for job in product(*map(_values, parse(overrides)))]
 

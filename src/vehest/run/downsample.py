@@ -35,11 +35,7 @@ def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path
 
 
 def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, Any]) -> Recording:
-    """A recording at another rate, after the transforms of a preparation and by its method.
-
-    Raises:
-        DataError: it is sampled more slowly.
-    """
+    """A recording, after the transforms of a preparation and by its method, at a rate that is no higher; else raises `DataError`."""
     if recording.rate_hz < rate_hz * (1 - 1e-9):
         raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed")
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):

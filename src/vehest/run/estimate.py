@@ -186,11 +186,7 @@ def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -
 
 
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`).
-
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
-    """
+    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
     needed = prepared_recording(model, recording)
     estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_other_vehicle(trust, recording))
     return require_estimate(model, recording, estimate)

@@ -76,11 +76,7 @@ class FaultSettings:
 
 
 def faults_of(config: Config) -> tuple[FaultSettings, ...]:
-    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``.
-
-    Raises:
-        ConfigurationError: a fault that makes no sense, or two of one name.
-    """
+    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
     if not isinstance(listed, list) or not all(isinstance(entry, dict) and entry.get("kind") in kinds for entry in listed):
@@ -121,11 +117,7 @@ def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ..
 
 
 def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]) -> None:
-    """Check that all scored recordings have the faulty channels; no samples are read.
-
-    Raises:
-        ConfigurationError: one of them lacks one.
-    """
+    """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
     spans = [span for spans in (split.validation, *split.tests.values()) for span in spans] if faults else []
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
         held = stored_contents(recording_file(data[dataset], Span(dataset, recording))).channels

@@ -1,6 +1,6 @@
 """First stage: raw files, or a simulation, to recordings in the store.
 
-data set -> source -> recording -> checks -> one Parquet file each
+data set -> its files, fetched where they are missing -> source -> recording -> checks -> one Parquet file each
 """
 
 from __future__ import annotations
@@ -20,10 +20,12 @@ from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.config import Config, compose_config, key_of, missing_keys
+from vehest.run.config_files import choices
+from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
 from vehest.run.locks import held
-from vehest.run.signals import StopSignals
+from vehest.run.signals import DryRunStop, StopSignals
 from vehest.sources.base import SIMULATED, Source, open_source, source_class
 from vehest.training.context import Progress
 
@@ -59,10 +61,6 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     """Read every recording, check it, and write it into ``folder``.
 
     Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
-
-    Raises:
-        DataError: a recording cannot be used as it is.
-        Stopped: a signal came.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
@@ -136,11 +134,7 @@ def _parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store: its name is the id itself, by which splits and later stages find it.
-
-    Raises:
-        DataError: the id cannot be a file's name, or would lead elsewhere.
-    """
+    """The file of a recording in the store, by its id; raises `DataError` where that cannot be a file's name or would lead elsewhere."""
     if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id) or len(os.fsencode(recording_id)) > LONGEST_ID:
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
@@ -177,3 +171,43 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
         "left_road": [name for name, own in flags.items() if own["left_road"]],
         "not_completed": [name for name, own in flags.items() if not own["completed"]],
     }
+
+
+def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
+    """Fetch missing files of a data set, and record or compare the checksums of the others; errors as of `Download.fetch`.
+
+    Raises:
+        ConfigurationError: the data set names no source of its files.
+        DryRunStop: in a dry run, if a file would have to be fetched.
+    """
+    from vehest.sources.download import download_of
+
+    source = open_source(config["dataset"])
+    if source.dataset.get("download") is None:
+        known = [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]
+        raise ConfigurationError(
+            f"data set '{source.name}' does not say where its files can be fetched from (download); "
+            f"data sets that do: {', '.join(known) or 'none'}"
+        )
+    download = download_of(source)
+    if dry_run:
+        for name in download.missing():
+            messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
+        if download.missing():
+            messages.line("plan", "ingest", source.name, "then")
+            raise DryRunStop
+        return
+    with messages.bars() as bars:
+
+        def progress(name: str, done: int, total: int | None) -> None:
+            bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
+
+        for file in download.fetch(progress):
+            went_on = f", went on after {file.resumed_at / 1e6:.1f} MB" if file.resumed_at else ""
+            words = {
+                "matched": "is there, with the recorded checksum",
+                "recorded": f"was there; its checksum is now recorded: sha256 {file.sha256}",
+                "fetched": f"{file.size / 1e6:.1f} MB{went_on}, sha256 {file.sha256}",
+            }
+            bars.close(f"download {file.name}")
+            messages.line("skip" if file.what == "matched" else "done", "download", file.name, words[file.what])

@@ -111,11 +111,7 @@ def has_to_compile(estimator: str) -> bool:
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone.
-
-    Raises:
-        DataError: the recordings do not fit the estimator.
-    """
+    """Train the jobs of one group together, each as if it were alone; raises `DataError` where recordings do not fit the estimator."""
     first, members = jobs[0], [new_estimator(job.estimator) for job in jobs]
     for member, job in zip(members, jobs, strict=True):
         member.seed(job.seed)
