@@ -30,7 +30,7 @@ from vehest.data.limits import Limits, check_limit, current_limits, limits_from_
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import first_line
 from vehest.data.transforms import Preparation
-from vehest.run.config_files import GROUPS, choices, local_conf, packaged_conf, papers_conf
+from vehest.run.config_files import GROUPS, choices, conf_folders, packaged_conf
 
 Config = dict[str, Any]
 
@@ -86,10 +86,10 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
     """Makes Hydra search ./conf before the packaged folder, and the folder of the papers' studies last."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        folder = local_conf()
-        if folder is not None:
+        *local, _, papers = conf_folders()
+        for folder in local:
             search_path.prepend("local", folder.resolve().as_uri())
-        search_path.append("papers", papers_conf().as_uri())
+        search_path.append("papers", papers.as_uri())
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:

@@ -18,11 +18,6 @@ def packaged_conf() -> Path:
     return _packaged("conf")
 
 
-def papers_conf() -> Path:
-    """The conf folder of the papers' studies: splits that one of them alone uses."""
-    return Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"
-
-
 def packaged_pipelines() -> Path:
     """The pipelines folder that came with vehest."""
     return _packaged("pipelines")
@@ -35,15 +30,11 @@ def _packaged(name: str) -> Path:
     return inside if inside.is_dir() else package.parents[1] / name
 
 
-def local_conf() -> Path | None:
-    """./conf, if there is one and it is not the packaged folder itself."""
-    folder = Path("conf")
-    return folder if folder.is_dir() and folder.resolve() != packaged_conf().resolve() else None
-
-
 def conf_folders() -> list[Path]:
-    """Folders of configuration, the first one searched first: ./conf, the packaged folder, that of the papers' studies."""
-    return [folder for folder in (local_conf(), packaged_conf(), papers_conf()) if folder is not None]
+    """Folders of configuration, the first one searched first: ./conf, if there is one, the packaged folder, that of the papers' studies."""
+    local, packaged = Path("conf"), packaged_conf()
+    own = [local] if local.is_dir() and local.resolve() != packaged.resolve() else []
+    return [*own, packaged, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
 
 
 def conf_text(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Runs a trained model on a new recording that has no reference channels.
+"""Runs a trained model on a new recording that has no reference channels; trains and scores models on recordings of Python.
 
 model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,17 +22,22 @@ from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
+from vehest.data.schema import settings_from_config
+from vehest.data.splits import Span
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
-from vehest.estimators.base import Estimator
+from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
+from vehest.evaluation.metrics import accuracy, score
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
-from vehest.run.calibrate import trust_of
+from vehest.run.calibrate import Stretch, learn_trust, trust_of
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
+from vehest.run.evaluate import protocol_from_config
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
+from vehest.run.train import new_estimator
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict
@@ -254,3 +260,32 @@ def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> s
     valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
     outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
     return f"{outside}; {valid}" if outside else valid
+
+
+def train_on(
+    name: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str], seed: int
+) -> tuple[Estimator, Trust]:
+    """Fit an estimator as conf/train.yaml and overrides describe it, and calibrate it; see `vehest.api.train`."""
+    config = compose_config("train", [f"estimator={name}", *overrides])
+    model, training = new_estimator(config["estimator"]), config["training"]
+    if training.get("start_from") is not None:
+        training["start_from"] = str(find_model(str(training["start_from"]), Path(config["output"]), warnings.warn))
+    settings: Any = settings_from_config(model.training_type, training, "training")
+    model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
+    model.seed(seed)
+    parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
+    model.fit(FitData(*parts), settings)
+    learnt, stopped = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in parts)
+    return model, learn_trust(model, learnt, stopped)
+
+
+def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
+    """Metrics of a model on whole recordings under the protocol of conf/eval.yaml; see `vehest.api.score`."""
+    evaluation = compose_config("eval")["evaluation"]
+    protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
+    parts = []
+    for recording in recordings:
+        needed = prepared_recording(model, recording.without_references())
+        estimate = require_estimate(model, recording, model.estimate([needed])[0])
+        parts.append(score(estimate, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
+    return accuracy(parts)
