@@ -63,10 +63,7 @@ def pretrained_note() -> str:
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
 
-    Of several models the newest is taken, with a remark to ``say``.
-
-    Raises:
-        MissingError: there is none.
+    Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is none.
     """
     given = Path(name)
     if given.is_dir():
@@ -101,9 +98,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         strict: whether findings in the channels are an error; else they are printed as warnings.
 
     Raises:
-        ConfigurationError: words or the file to write make no sense.
-        MissingError: there is no such model or recording.
-        DataError: the recording cannot be used.
+        VehestError: model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
     name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]

@@ -34,9 +34,6 @@ VERSION = "1"
 NONE = {"name": "none"}
 DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 
-Piece = tuple[Span, Recording, dict[str, float] | None]
-"""A range or sequence, its samples with a warm-up before it, and the state to start from, if any."""
-
 
 def code_under_faults(code: str) -> str:
     """Version of an evaluation under faults, from that without them."""
@@ -79,13 +76,15 @@ def faults_of(config: Config) -> tuple[FaultSettings, ...]:
     """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
     listed = config.get("faults") or []
     kinds = [name for name in choices("fault") if name != NONE["name"]]
-    if not isinstance(listed, list) or not all(isinstance(entry, dict) and entry.get("kind") in kinds for entry in listed):
+    if not isinstance(listed, list) or not all(isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed):
         raise ConfigurationError(
             "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]; "
             f"kinds: {', '.join(kinds)}"
         )
-    bases = {kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(entry["kind"] for entry in listed)}
-    found = [_settings({**bases[entry["kind"]], **{key: value for key, value in entry.items() if key != "kind"}}) for entry in listed]
+    named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
+    bases = {kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(named)}
+    own = [{key: value for key, value in entry.items() if key != "kind"} for entry in listed]
+    found = [_settings(bases[kind] | changes) for kind, changes in zip(named, own, strict=True)]
     chosen = chosen_fault(config)
     return all_of([found, [] if chosen is None else [chosen]])
 
@@ -133,7 +132,7 @@ def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[
 def errors_under(
     settings: FaultSettings,
     estimator: Estimator,
-    pieces: Sequence[Piece],
+    pieces: Sequence[tuple[Span, Recording, dict[str, float] | None]],
     trust: Trust | None,
     nominal: Sequence[Scored],
     score: Callable[[list[Estimate]], list[Scored]],
@@ -142,6 +141,8 @@ def errors_under(
     other_vehicle: bool,
 ) -> dict[str, dict[str, float]]:
     """Errors of guarded estimates with a fault injected into each piece; estimates that it makes missing count as infinite.
+
+    A piece is a range or sequence, its samples with a warm-up before it, and the state to start from, if any.
 
     Returns:
         Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of bands and health where there is a trust.

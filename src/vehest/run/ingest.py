@@ -27,7 +27,6 @@ from vehest.run.launchers.local import launch
 from vehest.run.locks import held
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.sources.base import SIMULATED, Source, open_source, source_class
-from vehest.training.context import Progress
 
 STAGE = "ingest"
 VERSION = "1"
@@ -96,9 +95,7 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         _link(parts / recording_file(recording_id), folder / recording_file(recording_id))
 
 
-def _make_part(
-    dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
-) -> None:
+def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
     _make(open_source(dataset), recording_id, parts)
 
 

@@ -168,19 +168,13 @@ def summary_of_leaderboard(title: str, board: pd.DataFrame, left_out: Mapping[st
         if rows["rmse_sideslip_low"].isna().all():
             notes.append(f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner")
     figures = {"leaderboard": _records(board)} | ({"verdict": list(verdict)} if verdict else {})
-    return _summary(tables, notes, figures, left_out, verdict)
+    return _summary(tables, notes, figures, left_out)
 
 
-def _summary(
-    tables: Sequence[TerminalTable],
-    notes: Sequence[str],
-    figures: Mapping[str, Any],
-    left_out: Mapping[str, str],
-    verdict: Sequence[str] = (),
-) -> TerminalSummary:
+def _summary(tables: list[TerminalTable], notes: list[str], figures: dict[str, Any], left_out: Mapping[str, str]) -> TerminalSummary:
     missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
-    figures = {**figures, "failed": dict(left_out)} if left_out else figures
-    return TerminalSummary(tuple(tables), "\n".join([*notes, *missing, *verdict]), "report.html", json.dumps(figures))
+    shown = "\n".join([*notes, *missing, *figures.get("verdict", [])])
+    return TerminalSummary(tuple(tables), shown, "report.html", json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})))
 
 
 def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> TerminalSummary:

@@ -43,9 +43,7 @@ def replay_log(
     """Replay a log and let a model estimate; returns its figures. The options are those of ``vehest replay``.
 
     Raises:
-        ConfigurationError: options that make no sense together.
-        MissingError: log, DBC, model, bus or a package is not there.
-        DataError: log or DBC cannot be used.
+        VehestError: options make no sense together, or log, DBC, model or bus cannot be used.
     """
     bus = Bus(interface, channel, _speed(speed), _identifier(identifier))
     for path in (out, write_dbc):
