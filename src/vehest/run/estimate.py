@@ -181,8 +181,8 @@ def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -
     findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            told = f"channels contradict each other: {finding.message}"
-            raise DataError(f"recording '{recording.id}': {told} (or dataset.accept=[{finding.check}])")
+            what = f"channels contradict each other: {finding.message}"
+            raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
     return [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
 
 
