@@ -162,7 +162,7 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
     assert metrics["rmse_vy"] == pytest.approx(np.sqrt(np.mean(scored**2)), rel=1e-3)
     with pytest.raises(DataError, match="has no channel 'vy_ref'"):
         vehest.score(model, [lap.without_references()])
-    with pytest.raises(DataError, match="no channel 'vy_ref', which training 'static_map' needs"):
+    with pytest.raises(DataError, match="no channel 'vy_ref', which the fit of 'static_map' needs"):
         vehest.train("static_map", [lap.without_references()], [lap])
     with pytest.raises(ConfigurationError, match="n_hiden"):
         vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"])

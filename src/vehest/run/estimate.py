@@ -105,6 +105,8 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
     _check_table_name(out)
+    if out.is_dir():
+        raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     config = compose_config("estimate", overrides)
