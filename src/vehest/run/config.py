@@ -144,7 +144,8 @@ def _one_line(error: Exception, command: str) -> str:
         return f"unknown option '{unknown[1]}'{hint}"
     if missing := re.search(r"You must specify '([^']+)'", text):
         return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
-    return " ".join(line.strip() for line in text.splitlines()[:2])
+    key = getattr(error, "full_key", None)
+    return f"{key}: {text.splitlines()[0]}" if key else " ".join(line.strip() for line in text.splitlines()[:2])
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
