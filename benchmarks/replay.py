@@ -87,7 +87,7 @@ def soak(minutes: float, model: str) -> int:
 
     from conftest import planar_drive
     from vehest.api import load_model
-    from vehest.run.replay import ReplayWords, replay_log
+    from vehest.run.replay import replay_log
 
     torch.set_num_threads(1)
     if os.environ.get("VEHEST_DATA"):
@@ -100,10 +100,8 @@ def soak(minutes: float, model: str) -> int:
     with tempfile.TemporaryDirectory() as folder:
         drive = drive.cut(drive.start_time, drive.start_time + 60.0 * minutes / repeats)
         written = write_log(drive, Path(folder), ".blf", jitter=JITTER, lost=LOST, repeats=repeats)
-        words = ReplayWords(
-            written.log, model, written.dbc, signals=told_for(load_model(model).channels), out=Path(folder) / "estimates.csv", quiet=False
-        )
-        figures = replay_log(words)
+        signals, out = told_for(load_model(model).channels), Path(folder) / "estimates.csv"
+        figures = replay_log(written.log, model=model, dbc=written.dbc, signals=signals, out=out, quiet=False)
     row: dict[str, Any] = {
         "drive": name,
         "model": re.sub(r"-[0-9a-f]{12}$", "", Path(model).name),

@@ -17,7 +17,7 @@ import pandas as pd
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description, save_model
 from vehest.report.style import fixed
-from vehest.run.calibrate import plan_calibrate, write_calibration
+from vehest.run.calibrate import plan_calibrate
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
@@ -76,7 +76,7 @@ def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
     job = plan_calibrate(model_artefact(target), split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
     if job is None:
         raise SystemExit(f"split '{split.name}' has no validation range")
-    write_calibration(job, target)
+    job[1](target)
     write_trust(replace(read_trust(target), guard=None), target)  # samples are held to what any car's sensors do, not to simulated ones
 
 

@@ -160,9 +160,9 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
     metrics = vehest.score(model, [lap])
     scored = lap["vy_ref"][150::5]  # 20 Hz, from 1.5 s on
     assert metrics["rmse_vy"] == pytest.approx(np.sqrt(np.mean(scored**2)), rel=1e-3)
-    with pytest.raises(DataError, match="no channel 'vy_ref' to score"):
+    with pytest.raises(DataError, match="has no channel 'vy_ref'"):
         vehest.score(model, [lap.without_references()])
-    with pytest.raises(DataError, match="no channel 'vy_ref', which training 'static_map' needs"):
+    with pytest.raises(DataError, match="no channel 'vy_ref', which the fit of 'static_map' needs"):
         vehest.train("static_map", [lap.without_references()], [lap])
     with pytest.raises(ConfigurationError, match="n_hiden"):
         vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"])

@@ -21,8 +21,7 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import save_model as _save_model
-from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, write_estimate_table
-from vehest.run.fit_recordings import score_on, train_on
+from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, score_on, train_on, write_estimate_table
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust, write_trust
 from vehest.trust.verdict import reason_in_words

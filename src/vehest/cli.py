@@ -50,7 +50,7 @@ def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, 
     """Completion of a command's overrides."""
 
     def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-        from vehest.run.completion import complete_override
+        from vehest.run.config_files import complete_override
 
         given = [str(word) for word in context.params.get("overrides") or []]
         if context.params.get("check"):
@@ -188,14 +188,14 @@ def ingest(
     jobs: Jobs = None,
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
-    from vehest.run.download import download_files
+    from vehest.run.ingest import download_files
     from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
     with open_runner(config, RunOptions(force, dry_run, quiet, jobs), frozenset({"ingest"})) as runner:
         if download:
-            download_files(config, runner)
+            download_files(config, runner.messages, dry_run=dry_run)
         made = runner.ingest(config)
     emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
 
@@ -384,13 +384,29 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; written files stay.
     """
-    from vehest.run.replay import ReplayWords, replay_log
+    from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
-    words = ReplayWords(log, model, dbc, dataset, signals, speed, bus_rate, interface, channel, identifier, out, write_dbc, quiet)
     stop = StopSignals()
     with stop.installed(), stop.deferred():
-        outcome = replay_log(words, overrides or [], stop.requested, note)
+        outcome = replay_log(
+            log,
+            overrides or [],
+            stop.requested,
+            note,
+            model=model,
+            dbc=dbc,
+            dataset=dataset,
+            signals=signals,
+            speed=speed,
+            bus_rate=bus_rate,
+            interface=interface,
+            channel=channel,
+            identifier=identifier,
+            out=out,
+            write_dbc=write_dbc,
+            quiet=quiet,
+        )
     emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)

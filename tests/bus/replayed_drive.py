@@ -12,7 +12,7 @@ from can_drive import SIGNALS, write_log
 from vehest.api import estimate, load_model
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.run.replay import ReplayWords, replay_log
+from vehest.run.replay import replay_log
 
 JITTER, LOST = 0.001, 0.01
 SETTLED = 2.0  # s after the first estimate of both
@@ -64,8 +64,8 @@ def compare(model: str, drive: Recording, folder: Path, output: Path | None = No
     fitted = load_model(model, output)
     offline = estimate(fitted, drive.without_references())
     table = folder / "estimates.csv"
-    words = ReplayWords(written.log, model, written.dbc, signals=told_for(fitted.channels), speed="max", out=table)
-    figures = replay_log(words, [f"output={output}"] if output else [])
+    words = {"model": model, "dbc": written.dbc, "signals": told_for(fitted.channels)}
+    figures = replay_log(written.log, [f"output={output}"] if output else [], speed="max", out=table, **words)
     online = pd.read_csv(table).dropna(subset=["vy", "sideslip"])
     known = ~np.isnan(offline["vy"])
     begin = SETTLED + max(online["time"].iloc[0] + written.origin, offline.time[known][0])

@@ -19,7 +19,7 @@ from vehest.bus.sampling import Sample
 from vehest.bus.view import LiveView, PlainView, Shown, rows_of, view_on
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.recording import Recording
-from vehest.run.replay import ReplayWords, replay_log
+from vehest.run.replay import replay_log
 from vehest.trust.contract import GuardedStepper
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
@@ -38,7 +38,7 @@ def drive(seconds: float = 20.0) -> Recording:
 
 def replayed(written: Written, **more: Any) -> dict[str, Any]:
     words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max", **more}
-    return replay_log(ReplayWords(written.log, **words), more.pop("overrides", ()))
+    return replay_log(written.log, **words)
 
 
 def by_cantools(written: Written) -> dict[str, list[float]]:
@@ -124,8 +124,8 @@ def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path: Path
 def test_what_was_written_before_a_stop_is_kept(tmp_path: Path, speed: str) -> None:
     written = write_log(drive(), tmp_path)
     calls = iter(range(10_000))
-    words = ReplayWords(written.log, dbc=written.dbc, signals=told_for(CHANNELS), speed=speed, out=tmp_path / "out.csv")
-    figures = replay_log(words, stopped=lambda: next(calls) > 300)
+    words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "out": tmp_path / "out.csv"}
+    figures = replay_log(written.log, stopped=lambda: next(calls) > 300, speed=speed, **words)
     assert figures["stopped"]
     assert 0 < figures["samples"] < 2000
     assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]

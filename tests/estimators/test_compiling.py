@@ -13,7 +13,7 @@ import pytest
 
 import vehest
 from vehest.estimators.kernels import planar_car
-from vehest.run.compiling import has_to_compile
+from vehest.run.train import has_to_compile
 
 
 def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

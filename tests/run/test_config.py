@@ -11,9 +11,8 @@ from pathlib import Path
 import pytest
 
 from vehest.data.errors import ConfigurationError, MissingError
-from vehest.run.completion import complete_override
 from vehest.run.config import compose_config, expand
-from vehest.run.config_files import choices
+from vehest.run.config_files import choices, complete_override
 from vehest.run.study import jobs_of, read_study
 
 

@@ -71,7 +71,7 @@ def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
     with FINE.bars() as bars:
         for number in range(console.MOST_BARS + 5):
             bars.fit(f"training {number}", None)
-        assert len(bars._tasks) == console.MOST_BARS
+        assert len(bars.tasks) == console.MOST_BARS
 
 
 # Artefacts that travel

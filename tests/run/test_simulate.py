@@ -12,7 +12,7 @@ import yaml
 
 from place import Place
 from vehest.data.store import read_recording
-from vehest.run.completion import complete_override
+from vehest.run.config_files import complete_override
 from vehest.simulation.plant import compiled
 from vehest.sources.simulated import SimulatedSource
 

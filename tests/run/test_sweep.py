@@ -18,7 +18,7 @@ from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.report.heat_map import Panel, heat_map
 from vehest.run.artefacts import StagePlan
-from vehest.run.completion import complete_override
+from vehest.run.config_files import complete_override
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of

@@ -7,9 +7,10 @@ A calibration knows no evaluation's protocol, and no test range.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
 from vehest.run.train import file_digest, recording_file
-from vehest.trust.bands import Bands, Origin, Piece, band_inputs, calibrated
+from vehest.trust.bands import Origin, Piece, band_inputs, calibrated
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
@@ -34,22 +35,10 @@ WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
 
-@dataclass(frozen=True)
-class CalibrateJob:
-    """One model to calibrate on the training and validation ranges of a split."""
-
-    plan: StagePlan
-    model: Artefact
-    split: Split
-    data: Mapping[str, Artefact]
-
-
-def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path) -> CalibrateJob | None:
-    """The calibration of a model; none where a split has no validation range.
-
-    Raises:
-        DataError: the split names a recording that the data set does not have.
-    """
+def plan_calibrate(
+    model: Artefact, split: Split, data: Mapping[str, Artefact], output: Path
+) -> tuple[StagePlan, Callable[[Path], None]] | None:
+    """The calibration of a model, as `vehest.run.artefacts.make` takes it; none where a split has no validation range."""
     if not split.validation:
         return None
     spans = {"train": split.train, "validation": split.validation}
@@ -57,23 +46,24 @@ def plan_calibrate(model: Artefact, split: Split, data: Mapping[str, Artefact], 
     inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for own in spans.values() for span in own}
     config = {role: [str(span) for span in own] for role, own in spans.items()}
     code = code_of_calibration(read_description(model.folder).estimator)
-    return CalibrateJob(StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output), model, split, data)
+    plan = StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output)
+    return plan, partial(_write, model.folder, split, data)
 
 
 def code_of_calibration(estimator: str) -> str:
-    """Version of a calibration of an estimator.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """Version of a calibration of an estimator."""
     return f"calibrate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
-def write_calibration(job: CalibrateJob, folder: Path) -> None:
+def _write(model_folder: Path, split: Split, data: Mapping[str, Artefact], folder: Path) -> None:
     """Calibrate a model; write trust.yaml into ``folder``, with the reason where bands or health are missing."""
-    description, estimator = read_description(job.model.folder), load_model(job.model.folder)
-    train, validation = ([_stretch(job.data, span) for span in spans] for spans in (job.split.train, job.split.validation))
-    write_trust(learn_trust(estimator, train, validation, description.variant), folder)
+
+    def stretch(span: Span) -> Stretch:
+        recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
+        return Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe())
+
+    train, validation = ([stretch(span) for span in spans] for spans in (split.train, split.validation))
+    write_trust(learn_trust(load_model(model_folder), train, validation, read_description(model_folder).variant), folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,23 +81,23 @@ class Stretch:
         return self.recording.cut(self.start, self.recording.end_time)
 
 
-def _stretch(data: Mapping[str, Artefact], span: Span) -> Stretch:
-    recording = read_recording(recording_file(data[span.dataset], span)).cut(span.start - WARM_UP_SECONDS, span.stop)
-    return Stretch(recording, max(span.start, recording.start_time), span.dataset, span.describe())
-
-
 def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch], variant: str = "") -> Trust:
     """Bands, limits of samples and health of a fitted estimator.
 
-    Args:
-        estimator: fitted.
-        train: give scales, limits and relations between channels.
-        validation: gives factors of bands and, together with ``train``, thresholds of health.
-        variant: name in its paper.
+    Training ranges give scales, limits and relations between channels; validation ranges give factors of bands and, together with the
+    others, thresholds of health.
     """
     bands, guard, health, notes = None, None, None, []
     try:
-        bands = _bands(estimator, train, validation)
+        origin = Origin(
+            vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
+            datasets=tuple(dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)),
+            scaled_on=tuple(stretch.name for stretch in train),
+            calibrated_on=tuple(stretch.name for stretch in validation),
+            channels=tuple(estimator.channels),
+            horizon_steps=estimator.horizon_steps,
+        )
+        bands = calibrated(_pieces(estimator, train), _pieces(estimator, validation), origin)
     except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))
     try:
@@ -121,27 +111,8 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
     return Trust(About(estimator.name, variant, "; ".join(notes)), bands, guard, health)
 
 
-def _bands(estimator: Estimator, train: Sequence[Stretch], validation: Sequence[Stretch]) -> Bands:
-    origin = Origin(
-        vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
-        datasets=tuple(dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)),
-        scaled_on=tuple(stretch.name for stretch in train),
-        calibrated_on=tuple(stretch.name for stretch in validation),
-        channels=tuple(estimator.channels),
-        horizon_steps=estimator.horizon_steps,
-    )
-    return calibrated(_pieces(estimator, train), _pieces(estimator, validation), origin)
-
-
 def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
-    """Ranges after their starts with the model's estimates on them.
-
-    Raises:
-        DataError: a recording lacks a channel or the reference, or the model cannot estimate it.
-    """
-    for stretch in stretches:
-        if "vy_ref" not in stretch.recording:
-            raise DataError(f"recording '{stretch.recording.id}' has no channel 'vy_ref' to calibrate bands by")
+    """Ranges after their starts with the model's estimates on them; raises `DataError` where a recording lacks a channel."""
     found: list[Piece] = []
     estimates = estimator.estimate([stretch.recording.without_references() for stretch in stretches])
     for stretch, estimate in zip(stretches, estimates, strict=True):
@@ -157,24 +128,19 @@ def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
 
 
 def calibration_figures(folder: Path) -> dict[str, float]:
-    """Figures of a calibration for tracking; none where there are no bands.
-
-    Raises:
-        VehestError: it cannot be read.
-    """
+    """Figures of a calibration for tracking; none where there are no bands."""
     bands = read_trust(folder).bands
     if bands is None:
         return {}
-    figures = {"calibration_blocks": float(bands.n_blocks), "calibration_blocks_effective": bands.sideslip.effective_blocks}
-    return figures | {"calibration_seconds": bands.seconds}
+    return {
+        "calibration_blocks": float(bands.n_blocks),
+        "calibration_blocks_effective": bands.sideslip.effective_blocks,
+        "calibration_seconds": bands.seconds,
+    }
 
 
 def trust_of(model_folder: Path, output: Path) -> Trust | None:
-    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root or in ``output``.
-
-    Raises:
-        DataError: it is damaged.
-    """
+    """Bands, limits and health of a model: trust.yaml in its folder, else its calibration in its own output root or in ``output``."""
     if (model_folder / TRUST).is_file():
         return read_trust(model_folder)
     found = calibration_of(model_folder, output)

@@ -30,21 +30,21 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
 from vehest.run.estimate import estimate_recording, open_model, read_table
-from vehest.run.printing import TerminalTable, complain, note
-from vehest.run.terminal import SCORE_HEADER, score_cells
+from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.sources.base import read_single
 from vehest.sources.tabular import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
 SPELLINGS = {
-    "vy_ref": {"vy", "v", "v_y", "vlat", "lateralvelocity", "lateral_velocity", "v_lat", "vy_est", "vy_hat"},
-    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "sideslip_angle", "beta_est", "beta_hat", "slip_angle"},
+    "time": {"time", "t", "timestamp", "zeit"},
+    "vy_ref": {"vy", "v", "vlat", "lateralvelocity", "vyest", "vyhat"},
+    "sideslip_ref": {"sideslip", "beta", "β", "slip", "slipangle", "sideslipangle", "betaest", "betahat"},
 }
-"""Channel that a quantity is read as -> how a table may call it."""
-USUAL_UNITS = {"vy_ref": "m/s", "sideslip_ref": "rad"}
-TIMES = {"time", "t", "timestamp", "zeit"}
+"""Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
+USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 LEAST_SECONDS = 5.0
+RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,7 @@ class ComparedFiles:
 
 
 def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
-    """Score estimates of other tools, and models, on one recording.
-
-    Raises:
-        ConfigurationError: two estimates have the same name.
-        MissingError: a file or model is not there.
-        DataError: a file cannot be used.
-    """
+    """Score estimates of other tools, and models, on one recording; raises `VehestError` where a file or model cannot be used."""
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
     config = compose_config("estimate", overrides)
@@ -96,41 +90,27 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     β is there, v = u tan β with the recording's u.
 
     Raises:
-        MissingError: there is no such file.
         DataError: it has neither v nor β, or no time, or cannot be read.
     """
     if file.suffix == ".parquet":
         with suppress(DataError):  # a table of another tool
             return read_estimate(file)
     names = column_names(file, {})
-    time = _column_like(names, TIMES)
-    found = {channel: _column_like(names, spellings) for channel, spellings in SPELLINGS.items()}
-    channel = next((channel for channel, column in found.items() if column is not None), None)
+    found: dict[str, dict[str, str]] = {}
+    for quantity, spellings in SPELLINGS.items():
+        for name in names:
+            if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
+                found.setdefault(quantity, {"column": name, "unit": _unit_in(name) or USUAL_UNITS[quantity]})
+    time, channel = found.pop("time", None), next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
-        raise DataError(f"'{file}' has no column {wanted} (it has {', '.join(names[:12])}{', …' if len(names) > 12 else ''})")
-    column = str(found[channel])
-    dataset = {
-        "name": file.stem,
-        "source": "tabular",
-        "kind": "real",
-        "vehicle": "unknown",
-        "time": {"column": time, "unit": _unit_in(time) or "s"},
-        "clock": "interpolate",
-        "gappy": [channel],
-        "channels": {channel: {"column": column, "unit": _unit_in(column) or USUAL_UNITS[channel]}},
-    }
-    table = read_single(dataset, file)
+        raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
+    options = {"name": file.stem, "source": "tabular", "vehicle": "unknown", "clock": "interpolate", "gappy": [channel]}
+    table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
     return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
-
-
-def _column_like(names: Sequence[str], spellings: set[str]) -> str | None:
-    """The first column of that name, without its unit in brackets and whatever its case."""
-    bare = {name: re.sub(r"[\[(].*?[\])]", "", name).strip().lower().replace(" ", "_") for name in names}
-    return next((name for name in names if bare[name] in spellings or bare[name].replace("_", "") in spellings), None)
 
 
 def _unit_in(name: str) -> str | None:
@@ -141,7 +121,7 @@ def _unit_in(name: str) -> str | None:
     return written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
 
 
-def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_hz: float = 20.0) -> ComparedFiles:
+def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> ComparedFiles:
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
@@ -150,19 +130,16 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
         DataError: no reference, too little in common, or gaps within what is in common.
         ConfigurationError: there is nothing to compare, or a name is that of a baseline.
     """
-    for name in ("vx", "vy_ref"):
-        if name not in drive:
-            raise DataError(f"recording '{drive.id}' has no channel '{name}', which estimates are scored by")
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")
     if taken := {"zero", "static_map"} & set(estimates):
         raise ConfigurationError(f"an estimate cannot be called '{min(taken)}', which is a baseline; rename its file")
-    channels = [name for name in ("vx", "vy_ref", "ay", "yaw_rate") if name in drive]
-    reference = resampled(drive.select(channels), min(rate_hz, drive.rate_hz), {"method": "polyphase", "transforms": []})
+    further = [name for name in ("ay", "yaw_rate") if name in drive]
+    reference = resampled(drive.select(["vx", "vy_ref", *further]), min(RATE_HZ, drive.rate_hz), {"method": "polyphase", "transforms": []})
     start, stop = _in_common(reference, estimates)
     span, protocol = Span("", drive.id, start, stop), Protocol(rate_hz=reference.rate_hz, warm_up_seconds=0.0, skip_seconds=0.0)
-    everyone = {**estimates, **_baselines(reference, start, stop)}
-    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in everyone.items()}
+    candidates = {**estimates, **_baselines(reference, start, stop)}
+    scored = {(name, ""): score(estimate, reference, span, protocol) for name, estimate in candidates.items()}
     ranking = rank({name: [segments_of([own], reference.rate_hz)] for name, own in scored.items()}, reference.rate_hz)
     titles = {name: {"zero": "v = 0", "static_map": "the static map"}.get(name[0], name[0]) for name in ranking.order}
     verdict = verdict_sentences(ranking, titles, "this recording")
@@ -178,43 +155,36 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate], rate_
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:
     """Start and end [s] of the part in which every estimate and the reference have values."""
-    known = np.flatnonzero(np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"]))
-    if not len(known):
-        raise DataError(f"recording '{reference.id}': channel 'vy_ref' has no sample")
-    start, stop = float(reference.time[known[0]]), float(reference.time[known[-1]])
-    for name, estimate in estimates.items():
-        there = np.flatnonzero(np.isfinite(estimate["vy"]))
-        if not len(there):
-            raise DataError(f"'{name}' has no estimate at all")
-        start, stop = max(start, float(estimate.time[there[0]])), min(stop, float(estimate.time[there[-1]]))
-        if stop - start < LEAST_SECONDS:
-            raise DataError(
-                f"'{name}' goes from {estimate.time[there[0]]:.6g} to {estimate.time[there[-1]]:.6g} s, which leaves less than "
-                f"{LEAST_SECONDS:g} s in common with the recording ({reference.time[known[0]]:.6g} to {reference.time[known[-1]]:.6g} s); "
-                f"are the clocks the same?"
-            )
+    known = np.isfinite(reference["vy_ref"]) & np.isfinite(reference["vx"])
+    times = {"the reference": reference.time[known]}
+    times |= {f"'{name}'": estimate.time[np.isfinite(estimate["vy"])] for name, estimate in estimates.items()}
+    if empty := [name for name, own in times.items() if not len(own)]:
+        raise DataError(f"{empty[0]} has no value at all")
+    start, stop = max(float(own[0]) for own in times.values()), min(float(own[-1]) for own in times.values())
+    if stop - start < LEAST_SECONDS:
+        ranges = ", ".join(f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items())
+        raise DataError(f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?")
     return start, stop
 
 
 def _baselines(reference: Recording, start: float, stop: float) -> dict[str, Estimate]:
     """v = 0, and the static map where the car turns enough to fit one."""
+    found = {"zero": np.zeros(len(reference))}
+    if "yaw_rate" in reference:
+        with suppress(DataError):
+            found["static_map"] = _held_out_map(reference, start, stop)
+    clock = (reference.rate_hz, reference.start_time)
+    return {name: Estimate(reference.id, name, *clock, {"vy": vy, "sideslip": np.zeros_like(vy)}) for name, vy in found.items()}
 
-    def made(name: str, vy: FloatArray) -> Estimate:
-        return Estimate(reference.id, name, reference.rate_hz, reference.start_time, {"vy": vy, "sideslip": np.zeros_like(vy)})
 
-    vy = np.zeros(len(reference))
-    zero = {"zero": made("zero", vy)}
-    if "yaw_rate" not in reference:
-        return zero
-    middle, vy = 0.5 * (start + stop), vy.copy()
+def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray:
+    """Lateral velocity of a static map of the other half of the range [m/s]; raises `DataError` where the car turns too little."""
+    middle, vy = 0.5 * (start + stop), np.zeros(len(reference))
     for fitted, held_out in (((start, middle), reference.time >= middle), ((middle, stop), reference.time < middle)):
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
         kept = {name: values[clean] for name, values in part.channels.items()}
         model = StaticMap(StaticMapSettings(reference.rate_hz))
-        try:
-            model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
-        except DataError:
-            return zero
+        model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
         vy[held_out] = model.lateral_velocity({name: reference[name][held_out] for name in model.channels})
-    return zero | {"static_map": made("static_map", vy)}
+    return vy

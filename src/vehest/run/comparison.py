@@ -17,8 +17,8 @@ from vehest.run.artefacts import Artefact
 from vehest.run.config import GIVEN, Config
 from vehest.run.estimate import find_model, model_artefact
 from vehest.run.evaluate import Evaluation
+from vehest.run.evaluate_faults import all_of, check_channels, faults_of
 from vehest.run.failures import Failure, failure_of
-from vehest.run.faults import all_of, check_channels, faults_of
 from vehest.run.group import Group, Member
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop

@@ -30,7 +30,7 @@ from vehest.data.limits import Limits, check_limit, current_limits, limits_from_
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import first_line
 from vehest.data.transforms import Preparation
-from vehest.run.config_files import GROUPS, choices, local_conf, packaged_conf, papers_conf
+from vehest.run.config_files import GROUPS, choices, conf_folders, packaged_conf
 
 Config = dict[str, Any]
 
@@ -86,18 +86,14 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
     """Makes Hydra search ./conf before the packaged folder, and the folder of the papers' studies last."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        folder = local_conf()
-        if folder is not None:
+        *local, _, papers = conf_folders()
+        for folder in local:
             search_path.prepend("local", folder.resolve().as_uri())
-        search_path.append("papers", papers_conf().as_uri())
+        search_path.append("papers", papers.as_uri())
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
-    """The resolved configuration of a command.
-
-    Args:
-        command: name of a root file in conf/, for example ``train``.
-        overrides: in Hydra's grammar, for example ``estimator=gru`` or ``training.patience=10``; no sweeps.
+    """The resolved configuration of a command, a root file in conf/, with overrides in Hydra's grammar, but no sweeps.
 
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
@@ -118,10 +114,9 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing
         raise ConfigurationError(_one_line(error, command)) from None
-    config = {str(key): value for key, value in resolved.items()}
-    validated(Root, config, "", error=ConfigurationError)
+    validated(Root, resolved, "", error=ConfigurationError)
     chosen = [key for key in RATES if any(override.key_or_group == key for override in parsed)]
-    return {**config, GIVEN: chosen} if chosen else config
+    return {str(key): value for key, value in resolved.items()} | ({GIVEN: chosen} if chosen else {})
 
 
 def _check(override: Override) -> None:
@@ -149,18 +144,12 @@ def _one_line(error: Exception, command: str) -> str:
         return f"unknown option '{unknown[1]}'{hint}"
     if missing := re.search(r"You must specify '([^']+)'", text):
         return f"{missing[1]} is not chosen; {missing[1]}=… (choices: {', '.join(choices(missing[1]))})"
-    if variable := re.search(r"Environment variable '([^']+)' not found", text):
-        return f"environment variable {variable[1]} is not set"
     key = getattr(error, "full_key", None)
     return f"{key}: {text.splitlines()[0]}" if key else " ".join(line.strip() for line in text.splitlines()[:2])
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """Parse overrides in Hydra's grammar.
-
-    Raises:
-        ConfigurationError: bad syntax.
-    """
+    """Overrides, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
     return [_parsed(text) for text in overrides]
 
 
@@ -178,22 +167,14 @@ def _parsed(text: str) -> Override:
 
 
 def count(overrides: Sequence[str]) -> int:
-    """Number of combinations of overrides with several values; of one override at most ``limits.jobs`` + 1 values count.
-
-    Raises:
-        ConfigurationError: bad syntax, or values that cannot be counted.
-    """
-    return math.prod(len(_values(override)) for override in parse(overrides))
+    """Number of combinations that `expand` gives; of one override at most ``limits.jobs`` + 1 values count."""
+    return math.prod(map(len, map(_values, parse(overrides))))
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """All combinations of overrides with several values, the last one varying fastest.
-
-    Raises:
-        ConfigurationError: bad syntax, values that cannot be counted, or more combinations than ``limits.jobs``.
-    """
+    """All combinations of overrides with several values, the last one varying fastest; `ConfigurationError` above ``limits.jobs``."""
     check_jobs(count(overrides), "these overrides stand")
-    return [list(job) for job in product(*(_values(override) for override in parse(overrides)))]
+    return [list(job) for job in product(*map(_values, parse(overrides)))]
 
 
 def _values(override: Override) -> list[str]:
@@ -212,20 +193,12 @@ def _values(override: Override) -> list[str]:
 
 
 def check_jobs(number: int, what: str) -> None:
-    """Refuse more jobs than ``limits.jobs``.
-
-    Raises:
-        ConfigurationError: there are more.
-    """
+    """Refuse more jobs than ``limits.jobs``."""
     check_limit("jobs", number, f"{what} for at least {number} jobs", ConfigurationError)
 
 
 def limits_of(overrides: Sequence[str]) -> Limits:
-    """The limits of conf/common.yaml, changed by overrides.
-
-    Raises:
-        ConfigurationError: bad syntax, an unknown limit or a wrong value.
-    """
+    """The limits of conf/common.yaml, changed by overrides."""
     own = list(dict.fromkeys(text for text in overrides if key_of(text).split(".")[0] == "limits"))
     return limits_from_config(compose_config("eval", own)["limits"])
 
@@ -248,12 +221,8 @@ def option_hint(key: str) -> str:
 
 def has_key(config: Config, key: str) -> bool:
     """Whether a dotted key is in a configuration."""
-    node: Any = config
-    for part in key.split("."):
-        if not isinstance(node, dict) or part not in node:
-            return False
-        node = node[part]
-    return True
+    first, _, rest = key.partition(".")
+    return isinstance(config, dict) and first in config and (not rest or has_key(config[first], rest))
 
 
 def as_yaml(config: Config) -> str:
@@ -263,11 +232,7 @@ def as_yaml(config: Config) -> str:
 
 
 def positive_rate(value: Any, name: str) -> float:
-    """A rate [Hz] of a configuration.
-
-    Raises:
-        ConfigurationError: it is no positive number.
-    """
+    """A rate [Hz] of a configuration; raises `ConfigurationError` unless it is a positive number."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
         raise ConfigurationError(f"{name} must be a positive number [Hz], not {value!r}; for example {name}=20")
     return float(value)

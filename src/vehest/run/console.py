@@ -6,18 +6,20 @@ Text from files is shown with control characters as escapes, and nothing in it i
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
+from typing import Any
 
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
 from vehest.data.errors import printable
 from vehest.training.context import Progress as FitProgress
 
+WARNING = "warn"
 MARKS = {
+    WARNING: ("warning", "yellow"),
     "done": ("done", "green"),
     "skip": ("skipped", "dim"),
     "plan": ("would", "cyan"),
@@ -30,7 +32,6 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-WARNING = "warn"
 MOST_ROWS = 12  # of finished trainings above the bars
 MOST_BARS = 16  # of trainings that run at a time
 
@@ -52,33 +53,24 @@ class Messages:
         self.quiet = quiet or silent
         self.printed: list[tuple[str, str, str, str]] = []
 
-    def again(self, printed: Sequence[tuple[str, str, str, str]]) -> None:
-        """Print earlier lines and warnings once more."""
-        for status, stage, label, detail in printed:
-            if status == WARNING:
-                self.warn(detail)
-            else:
-                self.line(status, stage, label, detail)
-
-    def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
-        """Print the status of one artefact."""
-        self.printed.append((status, stage, label, detail))
-        if not self.quiet:
-            word, colour = MARKS[status]
-            shown = (f" {printable(detail)}" if detail else "", "dim")
-            self._print(Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown))
-
     def warn(self, text: str) -> None:
         """Print a warning."""
-        self.printed.append((WARNING, "", "", text))
-        self._print(Text.assemble(("warning", "yellow"), f" {printable(text, keep=chr(10))}"))
+        self.line(WARNING, "", "", text)
 
-    def _print(self, text: Text) -> None:
-        with suppress(OSError):  # a closed stream or a full disk does not end the work
-            self.console.print(text)
+    def line(self, status: str, stage: str, label: str, detail: str = "") -> None:
+        """Print the status of one artefact, or a warning."""
+        self.printed.append((status, stage, label, detail))
+        word, colour = MARKS[status]
+        if status == WARNING:
+            text = Text.assemble((word, colour), f" {printable(detail, keep=chr(10))}")
+        else:
+            shown = (f" {printable(detail)}" if detail else "", "dim")
+            text = Text.assemble((f"{word:<7}", colour), f" {stage:<10} {printable(label)}", shown)
+        if status == WARNING or not self.quiet:
+            with suppress(OSError):  # a closed stream or a full disk does not end the work
+                self.console.print(text)
 
-    @contextmanager
-    def bars(self) -> Iterator[Bars]:
+    def bars(self) -> AbstractContextManager[Bars]:
         """Progress bars that vanish at the end; nothing is drawn without a terminal."""
         columns = (
             TextColumn("{task.description}", markup=False),
@@ -88,26 +80,27 @@ class Messages:
             TimeElapsedColumn(),
         )
         drawn = not self.quiet and self.console.is_terminal
-        bars = Bars(Progress(*columns, console=self.console, disable=not drawn))
-        with Live(bars, console=self.console, transient=True) if drawn else nullcontext():
-            yield bars
+        bars = Bars(*columns, console=self.console, transient=True, disable=not drawn)
+        return bars if drawn else nullcontext(bars)
 
 
-class Bars:
+class Bars(Progress):
     """Progress bars by name, between a table of finished trainings and counts of all."""
 
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-        self._tasks: dict[str, TaskID] = {}
+    def __init__(self, *columns: ProgressColumn, **options: Any) -> None:
+        self._named: dict[str, TaskID] = {}
         self._done: dict[str, Mapping[str, float]] = {}
         self._counted: Mapping[str, str] = {}
+        super().__init__(*columns, **options)
 
-    def __rich__(self) -> RenderableType:
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """The table of the best, the bars, the counts."""
         best = sorted(self._done.items(), key=lambda row: tuple(row[1].values()))[:MOST_ROWS]
-        rows: list[list[str | Text]] = [[Text(printable(name)), *(f"{value:.3f}" for value in figures.values())] for name, figures in best]
-        done = _grid(["done so far", *best[0][1]] if best else [], rows)
-        counts = _grid(list(self._counted), [list(self._counted.values())])
-        return Group(*done, self._progress, *counts)
+        figures = [("done so far", *best[0][1])] if best else []
+        figures += [(printable(name), *(f"{value:.3f}" for value in own.values())) for name, own in best]
+        yield from [_grid(figures)] if figures else []
+        yield self.make_tasks_table(self.tasks)
+        yield from [_grid([tuple(self._counted), tuple(self._counted.values())])] if self._counted else []
 
     def count(self, counted: Mapping[str, str]) -> None:
         """Show numbers below the bars, such as how many are done."""
@@ -120,11 +113,10 @@ class Bars:
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar, which appears when it is first moved."""
-        if name not in self._tasks:
-            if len(self._tasks) >= MOST_BARS:
-                return
-            self._tasks[name] = self._progress.add_task(printable(name), total=total, note="")
-        self._progress.update(self._tasks[name], completed=done, total=total, note=printable(note))
+        if name not in self._named and len(self._named) < MOST_BARS:
+            self._named[name] = self.add_task(printable(name), total=total, note="")
+        if name in self._named:
+            self.update(self._named[name], completed=done, total=total, note=printable(note))
 
     def fit(self, name: str, progress: FitProgress | None) -> None:
         """Move the bar of a training."""
@@ -136,13 +128,13 @@ class Bars:
 
     def close(self, name: str) -> None:
         """Remove a bar."""
-        if name in self._tasks:
-            self._progress.remove_task(self._tasks.pop(name))
+        if name in self._named:
+            self.remove_task(self._named.pop(name))
 
 
-def _grid(header: Sequence[str], rows: Sequence[Sequence[str | Text]]) -> list[Table]:
-    """A table without borders; nothing without a header."""
-    table = Table(*header, box=None, header_style="dim", padding=(0, 2))
-    for row in rows if header else ():
-        table.add_row(*row)
-    return [table] if header else []
+def _grid(rows: Sequence[Sequence[str]]) -> Table:
+    """A table without borders, its header first."""
+    table = Table.grid(padding=(0, 2))
+    for number, row in enumerate(rows):
+        table.add_row(*(Text(cell) for cell in row), style="" if number else "dim")
+    return table

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from vehest.data.text_files import first_line
 from vehest.run.artefacts import library_versions
-from vehest.run.config_files import packaged_conf, packaged_pipelines
+from vehest.run.config_files import packaged_conf
 
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),
@@ -36,53 +37,23 @@ class Item:
 
 def examine() -> list[Item]:
     """Check everything that vehest relies on."""
-    return [*_installation(), *_machine()]
+    return list(_items())
 
 
-def _installation() -> Iterator[Item]:
-    """Libraries, configuration and extras."""
-    versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
-    yield Item("ok", "python", f"{platform.python_version()}; {versions}")
-    missing = [folder for folder in (packaged_conf(), packaged_pipelines()) if not folder.is_dir()]
-    searched = f"{packaged_conf()}; ./conf is searched first" if Path("conf").is_dir() else str(packaged_conf())
-    if missing:
-        yield Item("error", "configuration", f"'{missing[0]}' is not there; install vehest again")
-    else:
-        yield Item("ok", "configuration", searched)
+def _items() -> Iterator[Item]:
     import torch
 
-    value = torch.ones(2, requires_grad=True)
-    (value * value).sum().backward()
-    yield Item("ok", "torch", f"{torch.__version__}, autograd works")
+    from vehest.run.launchers.local import default_jobs
+
+    versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
+    yield Item("ok", "python", f"{platform.python_version()}; {versions}")
+    yield Item("ok", "configuration", f"{packaged_conf()}{'; ./conf is searched first' if Path('conf').is_dir() else ''}")
     yield _kernels()
     absent = [f"{use} need 'vehest[{extra}]'" for extra, (package, use) in EXTRAS.items() if importlib.util.find_spec(package) is None]
     if absent:
         yield Item("warning", "extras", f"{'; '.join(absent)}: pip install it where you need it")
     else:
         yield Item("ok", "extras", f"{', '.join(EXTRAS)} are there")
-
-
-def _kernels() -> Item:
-    try:
-        import numpy as np
-
-        from vehest.estimators.kernels.luenberger import observe
-
-        observe(np.array([[0.5, 20.0, 9.0, 0.0]]), 5.0, 0.1, 0.01)
-    except Exception as error:
-        reason = str(error).partition("\n")[0][:100]
-        return Item(
-            "warning", "compiled recursions", f"numba does not work; use training.compiled=false ({type(error).__name__}: {reason})"
-        )
-    return Item("ok", "compiled recursions", "numba compiles and runs")
-
-
-def _machine() -> Iterator[Item]:
-    """Folders, disk, cores and GPU."""
-    import torch
-
-    from vehest.run.launchers.local import default_jobs
-
     root = os.environ.get("VEHEST_DATA")
     if not root:
         yield Item("warning", "recordings", "VEHEST_DATA is not set; only simulated data sets work without root=FOLDER")
@@ -96,13 +67,19 @@ def _machine() -> Iterator[Item]:
         yield Item("ok", "output", str(folder))
     else:
         yield Item("error", "output", f"'{folder}' cannot be written; set VEHEST_OUTPUT or give output=FOLDER")
-    try:
-        free = shutil.disk_usage(".").free / 1e9
-        yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
-    except OSError as error:
-        yield Item("warning", "disk", f"the working folder cannot be used ({error.strerror}); change to another")
+    free = shutil.disk_usage(".").free / 1e9
+    yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
     yield Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")
-    if torch.cuda.is_available():
-        yield Item("ok", "GPU", f"{torch.cuda.get_device_name(0)}; vehest's trainings run on the processor")
-    else:
-        yield Item("ok", "GPU", "none; vehest needs none")
+    yield Item("ok", "GPU", f"{torch.cuda.get_device_name(0) if torch.cuda.is_available() else 'none'}; trainings run on the processor")
+
+
+def _kernels() -> Item:
+    try:
+        import numpy as np
+
+        from vehest.estimators.kernels.luenberger import observe
+
+        observe(np.array([[0.5, 20.0, 9.0, 0.0]]), 5.0, 0.1, 0.01)
+    except Exception as error:
+        return Item("warning", "compiled recursions", f"numba does not work; use training.compiled=false ({first_line(error)})")
+    return Item("ok", "compiled recursions", "numba compiles and runs")

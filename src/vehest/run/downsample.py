@@ -17,11 +17,7 @@ VERSION = "1"
 
 
 def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
-    """The artefact of a downsampling.
-
-    Raises:
-        ConfigurationError: a rate, method or transform that makes no sense.
-    """
+    """The artefact of a downsampling; raises `ConfigurationError` for a rate, method or transform that makes no sense."""
     config = {"rate_hz": float(rate_hz), "method": options["method"], "transforms": list(options.get("transforms") or [])}
     transforms_of(config)
     return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of_downsampling(), output)
@@ -33,21 +29,13 @@ def code_of_downsampling() -> str:
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:
-    """Transform and resample every recording into ``folder``.
-
-    Raises:
-        DataError: a recording cannot be brought to that rate.
-    """
+    """Transform and resample every recording into ``folder``."""
     for name in ingested.outputs:
         write_recording(resampled(read_recording(ingested.folder / name), config["rate_hz"], config), folder / name)
 
 
 def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, Any]) -> Recording:
-    """A recording at another rate, after the transforms of a preparation and by its method.
-
-    Raises:
-        DataError: it is sampled more slowly.
-    """
+    """A recording, after the transforms of a preparation and by its method, at a rate that is no higher; else raises `DataError`."""
     if recording.rate_hz < rate_hz * (1 - 1e-9):
         raise DataError(f"recording '{recording.id}' is sampled at {recording.rate_hz:g} Hz, below the {rate_hz:g} Hz needed")
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
@@ -57,5 +45,4 @@ def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, An
 
 def transforms_of(config: Mapping[str, Any]) -> list[Transform]:
     """The transforms of a downsampling, in order."""
-    first = [transform_from_config(entry) for entry in config["transforms"]]
-    return [*first, Resample(float(config["rate_hz"]), config["method"])]
+    return [*map(transform_from_config, config["transforms"]), Resample(float(config["rate_hz"]), config["method"])]

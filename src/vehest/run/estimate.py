@@ -1,4 +1,4 @@
-"""Runs a trained model on a new recording that has no reference channels.
+"""Runs a trained model on a new recording that has no reference channels; trains and scores models on recordings of Python.
 
 model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,17 +22,22 @@ from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
+from vehest.data.schema import settings_from_config
+from vehest.data.splits import Span
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
-from vehest.estimators.base import Estimator
+from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
+from vehest.evaluation.metrics import accuracy, score
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
-from vehest.run.calibrate import trust_of
+from vehest.run.calibrate import Stretch, learn_trust, trust_of
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.printing import complain, note
+from vehest.run.evaluate import protocol_from_config
+from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
+from vehest.run.train import new_estimator
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict
@@ -58,37 +63,26 @@ def pretrained_note() -> str:
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
 
-    Of several models the newest is taken, with a remark to ``say``.
-
-    Raises:
-        MissingError: there is none.
+    Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is none.
     """
     given = Path(name)
     if given.is_dir():
         return given
     if name == PRETRAINED:
         return pretrained_folder()
-    models = sorted(output.glob("train/[!.]*"))
-    found = sorted(
-        (folder for folder in models if folder.is_dir() and folder.match(f"{given.name}*")), key=lambda folder: -folder.stat().st_mtime_ns
-    )
+    models = [folder for folder in sorted(output.glob("train/[!.]*")) if folder.is_dir()]
+    found = [folder for folder in models if folder.match(f"{given.name}*")]
     if not found:
-        known = [folder.name for folder in models]
-        listed = f" (there are: {', '.join(known[:8])}{', …' if len(known) > 8 else ''})" if known else "; train one first"
-        raise MissingError(f"there is no model '{name}', neither a folder nor in '{output / 'train'}'{listed}")
+        known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
+        raise MissingError(f"there is no model '{name}', neither a folder nor in {known}; train one first")
+    newest = max(found, key=lambda folder: folder.stat().st_mtime_ns)
     if len(found) > 1:
-        others = f"{', '.join(folder.name for folder in found[1:4])}{f' and {len(found) - 4} more' if len(found) > 4 else ''}"
-        say(f"'{name}' is taken for {found[0].name}, the newest; it could also be {others}")
-    return found[0]
+        say(f"'{name}' is taken for {newest.name}, the newest of {counted([folder.name for folder in found])}")
+    return newest
 
 
 def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Path, Estimator, Trust | None]:
-    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration.
-
-    Raises:
-        MissingError: there is none.
-        DataError: its files are damaged.
-    """
+    """A model's folder, found as `find_model` does, the model with the preparation of its training data, and its calibration."""
     folder = find_model(name, output, say)
     model = load_model(folder)
     model.preparation = preparation_of(folder)
@@ -96,20 +90,15 @@ def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Pat
 
 
 def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> dict[str, Any]:
-    """Run a model on a recording and write the estimate.
+    """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
 
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
         out: table to write.
         strict: whether findings in the channels are an error; else they are printed as warnings.
 
-    Returns:
-        Figures of the estimate and a verdict.
-
     Raises:
-        ConfigurationError: words or the file to write make no sense.
-        MissingError: there is no such model or recording.
-        DataError: the recording cannot be used.
+        VehestError: model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
     name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
@@ -133,19 +122,18 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     for finding in findings:
         complain(f"warning: {finding}")
     write_estimate_table(result, out)
-    figures = {"verdict": _verdict(result, drive, trust), "findings": findings}
-    figures |= {"note": pretrained_note()} if name == PRETRAINED else {}
-    return {"out": str(out), "model": PRETRAINED if name == PRETRAINED else str(folder), **_summary(result), **figures}
+    return {
+        "out": str(out),
+        "model": PRETRAINED if name == PRETRAINED else str(folder),
+        **_summary(result),
+        "verdict": _verdict(result, drive, trust),
+        "findings": findings,
+        **({"note": pretrained_note()} if name == PRETRAINED else {}),
+    }
 
 
 def model_artefact(folder: Path) -> Artefact:
-    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model.
-
-    Raises:
-        MissingError: there is no model.
-        DataError: its files are damaged.
-        ConfigurationError: another stage made it.
-    """
+    """A model as an artefact of the stage ``train``, also where it has no manifest, such as `pretrained_folder` or a saved model."""
     if (folder / MANIFEST).is_file():
         artefact = read_artefact(folder)
         if artefact.stage != TRAIN:
@@ -153,10 +141,9 @@ def model_artefact(folder: Path) -> Artefact:
         return artefact
     about = read_description(folder)
     outputs = {name: sha256_of(folder / name) for name in (DESCRIPTION, WEIGHTS)}
-    label = PRETRAINED if folder == pretrained_folder() else folder.resolve().name
     key = hashlib.sha256(json.dumps(outputs, sort_keys=True).encode()).hexdigest()
     config = {"estimator": dict(about.settings), "train": [], "validation": []}
-    return Artefact(folder, TRAIN, label, key, "complete", outputs, config, {}, skipped=True)
+    return Artefact(folder, TRAIN, folder.resolve().name, key, "complete", outputs, config, {}, skipped=True)
 
 
 def preparation_of(model_folder: Path) -> dict[str, Any]:
@@ -167,10 +154,7 @@ def preparation_of(model_folder: Path) -> dict[str, Any]:
 def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = False) -> Recording:
     """Read a recording from its file, a table unless the data set says otherwise, as conf/estimate.yaml and overrides describe it.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be used as it is.
-        ConfigurationError: the file is of another format than the data set's.
+    Raises what `read_single` does, and `DataError` where a check finds an error that the data set does not accept.
     """
     config = compose_config("estimate", overrides)
     dataset = config["dataset"] if references else _without_references(config["dataset"])
@@ -194,64 +178,37 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
 
 
 def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
-    """Findings of the checks in the channels that a model reads, the gravest first.
-
-    Raises:
-        DataError: these channels contradict each other in sign or unit, so that no estimate can be right.
-    """
+    """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
     read = [name for name in model.channels if name in recording]
     findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
-            raise DataError(
-                f"recording '{recording.id}': channels contradict each other: {finding.message} (or dataset.accept=[{finding.check}])"
-            )
+            what = f"channels contradict each other: {finding.message}"
+            raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
     return [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
 
 
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
-    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`).
-
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
-    """
+    """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
     needed = prepared_recording(model, recording)
     estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_other_vehicle(trust, recording))
     return require_estimate(model, recording, estimate)
 
 
 def prepared_recording(model: Estimator, recording: Recording) -> Recording:
-    """The channels that a model reads, at its rate; see `estimate_recording`.
-
-    Raises:
-        DataError: a channel is missing, or the recording is sampled too slowly.
-    """
-    for name in model.channels:
-        if name not in recording:
-            raise DataError(
-                f"recording '{recording.id}' has no channel '{name}', which '{model.name}' needs (it reads {', '.join(model.channels)})"
-            )
+    """The channels that a model reads, at its rate; raises as `estimate_recording` does."""
     return resampled(recording.select(model.channels), model.settings.rate_hz, model.preparation)
 
 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
-    """The estimate, unless it is empty.
-
-    Raises:
-        DataError: the recording is too short.
-    """
+    """The estimate; raises `DataError` where it is empty, since the recording is too short."""
     if np.isnan(estimate["vy"]).all():
         raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
     return estimate
 
 
 def write_estimate_table(estimate: Estimate, path: Path) -> None:
-    """Write an estimate as Parquet or CSV, by the file's ending.
-
-    Raises:
-        ConfigurationError: another ending.
-        MissingError: it cannot be written.
-    """
+    """Write an estimate as Parquet or CSV, by the file's ending."""
     _check_table_name(path)
     if path.suffix.lower() == ".parquet":
         write_estimate(estimate, path)
@@ -271,7 +228,7 @@ def _check_table_name(path: Path) -> None:
 
 def _summary(estimate: Estimate) -> dict[str, Any]:
     """Figures of an estimate, for people and scripts."""
-    degrees = [math.degrees(value) for value in estimate["sideslip"][~np.isnan(estimate["sideslip"])]] or [math.nan]
+    degrees = np.degrees(estimate["sideslip"])
     figures: dict[str, Any] = {
         "recording": estimate.recording_id,
         "estimator": estimate.estimator,
@@ -279,7 +236,7 @@ def _summary(estimate: Estimate) -> dict[str, Any]:
         "samples": len(estimate),
         "estimated": int((~np.isnan(estimate["vy"])).sum()),
         "quantities": {name: QUANTITIES[name] for name in estimate.channels},
-        "sideslip_deg": {"min": round(min(degrees), 3), "max": round(max(degrees), 3)},
+        "sideslip_deg": {"min": round(float(np.fmin.reduce(degrees)), 3), "max": round(float(np.fmax.reduce(degrees)), 3)},
     }
     if "band_sideslip" in estimate.channels:
         half = np.degrees(estimate["band_sideslip"][~np.isnan(estimate["band_sideslip"])])
@@ -300,3 +257,32 @@ def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> s
     valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
     outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
     return f"{outside}; {valid}" if outside else valid
+
+
+def train_on(
+    name: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str], seed: int
+) -> tuple[Estimator, Trust]:
+    """Fit an estimator as conf/train.yaml and overrides describe it, and calibrate it; see `vehest.api.train`."""
+    config = compose_config("train", [f"estimator={name}", *overrides])
+    model, training = new_estimator(config["estimator"]), config["training"]
+    if training.get("start_from") is not None:
+        training["start_from"] = str(find_model(str(training["start_from"]), Path(config["output"]), warnings.warn))
+    settings: Any = settings_from_config(model.training_type, training, "training")
+    model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
+    model.seed(seed)
+    parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
+    model.fit(FitData(*parts), settings)
+    learnt, stopped = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in parts)
+    return model, learn_trust(model, learnt, stopped)
+
+
+def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
+    """Metrics of a model on whole recordings under the protocol of conf/eval.yaml; see `vehest.api.score`."""
+    evaluation = compose_config("eval")["evaluation"]
+    protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
+    parts = []
+    for recording in recordings:
+        needed = prepared_recording(model, recording.without_references())
+        estimate = require_estimate(model, recording, model.estimate([needed])[0])
+        parts.append(score(estimate, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
+    return accuracy(parts)

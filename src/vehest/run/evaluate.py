@@ -11,7 +11,7 @@ import csv
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,7 @@ from vehest.evaluation.metrics import (
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
-from vehest.run.evaluate_faults import code_under_faults, errors_and_flags, guarded_estimates, infinite_from
-from vehest.run.faults import FaultSettings
+from vehest.run.evaluate_faults import FaultSettings, code_under_faults, errors_under
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
 from vehest.studies.artefacts import read_frame
 from vehest.trust.bands import Bands, with_bands
@@ -65,14 +64,11 @@ TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
 HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
 COLUMNS = (*HEAD, "metric", "value", "unit", "low", "high")
+ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
-    """How estimates are scored.
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
+    """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
     protocol = settings_from_config(Protocol, config, "evaluation")
     if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
         raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
@@ -118,12 +114,7 @@ class EvaluateJob:
 
     @cached_property
     def plan(self) -> StagePlan:
-        """The artefact that it becomes.
-
-        Raises:
-            DataError: the split names a recording that the data set does not have.
-            ConfigurationError: a test range was used for training.
-        """
+        """The artefact that it becomes; raises `ConfigurationError` where a test range was used for training."""
         how, model = self.how, self.model
         for name, spans in how.split.tests.items():
             for learnt in learnt_spans(model):
@@ -167,11 +158,7 @@ class EvaluateJob:
 
 
 def code_of_evaluation(estimator: str) -> str:
-    """Version of an evaluation of an estimator.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """Version of an evaluation of an estimator."""
     return f"evaluate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
@@ -188,7 +175,9 @@ def scored_spans(split: Split) -> list[Span]:
 def write_evaluation(job: EvaluateJob, folder: Path) -> None:
     """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
     estimator, protocol = load_model(job.model.folder), job.how.protocol
-    fit = _fit_of(job.model, estimator)
+    without_fit = job.model.outputs and FIT_METRICS not in job.model.outputs  # such as a model that was saved from Python
+    fit = {"n_parameters": float(estimator.n_parameters), "epochs": 0.0, "train_seconds": 0.0}
+    fit |= {} if without_fit else read_fit_metrics(job.model.folder)
     trust = None if job.calibration is None else read_trust(job.calibration.folder)
     bands = None if trust is None else trust.bands
     rows: list[dict[str, Any]] = []
@@ -198,10 +187,12 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         head = _head(job, estimator, name, spans)
         pieces = sequences(spans, job.reference, protocol)
         estimates = _estimates(estimator, job, pieces)
-        if bands is not None:
-            estimates = [_with_bands(*pair, bands, job, name) for pair in zip(estimates, pieces, strict=True)]
-        for position, estimate in enumerate(estimates):
-            write_estimate(estimate, folder / name / f"{position}.parquet")
+        for position, piece in enumerate(pieces):
+            if bands is not None:  # wider on vehicles without calibration and on test sets that the protocol names
+                measured = job.measured(piece)
+                other_vehicle = measured.vehicle not in bands.vehicles or name in protocol.sets_elsewhere
+                estimates[position] = with_bands(estimates[position], measured, bands, elsewhere=other_vehicle)
+            write_estimate(estimates[position], folder / name / f"{position}.parquet")
         scored = job.score(spans, estimates)
         blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
@@ -253,12 +244,10 @@ def _rows_under_faults(
     rows: list[dict[str, Any]] = []
     pieces = [(piece, job.measured(piece), job.state(piece)) for piece in sequences(spans, job.reference, job.how.protocol)]
     other_vehicle = head["test_set"] in job.how.protocol.sets_elsewhere
+    score, rate_hz = partial(job.score, spans), job.how.protocol.rate_hz
     for fault in job.how.faults:
-        guarded, windows = guarded_estimates(fault, estimator, pieces, trust, other_vehicle=other_vehicle)
-        scored = job.score(spans, infinite_from(windows, guarded))
-        errors = errors_and_flags(scored, nominal, guarded, windows, job.how.protocol.rate_hz, flagged=trust is not None)
-        for subset, own in errors.items():
-            rows += _rows(head, own, units=UNITS_UNDER_FAULT, subset=subset, condition=fault.condition)
+        for subset, own in errors_under(fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle).items():
+            rows += _rows(head, own, subset=subset, condition=fault.condition)
     return rows
 
 
@@ -277,23 +266,15 @@ def _rows(
     head: Mapping[str, Any],
     figures: Mapping[str, float],
     intervals: Mapping[str, tuple[float, float]] | None = None,
-    units: Mapping[str, str] = UNITS,
     **columns: str,
 ) -> list[dict[str, Any]]:
     """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
     rows = []
     for metric, value in figures.items():
         low, high = (repr(float(end)) for end in intervals[metric]) if intervals and metric in intervals else ("", "")
-        row = {"metric": metric, "value": repr(float(value)), "unit": units[metric], "low": low, "high": high}
+        row = {"metric": metric, "value": repr(float(value)), "unit": ALL_UNITS[metric], "low": low, "high": high}
         rows.append({**head, **columns, **row})
     return rows
-
-
-def _fit_of(model: Artefact, estimator: Estimator) -> dict[str, float]:
-    """Figures of a fit; a model without them has its number of parameters and no epochs."""
-    if model.outputs and FIT_METRICS not in model.outputs:
-        return dict.fromkeys(FIT_FIGURES, 0.0) | {"n_parameters": float(estimator.n_parameters)}
-    return read_fit_metrics(model.folder)
 
 
 def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -> list[Estimate]:
@@ -306,26 +287,13 @@ def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -
     return estimates
 
 
-def _with_bands(estimate: Estimate, piece: Span, bands: Bands, job: EvaluateJob, test_set: str) -> Estimate:
-    """An estimate with its 90 % bands, wider on vehicles without calibration and on test sets that the protocol names."""
-    measured = job.measured(piece)
-    other_vehicle = measured.vehicle not in bands.vehicles or test_set in job.how.protocol.sets_elsewhere
-    return with_bands(estimate, measured, bands, elsewhere=other_vehicle)
-
-
 def _floors(estimator: Estimator, job: EvaluateJob, spans: Sequence[Span]) -> dict[str, float]:
     """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
     drives = drives_of(spans, job.reference, job.how.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
-    floors = {
-        "floor_reference": reference_floor(drives),
-        "floor_cramer_rao": cramer_rao_floor(drives, inputs) if inputs is not None else None,
-    }
-    figures: dict[str, float] = {}
-    for name, floor in floors.items():
-        if floor is not None:
-            figures |= {name: floor.sideslip, f"{name}_vy": floor.vy}
-    return figures
+    floors = {"floor_reference": reference_floor(drives)} | ({"floor_cramer_rao": cramer_rao_floor(drives, inputs)} if inputs else {})
+    known = {name: floor for name, floor in floors.items() if floor is not None}
+    return {name + suffix: value for name, own in known.items() for suffix, value in (("", own.sideslip), ("_vy", own.vy))}
 
 
 def _step_seconds(estimator: Estimator, recording: Recording) -> float:
@@ -344,11 +312,10 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
 def _training_rows(estimator: Estimator, job: EvaluateJob) -> list[dict[str, Any]]:
     """Errors on the training ranges; none where the reference has gaps there or nothing was learnt."""
     spans = [span for span in learnt_spans(job.model, "train") if span.dataset in job.how.data]
+    if not spans:
+        return []
     try:
-        pieces = sequences(spans, job.reference, job.how.protocol) if spans else []
-        if not pieces:
-            return []
-        estimates = _estimates(estimator, job, pieces)
+        estimates = _estimates(estimator, job, sequences(spans, job.reference, job.how.protocol))
         figures = accuracy(job.score(spans, estimates))
     except DataError:
         return []
@@ -356,12 +323,7 @@ def _training_rows(estimator: Estimator, job: EvaluateJob) -> list[dict[str, Any
 
 
 def read_metrics(folder: Path) -> pd.DataFrame:
-    """Metrics and times of an evaluation, one row a figure, with `COLUMNS`.
-
-    Raises:
-        MissingError: they are not there.
-        DataError: they are damaged.
-    """
+    """Metrics and times of an evaluation, one row a figure, with `COLUMNS`."""
     tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
     return pd.concat([table for table in tables if len(table)], ignore_index=True)
 

@@ -1,27 +1,38 @@
-"""Errors of estimates under a fault: each range with the fault injected -> guarded estimate, as online -> errors and flags."""
+"""Faults of an evaluation, as conf/fault, ``faults`` of the configuration and pipelines name them, and errors of estimates under them.
+
+each range with the fault injected -> guarded estimate, as online -> errors and flags
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 
+from vehest.data.channels import CHANNELS
+from vehest.data.contents import stored_contents
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.splits import Span
+from vehest.data.schema import validated
+from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.under_fault import FAULTED, Flagged, Window, errors_under_fault, flags_under_fault
-from vehest.run.faults import FaultSettings
+from vehest.run.artefacts import Artefact
+from vehest.run.config import Config, compose_config
+from vehest.run.config_files import choices
+from vehest.run.train import recording_file
 from vehest.trust.contract import estimate_guarded
-from vehest.trust.faults import inject
+from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
 VERSION = "1"
-
-Piece = tuple[Span, Recording, dict[str, float] | None]
-"""A range or sequence, its samples with a warm-up before it, and the state to start from, if any."""
+NONE = {"name": "none"}
+DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 
 
 def code_under_faults(code: str) -> str:
@@ -29,40 +40,133 @@ def code_under_faults(code: str) -> str:
     return f"{code} faults={VERSION}"
 
 
-def guarded_estimates(
-    settings: FaultSettings, estimator: Estimator, pieces: Sequence[Piece], trust: Trust | None, *, other_vehicle: bool
-) -> tuple[list[Estimate], list[Window]]:
-    """Estimates of pieces with a fault injected into each, and start and end of the faults [s]."""
+@dataclass(frozen=True)
+class FaultSettings:
+    """One choice of ``fault``; conf/fault explains its keys."""
+
+    name: str
+    channel: str
+    severity: Annotated[Severity, "mild, medium or severe"]
+    size: float | None = None  # instead of the severity's
+    start: float | None = None  # after the start of each range [s]; None: drawn, within `DRAWN_START`
+    duration: float | None = None  # [s]; None: to the end of the range
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self.within(0.0, 100.0, 0)
+
+    @property
+    def condition(self) -> str:
+        """Its name in an evaluation."""
+        return self._fault.condition
+
+    @property
+    def _fault(self) -> Fault:
+        return Fault(self.name, self.channel, self.severity, seed=self.seed, size=self.size)
+
+    def within(self, start: float, length: float, position: int) -> Fault:
+        """The fault in one range of a test set, ``start`` [s] after the first sample and ``length`` [s] long; each draws anew."""
+        drawn = np.random.default_rng([self.seed, position])
+        own_start = drawn.uniform(*DRAWN_START) * length if self.start is None else self.start
+        duration = math.inf if self.duration is None else self.duration
+        return replace(self._fault, onset=start + own_start, duration=duration, seed=int(drawn.integers(2**32)))
+
+
+def faults_of(config: Config) -> tuple[FaultSettings, ...]:
+    """The faults of a configuration of ``eval``: those listed in ``faults``, then the choice of ``fault``; raises as `all_of` does."""
+    listed = config.get("faults") or []
+    kinds = [name for name in choices("fault") if name != NONE["name"]]
+    if not isinstance(listed, list) or not all(isinstance(entry, dict) and str(entry.get("kind")) in kinds for entry in listed):
+        raise ConfigurationError(
+            "faults must be a list of faults, each with its kind, for example [{kind: bias, channel: ay, severity: mild}]; "
+            f"kinds: {', '.join(kinds)}"
+        )
+    named = [str(entry["kind"]) for entry in listed]  # nan and inf are numbers in YAML
+    bases = {kind: compose_config("eval", [f"fault={kind}"])["fault"] for kind in dict.fromkeys(named)}
+    own = [{key: value for key, value in entry.items() if key != "kind"} for entry in listed]
+    found = [_settings(bases[kind] | changes) for kind, changes in zip(named, own, strict=True)]
+    chosen = chosen_fault(config)
+    return all_of([found, [] if chosen is None else [chosen]])
+
+
+def chosen_fault(config: Config) -> FaultSettings | None:
+    """The choice of ``fault``, if any; the figures of a sweep are those under it."""
+    chosen = config.get("fault") or NONE
+    return None if chosen == NONE else _settings(chosen)
+
+
+def _settings(content: Mapping[str, Any]) -> FaultSettings:
+    return validated(FaultSettings, dict(content), "", error=ConfigurationError, group="fault")
+
+
+def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
+    """Faults of several configurations together, each once.
+
+    Raises:
+        ConfigurationError: two different ones have one name.
+    """
+    found: dict[str, FaultSettings] = {}
+    for fault in (fault for some in faults for fault in some):
+        if found.setdefault(fault.condition, fault) != fault:
+            raise ConfigurationError(
+                f"two faults are both called {fault.condition}: they differ in start or duration; give them different seeds too, "
+                f"or evaluate them one after the other"
+            )
+    return tuple(found.values())
+
+
+def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[str, Artefact]) -> None:
+    """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
+    spans = [span for spans in (split.validation, *split.tests.values()) for span in spans] if faults else []
+    for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
+        held = stored_contents(recording_file(data[dataset], Span(dataset, recording))).channels
+        for fault in faults:
+            if fault.channel not in held:
+                known = ", ".join(sorted(name for name in held if not CHANNELS[name].is_reference))
+                raise ConfigurationError(
+                    f"fault '{fault.condition}': recording '{recording}' of data set '{dataset}' has no channel '{fault.channel}' "
+                    f"(it has {known})"
+                )
+
+
+def errors_under(
+    settings: FaultSettings,
+    estimator: Estimator,
+    pieces: Sequence[tuple[Span, Recording, dict[str, float] | None]],
+    trust: Trust | None,
+    nominal: Sequence[Scored],
+    score: Callable[[list[Estimate]], list[Scored]],
+    rate_hz: float,
+    *,
+    other_vehicle: bool,
+) -> dict[str, dict[str, float]]:
+    """Errors of guarded estimates with a fault injected into each piece; estimates that it makes missing count as infinite.
+
+    A piece is a range or sequence, its samples with a warm-up before it, and the state to start from, if any.
+
+    Returns:
+        Subset -> metric -> value, beside the errors without it in ``nominal``; with figures of bands and health where there is a trust.
+    """
     guarded: list[Estimate] = []
+    counted: list[Estimate] = []
     windows: list[Window] = []
     for position, (span, recording, state) in enumerate(pieces):
         start = max(span.start - recording.start_time, 0.0)
         fault = settings.within(start, recording.duration - start, position)
         samples = inject(recording.channels, recording.rate_hz, fault)
         elsewhere = other_vehicle or is_other_vehicle(trust, recording)
-        guarded.append(estimate_guarded(estimator, samples, recording, trust, state, elsewhere=elsewhere))
+        estimate = estimate_guarded(estimator, samples, recording, trust, state, elsewhere=elsewhere)
         onset = recording.start_time + fault.onset
-        windows.append((onset, onset + fault.duration))
-    return guarded, windows
-
-
-def infinite_from(windows: Sequence[Window], estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Estimates that count as infinite where they are missing after the onset of a fault."""
-    found = []
-    for (onset, _), estimate in zip(windows, estimates, strict=True):
         lost = np.isnan(estimate["vy"]) & (estimate.time >= onset)
         channels = {name: np.where(lost, np.inf, estimate[name]) for name in ("vy", "sideslip")}
-        found.append(replace(estimate, channels=channels, covariance=None, covariance_of=()))
-    return found
-
-
-def errors_and_flags(
-    scored: list[Scored], nominal: Sequence[Scored], guarded: Sequence[Estimate], windows: list[Window], rate_hz: float, *, flagged: bool
-) -> dict[str, dict[str, float]]:
-    """Subset -> metric -> value under a fault, beside the errors without it; with figures of bands and health if ``flagged``."""
+        guarded.append(estimate)
+        counted.append(replace(estimate, channels=channels, covariance=None, covariance_of=()))
+        windows.append((onset, onset + fault.duration))
+    scored = score(counted)
     found = errors_under_fault(scored, nominal, windows)
-    if flagged and FAULTED in found:
-        found[FAULTED] |= flags_under_fault(scored, [_flags(*pair) for pair in zip(guarded, scored, strict=True)], windows, rate_hz)
+    if trust is not None and FAULTED in found:
+        flags = [_flags(*pair) for pair in zip(guarded, scored, strict=True)]
+        found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
     return found
 
 

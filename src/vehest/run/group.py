@@ -16,7 +16,7 @@ import torch
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
-from vehest.run.calibrate import plan_calibrate, write_calibration
+from vehest.run.calibrate import plan_calibrate
 from vehest.run.evaluate import Evaluation, write_evaluation
 from vehest.run.locks import Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
@@ -104,7 +104,7 @@ def _member(
     calibration = evaluation = None
     calibrating = plan_calibrate(model, group.split, job.data, job.plan.output)
     if calibrating is not None:
-        calibration = made(calibrating.plan, partial(write_calibration, calibrating))
+        calibration = made(*calibrating)
         if calibration is None:
             return Member(job, model)
     if group.evaluation is not None:

@@ -1,13 +1,15 @@
 """First stage: raw files, or a simulation, to recordings in the store.
 
-data set -> source -> recording -> checks -> one Parquet file each
+data set -> its files, fetched where they are missing -> source -> recording -> checks -> one Parquet file each
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,13 @@ from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.config import Config, compose_config, key_of, missing_keys
+from vehest.run.config_files import choices
+from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
 from vehest.run.locks import held
-from vehest.run.signals import StopSignals
+from vehest.run.signals import DryRunStop, StopSignals
 from vehest.sources.base import SIMULATED, Source, open_source, source_class
-from vehest.training.context import Progress
 
 STAGE = "ingest"
 VERSION = "1"
@@ -34,13 +37,7 @@ PROSE = frozenset({"path", "title", "licence", "citation", "download"})  # of a 
 
 
 def plan_ingest(config: Config) -> StagePlan:
-    """The artefact of an ingest.
-
-    Raises:
-        MissingError: the raw files are not there.
-        ConfigurationError: the data set's configuration makes no sense.
-        DataError: a recording's name cannot be a file's.
-    """
+    """The artefact of an ingest; raises `VehestError` where raw files are missing or the data set's configuration makes no sense."""
     dataset: Mapping[str, Any] = config["dataset"]
     if missing := missing_keys(dict(dataset)):
         raise ConfigurationError(f"data set '{dataset.get('name')}': dataset.{missing[0]} is not set")
@@ -63,10 +60,6 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     """Read every recording, check it, and write it into ``folder``.
 
     Recordings of slow sources are made side by side and kept beside the artefacts until all are done: an interrupted run goes on.
-
-    Raises:
-        DataError: a recording cannot be used as it is.
-        Stopped: a signal came.
     """
     source = open_source(config["dataset"])
     ids = source.ids()
@@ -91,8 +84,8 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         else:
             done += 1
             report(done, len(ids), "")
-    if not any(parts.iterdir() if parts.is_dir() else ()):
-        remove(parts)
+    with suppress(OSError):
+        parts.rmdir()  # unless something was made
     stop.raise_if_requested()
     if failures:
         error = DataError(failures[0].message + (f" (and {len(failures) - 1} more)" if len(failures) > 1 else ""))
@@ -102,18 +95,12 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         _link(parts / recording_file(recording_id), folder / recording_file(recording_id))
 
 
-def _make_part(
-    dataset: Mapping[str, Any], recording_id: str, parts: Path, should_stop: Callable[[], bool], on_progress: Callable[[Progress], None]
-) -> None:
+def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
     _make(open_source(dataset), recording_id, parts)
 
 
 def _make(source: Source, recording_id: str, folder: Path) -> None:
-    """Read, check and write a recording.
-
-    Raises:
-        DataError: it is unusable, or a check finds an error that the data set does not accept.
-    """
+    """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
     recording = source.read(recording_id)
     for finding in checks_of_recording(recording):
         if finding.level == "error" and finding.check not in (source.dataset.get("accept") or []):
@@ -144,13 +131,8 @@ def _parts_of(plan: StagePlan) -> Path:
 
 
 def recording_file(recording_id: str) -> str:
-    """The file of a recording in the store: its name is the id itself, by which splits and later stages find it.
-
-    Raises:
-        DataError: the id cannot be a file's name, or would lead elsewhere.
-    """
-    odd = any(character in "/\\" or ord(character) < 32 for character in recording_id)
-    if odd or not recording_id or recording_id.startswith(".") or len(os.fsencode(recording_id)) > LONGEST_ID:
+    """The file of a recording in the store, by its id; raises `DataError` where that cannot be a file's name or would lead elsewhere."""
+    if not re.fullmatch(r"[^/\\\x00-\x1f.][^/\\\x00-\x1f]*", recording_id) or len(os.fsencode(recording_id)) > LONGEST_ID:
         raise DataError(
             f"a recording cannot be called '{printable(recording_id[:60])}': its name is a file's name in the store, "
             f"of up to {LONGEST_ID} bytes, without '/', '\\' and control characters, and no hidden one"
@@ -177,13 +159,52 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
     Raises:
         DataError: a recording is damaged.
     """
-    hours = 0.0
-    flagged: dict[str, list[str]] = {"spun": [], "left_road": [], "not_completed": []}
-    for name in sorted(ingested.outputs):
-        recording = read_recording(ingested.folder / name, ["vx"])
-        flags: Mapping[str, Any] = recording.provenance.get("flags", {})
-        hours += len(recording) / recording.rate_hz / 3600.0
-        for flag, holds in (("spun", flags.get("spun")), ("left_road", flags.get("left_road")), ("not_completed", not flags["completed"])):
-            if holds:
-                flagged[flag].append(recording.id)
-    return {"drives": len(ingested.outputs), "hours": hours, **flagged}
+    drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
+    flags = {drive.id: drive.provenance["flags"] for drive in drives}
+    return {
+        "drives": len(drives),
+        "hours": sum(len(drive) / drive.rate_hz for drive in drives) / 3600.0,
+        "spun": [name for name, own in flags.items() if own["spun"]],
+        "left_road": [name for name, own in flags.items() if own["left_road"]],
+        "not_completed": [name for name, own in flags.items() if not own["completed"]],
+    }
+
+
+def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
+    """Fetch missing files of a data set, and record or compare the checksums of the others; errors as of `Download.fetch`.
+
+    Raises:
+        ConfigurationError: the data set names no source of its files.
+        DryRunStop: in a dry run, if a file would have to be fetched.
+    """
+    from vehest.sources.download import download_of
+
+    source = open_source(config["dataset"])
+    if source.dataset.get("download") is None:
+        known = [name for name in choices("dataset") if compose_config("ingest", [f"dataset={name}"])["dataset"].get("download")]
+        raise ConfigurationError(
+            f"data set '{source.name}' does not say where its files can be fetched from (download); "
+            f"data sets that do: {', '.join(known) or 'none'}"
+        )
+    download = download_of(source)
+    if dry_run:
+        for name in download.missing():
+            messages.line("plan", "download", name, f"from {download.address(name)} into {download.folder}")
+        if download.missing():
+            messages.line("plan", "ingest", source.name, "then")
+            raise DryRunStop
+        return
+    with messages.bars() as bars:
+
+        def progress(name: str, done: int, total: int | None) -> None:
+            bars.step(f"download {name}", done // 1000, (total or done) // 1000, "kB")
+
+        for file in download.fetch(progress):
+            went_on = f", went on after {file.resumed_at / 1e6:.1f} MB" if file.resumed_at else ""
+            words = {
+                "matched": "is there, with the recorded checksum",
+                "recorded": f"was there; its checksum is now recorded: sha256 {file.sha256}",
+                "fetched": f"{file.size / 1e6:.1f} MB{went_on}, sha256 {file.sha256}",
+            }
+            bars.close(f"download {file.name}")
+            messages.line("skip" if file.what == "matched" else "done", "download", file.name, words[file.what])

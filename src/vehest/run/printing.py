@@ -1,4 +1,7 @@
-"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard error."""
+"""Output of a command: lines and tables or one JSON object on standard output; remarks on standard error.
+
+outcome of a study -> `TerminalSummary`: tables, and figures as JSON -> `emit`
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,21 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from vehest.data.errors import MissingError, is_printable, printable
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from vehest.studies.sweep import SweepArtefacts
+
+SCORE_HEADER = ("RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0, static map")
 
 
 @dataclass(frozen=True)
@@ -24,6 +34,16 @@ class TerminalTable:
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class TerminalSummary:
+    """Tables of a study, a note below them (may be empty), the file of its report, and the figures of ``--json`` as JSON."""
+
+    tables: tuple[TerminalTable, ...]
+    note: str
+    page: str
+    figures: str
 
 
 class OutputClosed(Exception):
@@ -41,12 +61,7 @@ def open_streams() -> None:
 
 
 def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print the outcome of a command.
-
-    Args:
-        as_json: as one JSON object.
-        outcome: plain values.
-        shown: lines and tables for people; by default a line for each key of the outcome.
+    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key.
 
     Raises:
         MissingError: the disk behind standard output is full.
@@ -67,16 +82,14 @@ def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | Non
 def _print_table(shown: TerminalTable) -> None:
     """Print a table, 160 characters wide without a terminal; a title after an empty line."""
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
     if shown.title:
         echo("")
         echo(shown.title)
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False)
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for name in shown.header:
-        table.add_column(Text(printable(name)))
+    table = Table(*(Column(Text(printable(name))) for name in shown.header), box=None, header_style="bold", pad_edge=False)
     for row in shown.rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     with console.capture() as captured:
@@ -85,12 +98,7 @@ def _print_table(shown: TerminalTable) -> None:
 
 
 def echo(text: str, keep: str = "") -> None:
-    """Print a line on standard output, control characters as escapes except for those in ``keep``.
-
-    Raises:
-        MissingError: its disk is full.
-        OutputClosed: its reader has closed it.
-    """
+    """Print a line on standard output, control characters as escapes except for those in ``keep``; errors as of `emit`."""
     try:
         typer.echo(printable(text, keep))
     except BrokenPipeError:
@@ -137,3 +145,69 @@ def as_json_text(outcome: Any) -> str:
     encoding = (sys.stdout.encoding or "utf-8").lower().replace("-", "")
     text = json.dumps(plain(outcome), indent=1, ensure_ascii=encoding != "utf8", allow_nan=False)
     return "".join(c if c == "\n" or is_printable(c) else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text)
+
+
+def summary_of_overview(overview: pd.DataFrame, left_out: Mapping[str, str]) -> TerminalSummary:
+    """The overview of a study in parts, or of recordings alone."""
+    rows = [[_cell(value) for value in row] for row in overview.itertuples(index=False)]
+    table = TerminalTable("", [str(name) for name in overview.columns], rows)
+    return _summary([table], [], {"overview": _records(overview)}, left_out)
+
+
+def summary_of_leaderboard(title: str, board: pd.DataFrame, left_out: Mapping[str, str], verdict: Sequence[str]) -> TerminalSummary:
+    """The leaderboard of a study, a table a test set, with the study's verdict."""
+    header = ("estimator", "parameters", "seeds", *SCORE_HEADER, "FVU")
+    tables, notes = [], []
+    for test_set, rows in board.groupby("test_set", sort=False):
+        given = " (estimates start at the reference state)" if (rows["start"] == "reference").any() else ""
+        cells = [
+            (row["title"], f"{row['n_parameters']:.0f}", str(row["n_seeds"]), *score_cells(row), f"{row['fvu']:.3f}")
+            for row in rows.to_dict("records")
+        ]
+        tables.append(TerminalTable(f"{title}: test set '{test_set}'{given}", header, cells))
+        if rows["rmse_sideslip_low"].isna().all():
+            notes.append(f"test set '{test_set}' is too short to tell estimators apart: no interval, no winner")
+    figures = {"leaderboard": _records(board)} | ({"verdict": list(verdict)} if verdict else {})
+    return _summary(tables, notes, figures, left_out)
+
+
+def _summary(tables: list[TerminalTable], notes: list[str], figures: dict[str, Any], left_out: Mapping[str, str]) -> TerminalSummary:
+    missing = [f"left out: {name}: {reason}" for name, reason in left_out.items()]
+    shown = "\n".join([*notes, *missing, *figures.get("verdict", [])])
+    return TerminalSummary(tuple(tables), shown, "report.html", json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})))
+
+
+def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> TerminalSummary:
+    """A row a combination with settings, seeds, mean and half interval on validation and tests."""
+    from vehest.studies.sweep import table_of
+
+    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(artefacts.kinds.values()))
+    title = f"{artefacts.name}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
+    records = _records(table)
+    figures = {
+        "chosen": next((row for row in records if row["chosen"]), None),
+        "summary": records,
+        "failed": [{"jobs": name, "message": reason} for name, reason in artefacts.failures.items()],
+    }
+    note = "* lowest mean on the validation range; tests choose nothing" if table["chosen"].any() else ""
+    return TerminalSummary((TerminalTable(title, *table_of(artefacts, table)),), note, "report.md", json.dumps(figures))
+
+
+def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:
+    """Cells of a ranked estimate under `SCORE_HEADER`."""
+    low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
+    interval = f"{low:.3f} … {high:.3f}" if low > 0 else "–"
+    return (f"{row['rmse_sideslip']:.3f}", interval, str(row["against_best"]), f"{row['beats_zero']}, {row['beats_static_map']}")
+
+
+def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows with null in place of numbers that are not finite."""
+    rows: list[dict[str, Any]] = json.loads(table.to_json(orient="records"))
+    return rows
+
+
+def _cell(value: Any) -> str:
+    """A value of a table, numbers with four significant digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}" if math.isfinite(value) else "–"
+    return str(value)

@@ -25,8 +25,7 @@ from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
 from vehest.run.downsample import code_of_downsampling
 from vehest.run.evaluate import code_of_evaluation
-from vehest.run.evaluate_faults import code_under_faults
-from vehest.run.faults import all_of, faults_of
+from vehest.run.evaluate_faults import all_of, code_under_faults, faults_of
 from vehest.run.ingest import PROSE, code_of_ingest, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.report import code_of_report

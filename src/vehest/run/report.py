@@ -22,13 +22,13 @@ from vehest.evaluation.under_fault import FAULTED
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan, provenance
 from vehest.run.comparison import Comparison
 from vehest.run.evaluate import COLUMNS, METRICS, scored_spans
-from vehest.run.faults import FaultSettings, chosen_fault
+from vehest.run.evaluate_faults import FaultSettings, chosen_fault
 from vehest.run.group import Member
 from vehest.run.ingest import STAGE as INGEST
+from vehest.run.printing import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
 from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
-from vehest.run.terminal import TerminalSummary, summary_of_leaderboard, summary_of_overview, summary_of_sweep
 from vehest.run.train import new_estimator, read_fit_metrics, recording_file
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,

@@ -29,8 +29,8 @@ from vehest.run.artefacts import Artefact, library_versions, read_artefact
 from vehest.run.config_files import conf_folders, find_pipeline, packaged_pipelines
 from vehest.run.console import WARNING, Messages
 from vehest.run.launchers.base import LauncherOptions
+from vehest.run.printing import TerminalSummary
 from vehest.run.publishing import Publication, publish_study
-from vehest.run.terminal import TerminalSummary
 
 if TYPE_CHECKING:
     from vehest.run.runner import Runner
@@ -120,7 +120,8 @@ class RunCache:
         if record is None or self.file is None:
             return None
         messages = Messages(quiet=options.quiet)
-        messages.again(record.lines)
+        for line in record.lines:
+            messages.line(*line)
         report = read_artefact(self.file.parents[1] / list(record.made)[-1])
         published = None if options.dry_run else publish_study(record.publication, report, messages)
         return Ran(record.summary, report.folder, True, published)

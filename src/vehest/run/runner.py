@@ -19,13 +19,12 @@ from vehest.data.split_files import Reader, dataset_names, split_from_config
 from vehest.data.splits import Split
 from vehest.data.store import read_recording
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
-from vehest.run.compiling import has_to_compile
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
 from vehest.run.evaluate import Evaluation, protocol_from_config
+from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
-from vehest.run.faults import FaultSettings
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
 from vehest.run.launchers.base import Launcher, LaunchProgress
@@ -33,7 +32,7 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker, log_member, rmse_of_tests
-from vehest.run.train import read_fit_metrics
+from vehest.run.train import has_to_compile, read_fit_metrics
 from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.record import read_trust

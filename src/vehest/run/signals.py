@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 
 
@@ -33,11 +33,7 @@ class StopSignals:
         return self.number is not None
 
     def raise_if_requested(self) -> None:
-        """Stop now if a signal came.
-
-        Raises:
-            Stopped: it did.
-        """
+        """Raise `Stopped` if a signal came."""
         if self.number is not None:
             raise Stopped(self.number)
 
@@ -72,11 +68,8 @@ class TimeLimit:
 
     def __init__(self, stop: StopSignals, until: float | None) -> None:
         self._stop, self._until = stop, until
+        self.deferred = stop.deferred
 
     def requested(self) -> bool:
         """Whether a signal came, or the time is up."""
         return self._stop.requested() or (self._until is not None and time.monotonic() >= self._until)
-
-    def deferred(self) -> AbstractContextManager[None]:
-        """That of the signals."""
-        return self._stop.deferred()

@@ -35,8 +35,8 @@ from vehest.run.config import (
     value_of,
 )
 from vehest.run.config_files import find_pipeline, pipeline_names
+from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
-from vehest.run.faults import faults_of
 from vehest.run.train import TrainJob, new_estimator
 from vehest.studies.registry import study_module, study_names
 from vehest.studies.sweep import Value, short_names, shown_value

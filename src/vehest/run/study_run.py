@@ -17,19 +17,18 @@ from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, M
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact, find
-from vehest.run.calibrate import calibration_of, plan_calibrate, write_calibration
+from vehest.run.calibrate import calibration_of, plan_calibrate
 from vehest.run.comparison import Comparison, lower_rate, named_failures, print_notes, slowest
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
 from vehest.run.evaluate import fault_figures, write_evaluation
-from vehest.run.faults import check_channels, faults_of
+from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
-from vehest.run.launchers.base import chosen_launcher
+from vehest.run.launchers.base import LauncherOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
-from vehest.run.launchers.options import LauncherOptions
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import Publication, publish_study
 from vehest.run.report import STAGE as REPORT
@@ -272,7 +271,7 @@ def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], ru
     if model.status == "complete" and (not learnt or set(learnt) == {*split.train, *split.validation}):
         job = plan_calibrate(model, split, data, runner.output)
         if job is not None:
-            found = runner.ensure(job.plan, partial(write_calibration, job))
+            found = runner.ensure(*job)
     elif learnt:  # one of a model that learns nothing may have seen these tests
         found = calibration_of(model.folder, runner.output)
     if found is None:

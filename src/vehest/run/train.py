@@ -6,6 +6,7 @@ configuration, split, recordings -> TrainJob -> `fit_jobs` -> estimator and reco
 from __future__ import annotations
 
 import csv
+import importlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +28,9 @@ STAGE = "train"
 VERSION = "1"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
+
+SLOW = {"learned_ukf": "vehest.estimators.kernels.planar_car"}
+"""Estimators that compile for tens of seconds -> their slowest kernel."""
 
 T = TypeVar("T")
 
@@ -51,11 +55,7 @@ class TrainJob:
 
 
 def new_estimator(config: Mapping[str, Any]) -> Estimator:
-    """An estimator before its fit.
-
-    Raises:
-        ConfigurationError: an unknown name or setting.
-    """
+    """An estimator before its fit; raises `ConfigurationError` for an unknown name or setting."""
     return estimator_class(str(config["name"])).from_config(config)
 
 
@@ -79,7 +79,8 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
     content = {
         "estimator": dict(config["estimator"]),
         "training": {key: value for key, value in config["training"].items() if key != "checkpoint_seconds"},
-        **{role: [_plain(span) for span in spans] for role, spans in (("train", split.train), ("validation", split.validation))},
+        "train": [_plain(span) for span in split.train],
+        "validation": [_plain(span) for span in split.validation],
         "seed": seed,
         **({} if estimator.learns else {"downsample": _preparation(data)}),  # otherwise part of the inputs
     }
@@ -95,21 +96,24 @@ def _plain(span: Span) -> dict[str, str]:
 
 
 def code_of_training(estimator: str) -> str:
-    """Version of a training of an estimator.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """Version of a training of an estimator."""
     kind = estimator_class(estimator)
     return f"train={VERSION} {estimator}={kind.version} training={getattr(kind.training_type, 'version', '1')}"
 
 
-def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
-    """Train the jobs of one group together, each as if it were alone.
+def has_to_compile(estimator: str) -> bool:
+    """Whether an estimator's training compiles on this machine before it starts; later ones load the result."""
+    if estimator not in SLOW:
+        return False
+    kernel = importlib.import_module(SLOW[estimator])
+    if not hasattr(kernel._transition, "stats"):  # NUMBA_DISABLE_JIT
+        return False
+    folder = kernel._transition.stats.cache_path
+    return folder is not None and not any(Path(folder).glob(f"{kernel.__name__.rpartition('.')[2]}._transition-*.nbi"))
 
-    Raises:
-        DataError: the recordings do not fit the estimator.
-    """
+
+def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:
+    """Train the jobs of one group together, each as if it were alone; raises `DataError` where recordings do not fit the estimator."""
     first, members = jobs[0], [new_estimator(job.estimator) for job in jobs]
     for member, job in zip(members, jobs, strict=True):
         member.seed(job.seed)
@@ -153,31 +157,18 @@ def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]])
 
 
 def read_fit_metrics(folder: Path) -> dict[str, float]:
-    """Figures of a fit, such as ``epochs``, and its times.
-
-    Raises:
-        MissingError: they are not there.
-        DataError: they are damaged.
-    """
+    """Figures of a fit, such as ``epochs``, and its times."""
     paths = (folder / FIT_METRICS, folder / TIMINGS)
     return {row["metric"]: number_in(row, "value", path) for path in paths for row in read_rows(path, ("metric", "value"))}
 
 
 def trained_rate(model: Artefact) -> float:
-    """The rate that a model works at [Hz].
-
-    Raises:
-        DataError: its manifest lacks it.
-    """
+    """The rate that a model works at [Hz]."""
     return _from_manifest(model, lambda config: float(config["estimator"]["rate_hz"]))
 
 
 def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
-    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles.
-
-    Raises:
-        DataError: its manifest lacks them.
-    """
+    """The ranges that a model was trained on (``train``) and stopped on (``validation``), or those of the named roles."""
 
     def ranges(config: Mapping[str, Any]) -> list[Span]:
         named = [own for role in roles or ("train", "validation") for own in config[role]]
@@ -187,6 +178,7 @@ def learnt_spans(model: Artefact, *roles: str) -> list[Span]:
 
 
 def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T:
+    """Raises `DataError` where a manifest describes no training."""
     try:
         return read(model.config)
     except (LookupError, TypeError, ValueError, ConfigurationError) as error:
@@ -194,21 +186,13 @@ def _from_manifest(model: Artefact, read: Callable[[Mapping[str, Any]], T]) -> T
 
 
 def recording_file(data: Artefact, span: Span) -> Path:
-    """The stored recording of a span.
-
-    Raises:
-        DataError: the data set does not have it.
-    """
+    """The stored recording of a span; raises `DataError` where the data set does not have it."""
     file_digest(data, span)
     return data.folder / f"{span.recording}.parquet"
 
 
 def file_digest(data: Artefact, span: Span) -> str:
-    """Digest of the recording of a span.
-
-    Raises:
-        DataError: the data set does not have it.
-    """
+    """Digest of the recording of a span; raises `DataError` where the data set does not have it."""
     name = f"{span.recording}.parquet"
     if name not in data.outputs:
         known = ", ".join(sorted(Path(file).stem for file in data.outputs))
