@@ -316,10 +316,7 @@ def estimate(
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet or .csv.")] = Path("estimate.parquet"),
     strict: Annotated[
-        bool,
-        typer.Option(
-            "--strict", help="End with exit code 3, and write nothing, where a check finds something in the channels that are read."
-        ),
+        bool, typer.Option("--strict", help="Exit code 3 and no file where a check finds something in the channels read.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
