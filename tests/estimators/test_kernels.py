@@ -213,6 +213,6 @@ def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest
     monkeypatch.setattr(group, "find", lambda _: seen.extend(threads()) or job)
     monkeypatch.setattr(group, "_member", lambda *_: None)
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with
-        group.Group([job]).run(lambda: False, lambda progress: None)
+        group.Group([job], SimpleNamespace()).run(lambda: False, lambda progress: None)
         assert set(seen) == {1}
         assert set(threads()) == {2}

@@ -265,8 +265,8 @@ def test_a_fault_can_be_added_to_any_study_on_the_command_line(place):
     ("evaluation", "message"),
     [
         ({"faults": [{"kind": "bias", "channel": "nowhere", "severity": "mild"}]}, "fault.channel 'nowhere' is not there"),
-        ({"faults": "bias"}, "evaluation.faults = 'bias': faults are a list of faults"),
-        ({"rate_hz": [{"kind": "bias"}]}, "evaluation.rate_hz = "),
+        ({"faults": "bias"}, "faults must be a list of faults, each with its kind"),
+        ({"rate_hz": [{"kind": "bias"}]}, "evaluation.rate_hz must be a number"),
     ],
 )
 def test_faults_of_a_pipeline_that_make_no_sense_are_one_line(place, evaluation, message):

@@ -21,7 +21,7 @@ from pathlib import Path
 from vehest.data.errors import VehestError
 from vehest.data.files import aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
-from vehest.run import calibrate, downsample, evaluate, evaluate_faults, ingest, report, sweep, train
+from vehest.run import calibrate, downsample, evaluate, evaluate_faults, ingest, report, train
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.run_cache import FINISHED
 
@@ -33,7 +33,7 @@ CODES: dict[str, Callable[[str], str]] = {
     calibrate.STAGE: calibrate.code_of_calibration,
     evaluate.STAGE: evaluate.code_of_evaluation,
     report.STAGE: report.code_of_report,
-    sweep.STAGE: lambda _: sweep.code_of_sweep(),
+    report.SWEEP: lambda _: report.SWEEP_CODE,
 }
 """Stage -> today's version of its code, by the name of the source, estimator or study."""
 OUTDATED, DAMAGED, ORPHANED = "its code has changed", "it is damaged", "its inputs are gone"
