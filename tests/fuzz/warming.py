@@ -25,6 +25,7 @@ PIECES = (
     "pooch",
     "requests",
     "netrc",
+    "pydantic._internal._serializers",
 )
 PACKAGES = ("typer", "rich")
 

@@ -44,8 +44,8 @@ DEVICES = ("/dev/null", "/dev/full", "/dev/zero", "/dev/tty", "/dev/shm/")
 NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made, though a user may ask for it
 
 # Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels, syntax trees; annotations of the commands'
-# own functions, which inspect and typing evaluate for Typer; and rosbags, which makes dataclasses and readers of message layouts whose
-# names its grammar has let through. Whatever a payload would do is noticed as well: the file that it makes, or the program.
+# own functions, which inspect and typing evaluate for Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates
+# a store; and rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let through. Whatever a payload would do is noticed as well: the file that it makes, or the program.
 MAKERS = (
     "dataclasses",
     "collections",
@@ -55,6 +55,7 @@ MAKERS = (
     "llvmlite.",
     "rosbags.typesys.store",
     "rosbags.serde.",
+    "sqlalchemy.util.langhelpers",
     "ast",
 )
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
