@@ -45,7 +45,8 @@ NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made,
 
 # Modules whose own work makes code: fields of dataclasses and named tuples, compiled kernels, syntax trees; annotations of the commands'
 # own functions, which inspect and typing evaluate for Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates
-# a store; and rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let through. Whatever a payload would do is noticed as well: the file that it makes, or the program.
+# a store; and rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let through. Whatever a payload
+# would do is noticed as well: the file that it makes, or the program.
 MAKERS = (
     "dataclasses",
     "collections",
