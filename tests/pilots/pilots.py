@@ -137,8 +137,12 @@ def main() -> None:
     parser.add_argument("--compare", nargs=2, type=Path, metavar="OUT", help="compare two folders of tables instead")
     given = parser.parse_args()
     if given.compare:
-        sys.exit(compare(*given.compare) > 0)
-    studies = given.studies or sorted({file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - ABSENT)
+        absent = [str(folder) for folder in given.compare if not folder.is_dir()]
+        sys.exit(f"there is no folder {' or '.join(absent)}" if absent else compare(*given.compare) > 0)
+    known = {file.stem for file in (ROOT / "pipelines").glob("*.yaml")} - ABSENT
+    if set(given.studies) - known:
+        sys.exit(f"no pilot of {', '.join(sorted(set(given.studies) - known))}; there are: {', '.join(sorted(known))}")
+    studies = given.studies or sorted(known)
     with tempfile.TemporaryDirectory(prefix="pilots-") as output:  # a new one: keys say nothing of code whose versions stayed
         write_data_sets(Path(output) / "conf" / "dataset")
         succeeded = [run(study, given.out.resolve(), Path(output), given.jobs) for study in studies]
