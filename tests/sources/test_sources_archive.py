@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-import os
 import random
 import stat
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -58,12 +57,6 @@ def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> Non
     assert not folder.exists()
 
 
-def test_the_folder_goes_even_if_what_was_done_with_it_fails(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), unpacked(packed(tmp_path, CONTENT)) as folder:
-        _ = 1 / 0
-    assert not folder.exists()
-
-
 def test_names_with_backslashes_or_dots_in_the_middle_are_paths_inside(tmp_path: Path) -> None:
     with unpacked(packed(tmp_path, {"bag\\a..b": b"1", "./bag/./c": b"2"})) as folder:
         assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == ["bag/a..b", "bag/c"]
@@ -92,44 +85,23 @@ def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> 
     assert not (tmp_path.parent / "evil").exists()
 
 
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [(stat.S_IFLNK, "is a symbolic link"), (stat.S_IFIFO, "neither a file nor"), (stat.S_IFCHR, "neither"), (stat.S_IFSOCK, "neither")],
-)
-def test_links_and_special_files_are_refused(tmp_path: Path, kind: int, said: str) -> None:
+@pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO, stat.S_IFCHR, stat.S_IFSOCK])
+def test_links_and_special_files_are_refused(tmp_path: Path, kind: int) -> None:
     file = tmp_path / "bag.zip"
     with zipfile.ZipFile(file, "w") as archive:
         entry = zipfile.ZipInfo("bag/data.db3")
         entry.external_attr = (kind | 0o777) << 16
         archive.writestr(entry, "/etc/passwd")
-    assert said in refusal(file)
+    assert "is a link or a special file" in refusal(file)
 
 
-def test_a_link_does_not_become_a_way_for_a_later_entry(tmp_path: Path) -> None:
-    file = tmp_path / "bag.zip"
-    with zipfile.ZipFile(file, "w") as archive:
-        entry = zipfile.ZipInfo("bag")
-        entry.external_attr = (stat.S_IFLNK | 0o777) << 16
-        archive.writestr(entry, str(tmp_path))
-        archive.writestr("bag/evil", "evil")
-    assert "'bag' is a symbolic link" in refusal(file)
-
-
-def test_more_bytes_than_the_limit_are_refused_before_any_is_written(tmp_path: Path) -> None:
+def test_more_bytes_or_entries_than_the_limit_are_refused(tmp_path: Path) -> None:
     file = packed(tmp_path, {"zeros": bytes(10**6), "more": bytes(10**6)})
     assert file.stat().st_size < 10**4
-    assert "would unpack to 0.002 GB, more than the limit of 0.0015 GB" in refusal(file, most_bytes=1_500_000)
+    assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refusal(file, most_bytes=1_500_000)
+    assert "holds 2 entries" in refusal(file, most_files=1)
     with unpacked(file, most_bytes=2_000_000) as folder:
         assert (folder / "more").stat().st_size == 10**6
-
-
-def test_an_archive_that_claims_terabytes_is_refused(tmp_path: Path) -> None:
-    file = packed(tmp_path, {"data.db3": b"small"})
-    raw = bytearray(file.read_bytes())
-    directory = raw.index(b"PK\x01\x02")
-    raw[directory + 24 : directory + 28] = (2**32 - 2).to_bytes(4, "little")
-    file.write_bytes(raw)
-    assert "would unpack to 4.29 GB, more than the limit of 1 GB" in refusal(file, most_bytes=10**9)
 
 
 def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None:
@@ -141,19 +113,6 @@ def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None
     assert "not a sound zip archive" in refusal(file)
 
 
-def test_more_entries_than_the_limit_are_refused(tmp_path: Path) -> None:
-    assert "holds 11 entries, more than the limit of 10" in refusal(packed(tmp_path, {str(k): b"" for k in range(11)}), most_files=10)
-
-
-def test_entries_that_overwrite_each_other_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "bag.zip"
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("bag/a", "1")
-        archive.writestr("bag/./a", "2")
-    assert "two entries called" in refusal(file)
-    assert "is a file, too" in refusal(packed(tmp_path, {"bag": b"1", "bag/a": b"2"}))
-
-
 def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
     file = packed(tmp_path, {"data.db3": b"secret"})
     raw = bytearray(file.read_bytes())
@@ -161,24 +120,6 @@ def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
         raw[at] |= 1
     file.write_bytes(raw)
     assert "is encrypted" in refusal(file)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda raw: raw[: len(raw) // 2],
-        lambda raw: raw[:-10],
-        lambda raw: b"",
-        lambda raw: b"SQLite format 3\x00" + bytes(1000),
-        lambda raw: raw[:60] + bytes(40) + raw[100:],
-    ],
-    ids=["half", "tail", "empty", "other format", "zeros inside"],
-)
-def test_a_truncated_or_corrupt_archive_is_refused(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    content = {"data.db3": random.Random(0).randbytes(5000)}
-    file = packed(tmp_path, content)
-    file.write_bytes(damage(file.read_bytes()))
-    assert "not a sound zip archive" in refusal(file)
 
 
 def test_whatever_is_flipped_in_an_archive_is_refused_or_harmless(tmp_path: Path) -> None:
@@ -207,8 +148,11 @@ def test_whatever_is_flipped_in_an_archive_is_refused_or_harmless(tmp_path: Path
     assert not any("\n" in refused for refused in refusals)
 
 
-def test_a_missing_archive_is_named(tmp_path: Path) -> None:
-    assert "there is no file" in refusal(tmp_path / "nowhere.zip", MissingError)
+@pytest.mark.parametrize(
+    "content", [{"bag": b"1", "bag/a": b"2"}, {"bag/a": b"1", "bag/./a": b"2"}, {"x" * 300: b"1"}, {"a/" * 3000 + "b": b"1"}]
+)
+def test_paths_that_no_disk_takes_are_refused(tmp_path: Path, content: dict[str, bytes]) -> None:
+    assert "cannot be unpacked" in refusal(packed(tmp_path, content))
 
 
 def test_a_missing_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,17 +173,8 @@ def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path: Path) -> 
         assert "holds a list of entries of" in refusal(file)
 
 
-@pytest.mark.parametrize("name", ["x" * 300, "a/" * 100 + "b"])
-def test_names_that_no_disk_takes_and_folders_without_end_are_refused(tmp_path: Path, name: str) -> None:
-    assert "has too long a name, or lies in too many folders" in refusal(packed(tmp_path, {name: b"1"}))
-
-
-def test_an_archive_inside_an_archive_stays_one(tmp_path: Path) -> None:
-    inner = packed(tmp_path, CONTENT, "inner.zip").read_bytes()
-    with unpacked(packed(tmp_path, {"bag/inner.zip": inner})) as folder:
-        assert [path.name for path in folder.rglob("*") if path.is_file()] == ["inner.zip"]
-
-
-def test_a_pipe_is_no_archive(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "bag.zip")
-    assert "is a pipe, not a file" in refusal(tmp_path / "bag.zip")
+@pytest.mark.parametrize("left", [0, 200, -10])
+def test_a_truncated_archive_is_refused(tmp_path: Path, left: int) -> None:
+    file = packed(tmp_path, CONTENT)
+    file.write_bytes(file.read_bytes()[:left])
+    assert "not a sound zip archive" in refusal(file)

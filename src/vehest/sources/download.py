@@ -127,8 +127,9 @@ class Download:
             if error.errno is not None:
                 raise writing_error(path, error) from error
             reason = str(error).rsplit(": ", 1)[-1].split("', ")[0].rstrip("'\")")  # the innermost of the errors that requests reports
+            trust = "no trusted connection, " if "SSLError" in str(error) else ""
             part = "; the same command goes on after what has arrived" if downloader.part.exists() else ""
-            raise MissingError(f"cannot fetch {self.address(name)}: {reason[:160]}{part}") from None
+            raise MissingError(f"cannot fetch {self.address(name)}: {trust}{reason[:160]}{part}") from None
         except ValueError as error:  # of pooch, which has removed the file
             raise DataError(f"{self.address(name)}: {error} {self._origin(name)}") from None
         return Outcome(name, "fetched", found, path.stat().st_size, downloader.resumed_at)
