@@ -30,7 +30,7 @@ from vehest.run.ingest import plan_ingest, recording_file
 from vehest.run.printing import TerminalTable
 from vehest.run.usable import SCORED, absent_channels, all_usabilities, usable_in_words
 from vehest.sources.base import kind_of, open_source, origin_in_words, read_single
-from vehest.sources.unused import unused_columns
+from vehest.sources.tabular import unused_columns
 
 EARLIEST_UNIX, LATEST_UNIX = 6e8, 4e9  # s, 1989 to 2096: time stamps of recordings in between count from 1970
 MOST_COLUMNS = 40  # of a table that are listed

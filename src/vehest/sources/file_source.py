@@ -1,0 +1,85 @@
+"""Base of sources whose files are a recording each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.recording import Recording
+from vehest.sources.base import Source, matching_files
+from vehest.sources.columns import Clock
+from vehest.sources.tables import listed
+
+
+class FileSource(Source):
+    """Files that match the option ``files`` in the folder ``path``, a recording each; a file's stem is the recording's name.
+
+    Attributes:
+        gappy: channels in which NaN means "not measured".
+    """
+
+    gappy: frozenset[str] = frozenset()
+
+    def ids(self) -> list[str]:
+        """Stems of the files, in alphabetical order."""
+        return [file.stem for file in self._files()]
+
+    def inputs(self) -> dict[str, str | Path]:
+        """The files."""
+        return {file.name: file for file in self._files()}
+
+    def read_raw(self, recording_id: str) -> Recording:
+        """Read one file by its stem.
+
+        Raises:
+            MissingError: there is none of that name.
+            DataError: it cannot be used.
+        """
+        for file in self._files():
+            if file.stem == recording_id:
+                return self.read_raw_file(file)
+        raise self._no_recording(recording_id)
+
+    def _files(self) -> list[Path]:
+        return matching_files(self.dataset, self.options.files)
+
+    def _no_recording(self, recording_id: str) -> MissingError:
+        return MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {listed(self.ids())})")
+
+    def _require_pattern(self) -> None:
+        """See that ``files`` is a pattern inside the folder."""
+        pattern = self.options.files
+        if not pattern or Path(pattern).is_absolute():
+            raise ConfigurationError(f"data set '{self.name}': files must be a pattern inside path, such as '*.csv', not '{pattern}'")
+
+    def _recording(
+        self, recording_id: str, where: str, clock: Clock, channels: Mapping[str, FloatArray], provenance: Mapping[str, Any]
+    ) -> Recording:
+        """A recording of this data set.
+
+        Raises:
+            DataError: its channels make none; ``where`` names the file.
+        """
+        try:
+            return Recording(
+                id=recording_id,
+                vehicle=str(self.dataset.get("vehicle", "unknown")),
+                rate_hz=clock.rate_hz,
+                start_time=clock.start_time,
+                channels=channels,
+                kind=self.kind,
+                gappy=self.gappy,
+                provenance={"dataset": self.name, "source": self.dataset["source"], **provenance},
+            )
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from None
+
+    def _gappy_among(self, channels: Iterable[str]) -> frozenset[str]:
+        """Channels that the option ``gappy`` names, which must be among the data set's."""
+        gappy = frozenset(self.options.gappy or ())
+        for name in sorted(gappy - set(channels)):
+            raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
+        return gappy

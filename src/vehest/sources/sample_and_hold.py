@@ -1,0 +1,113 @@
+"""Slow channels that a table repeats from row to row until their next sample: straight lines between the samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.constants import FloatArray
+from vehest.data.channels import channel
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import validated
+from vehest.sources.columns import Clock, Column
+
+
+@dataclass(frozen=True)
+class SampleAndHold:
+    """Channels whose values stand in every row, though they are new in few.
+
+    Args:
+        channels: their names.
+        updated: column that changes with every new sample, such as a time stamp of the sensors' own; None: a sample is new in the rows
+            in which any of the channels changes.
+        delay: how much later than it was taken a sample first stands in a row [s], of all channels or of some.
+    """
+
+    channels: Annotated[tuple[str, ...], "a list of channels"]
+    updated: str | int | None = None
+    delay: float | dict[str, float] = 0.0
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Channel -> its delay [s]."""
+        if isinstance(self.delay, dict):
+            return {name: float(self.delay.get(name, 0.0)) for name in self.channels}
+        return dict.fromkeys(self.channels, float(self.delay))
+
+    def description(self, rate_hz: float) -> dict[str, Any]:
+        """Provenance of the channels."""
+        return {"channels": list(self.channels), "rate_hz": round(rate_hz, 3), "delay": self.delays}
+
+    def interpolated(
+        self, columns: Mapping[str, Column], values: Mapping[str, FloatArray], clock: Clock, where: str
+    ) -> tuple[dict[str, FloatArray], slice, float]:
+        """Held channels on a recording's clock, along straight lines, which look ahead by up to one interval.
+
+        Args:
+            columns: of the held channels.
+            values: of a table's columns, shape (T,).
+            clock: of the recording.
+            where: file, for messages.
+
+        Returns:
+            Channels on every tick, NaN outside their samples; the ticks between two samples of every channel; rate of the samples [Hz].
+
+        Raises:
+            DataError: the channels change in fewer than two rows, or no tick lies between two samples of each.
+        """
+        markers = [str(self.updated)] if self.updated is not None else list(dict.fromkeys(column.column for column in columns.values()))
+        rows = _changes([values[name] for name in markers])
+        if len(rows) < 2:
+            raise DataError(f"{where}: the held channels change in {len(rows)} rows; was their sensor connected? leave the file out")
+        times, ticks = clock.times_of_rows()[rows], clock.ticks()
+        found = {}
+        for name, column in columns.items():
+            samples, taken = column.to_si(values[column.column], channel(name).unit)[rows], times
+            if self.updated is None:
+                samples, taken = with_repeats(samples, times)
+            found[name] = between_samples(samples, taken, self.delays[name], ticks)
+        begin, end = (times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1))
+        inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
+        if not len(inside):
+            raise DataError(f"{where}: no row lies between two samples of every held channel; are their delays in seconds?")
+        return found, slice(int(inside[0]), int(inside[-1]) + 1), (len(rows) - 1) / float(times[-1] - times[0])
+
+
+def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndHold:
+    """A data set's declaration of held channels.
+
+    Raises:
+        ConfigurationError: it names a channel that the data set does not declare, or makes no sense.
+    """
+    held = validated(SampleAndHold, entry, where, error=ConfigurationError)
+    delayed = held.delay if isinstance(held.delay, dict) else {}
+    for name in (*held.channels, *delayed):
+        if name not in (known if name in held.channels else ()):
+            raise ConfigurationError(f"{where} names '{name}', which is not one of {'its' if name in delayed else "the data set's"} channels")
+    return held
+
+
+def between_samples(samples: FloatArray, times: FloatArray, delay: float, grid: FloatArray) -> FloatArray:
+    """A held channel on another clock: straight lines between its samples, NaN outside."""
+    return np.interp(grid, times - delay, samples, left=np.nan, right=np.nan)
+
+
+def with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Samples and times where no column marks updates: a value that stays was sampled again, up to an interval before the next change.
+
+    The interval is the median one between changes. Without this a straight line would be drawn through all of a standstill.
+    """
+    intervals = np.diff(times)
+    typical = float(np.median(intervals))
+    late = np.flatnonzero(intervals > 1.5 * typical)
+    return np.insert(samples, late + 1, samples[late]), np.insert(times, late + 1, times[late + 1] - typical)
+
+
+def _changes(columns: Sequence[FloatArray]) -> NDArray[np.int64]:
+    """Rows, counted from 0, in which any column differs from the row before; the sample of the first row may be older."""
+    changed = np.any([np.diff(column) != 0 for column in columns], axis=0)
+    return np.flatnonzero(changed).astype(np.int64) + 1

@@ -1,0 +1,215 @@
+"""Reads columns of numbers from tables of text (CSV) and Parquet.
+
+file -> names of its columns -> pyarrow -> columns of float64
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pc
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError, printable
+from vehest.data.files import regular_file
+from vehest.data.limits import check_limit, check_unpacked
+from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
+from vehest.data.text_files import first_line
+from vehest.sources.clock_times import seconds_of_text
+
+BLOCK = 1 << 20  # bytes; the longest line that pyarrow reads
+PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
+
+
+@dataclass(frozen=True)
+class TextLayout:
+    """Layout of a table of text.
+
+    Args:
+        delimiter: between cells.
+        decimal: mark of numbers.
+        encoding: of the text.
+        skip_rows: lines above the names; above the rows where ``names`` are given.
+        rows_below_names: lines between the names and the rows.
+        missing: cells without a sample, beside empty ones, NaN, NA and null.
+        names: of the columns where the file has no line of them.
+    """
+
+    delimiter: str = ","
+    decimal: str = "."
+    encoding: str = "utf8"
+    skip_rows: int = 0
+    rows_below_names: int = 0
+    missing: tuple[str, ...] = ()
+    names: tuple[str, ...] | None = None
+
+
+def is_parquet(file: Path) -> bool:
+    """Whether a file is Parquet by its ending."""
+    return file.suffix.lower() in {".parquet", ".pq"}
+
+
+def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
+    """Names of a table's columns, in order.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, or has too many columns.
+    """
+    if layout.names is not None:
+        names = list(layout.names)
+    elif is_parquet(file):
+        with parquet_file(file) as table:
+            names = list(table.schema_arrow.names)
+    else:
+        try:
+            lines = first_lines(file, layout)
+            names = next(csv.reader(lines[:1], delimiter=layout.delimiter), [])
+        except (*DAMAGE, csv.Error) as error:
+            raise _unreadable(file, error) from None
+    check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
+    return names
+
+
+def first_lines(file: Path, layout: TextLayout) -> list[str]:
+    """Lines from the one of names on that are not empty, as far as a megabyte goes."""
+    with table_stream(file) as stream:
+        text = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace").decode(stream.read(BLOCK))
+    return [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
+
+
+def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str = "") -> dict[str, FloatArray]:
+    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
+
+    Args:
+        file: a table.
+        wanted: names of columns.
+        layout: of a table of text.
+        clock: the wanted column that holds times as a clock shows them; it is returned in seconds.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
+    """
+    require_columns(file, column_names(file, layout), wanted)
+    if is_parquet(file):
+        with parquet_file(file) as table:
+            return read_numbers(file, table, wanted)
+    return parse_columns(file, partial(table_stream, file), wanted, layout, clock)
+
+
+def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> None:
+    """See that a table has every wanted column once.
+
+    Raises:
+        DataError: it does not.
+    """
+    for name in wanted:
+        count = names.count(name)
+        if count > 1:
+            raise DataError(f"'{file}' has {count} columns called '{printable(name)}'; rename or remove all but one")
+        if not count:
+            raise DataError(f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset")
+
+
+def parse_columns(
+    file: Path, opened: Callable[[], pa.NativeFile], wanted: Sequence[str], layout: TextLayout, clock: str = ""
+) -> dict[str, FloatArray]:
+    """Columns of numbers of a table of text, as `read_columns` does.
+
+    Args:
+        file: for messages.
+        opened: opens the table's text.
+        wanted: names of columns that are there once each.
+        layout: of the table.
+        clock: the wanted column that holds times as a clock shows them.
+    """
+    convert = pc.ConvertOptions(
+        column_types={name: pa.string() if name == clock else pa.float64() for name in wanted},
+        include_columns=list(wanted),
+        decimal_point=layout.decimal,
+        null_values=[*pc.ConvertOptions().null_values, *layout.missing],
+    )
+    try:
+        table = parse_table(opened, layout, convert)
+    except DAMAGE:
+        try:
+            table = parse_table(opened, layout, convert, threads=False)  # its errors state the row
+        except DAMAGE as error:
+            raise _wrong_cell(file, layout, str(error)) or _unreadable(file, error) from None
+    if not table.num_rows:
+        raise DataError(f"'{file}' has a header and no rows")
+    check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
+    columns = {name: table.column(name) for name in wanted}
+    del table
+    return {name: _seconds(file, name, columns.pop(name)) if name == clock else columns.pop(name).to_numpy() for name in wanted}
+
+
+def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:
+    """Table of text as pyarrow converts it; raises what pyarrow raises."""
+    read = pc.ReadOptions(
+        use_threads=threads,
+        block_size=BLOCK,
+        encoding=layout.encoding,
+        skip_rows=layout.skip_rows,
+        skip_rows_after_names=layout.rows_below_names,
+        column_names=None if layout.names is None else list(layout.names),
+    )
+    with opened() as stream:
+        return pc.read_csv(stream, read, pc.ParseOptions(delimiter=layout.delimiter), convert)
+
+
+def table_stream(file: Path) -> pa.NativeFile:
+    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it is a pipe, a device or a folder, or unpacks to more than it may.
+        OSError: it cannot be opened, or is damaged.
+    """
+    packed = PACKED.get(regular_file(file).suffix.lower())
+    stream = pa.input_stream(open(file, "rb"), compression=packed)  # pyarrow opens no name that is not UTF-8
+    if packed is None:
+        return stream
+    blocks, size = [], 0
+    with stream:
+        while block := stream.read(BLOCK):
+            blocks.append(block)
+            size += len(block)
+            check_unpacked(file, file.stat().st_size, size)
+    return pa.BufferReader(b"".join(blocks))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a message."""
+    return ", ".join(printable(name[:60]) for name in names[:12]) + (", …" if len(names) > 12 else "")
+
+
+def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
+    seconds = seconds_of_text(cells)
+    if seconds is None:
+        raise DataError(f"'{file}': column '{name}' holds other text than times such as 10:59:30.25 or 2024-05-03T10:59:30.25")
+    return seconds
+
+
+def _wrong_cell(file: Path, layout: TextLayout, message: str) -> DataError | None:
+    """The error for text in a column of numbers; None where pyarrow's message is of something else."""
+    found = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", message, re.DOTALL)
+    if found is None:
+        return None
+    name, above = column_names(file, layout)[int(found[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
+    text = printable(found[3] if len(found[3]) <= 40 else f"{found[3][:40]}…")
+    return DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {int(found[2]) - above}; numbers are needed")
+
+
+def _unreadable(file: Path, error: Exception) -> DataError:
+    problem = printable(first_line(error))
+    return DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?")
