@@ -19,7 +19,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
@@ -33,7 +32,7 @@ SECONDS = 15.0  # of processor time for a small file
 SECONDS_PER_BYTE = 1e-6
 WAITING = 8.0  # times the processor time: a busy machine, or one without limits of its own
 MEMORY_PER_BYTE = 10.0
-_ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")}
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
