@@ -14,21 +14,18 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_clock
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config, uniform_clock
+from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, unevenness, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config
 from vehest.sources.unit_spellings import require_unit
 
 OWN_KEYS = frozenset({"interpolation", "max_gap"})  # of a channel, beside those of every column
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 FASTER = 1.05  # than the raster: the rest would fold into it
-LATEST_TICK = 1e12  # 30 years at 1 kHz
-TICK = 1e-6  # of an interval; times that are nearer are the same
 
 
 @dataclass(frozen=True)
@@ -192,11 +189,7 @@ class SignalSource(Source):
         begin, end = spans[late][0], spans[early][1]
         if self.raster is None:
             rate = float(self.rate_hz or 0.0)
-            if not max(abs(begin), abs(end)) * rate < LATEST_TICK:
-                raise DataError(f"'{file}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {rate:g} Hz; the file is damaged")
-            check_limit("samples", (end - begin) * rate, f"'{file}' would become {(end - begin) * rate:.0f} samples at {rate:g} Hz")
-            first, last = math.ceil(begin * rate - TICK), math.floor(end * rate + TICK)
-            grid = Grid(np.arange(first, last + 1) / rate, rate)
+            grid = Grid(common_ticks(begin, end, rate, f"'{file}'"), rate)
         else:
             signal = signals[self.raster]
             stamps = signal.stamps[(signal.stamps >= begin) & (signal.stamps <= end)]
@@ -217,8 +210,8 @@ class SignalSource(Source):
                 f"would fold; take that rate here and let 'vehest downsample' filter, or accept: [aliasing]"
             )
         if name in self.gappy:
-            return _nearest(signal, grid)
-        near = TICK / grid.rate_hz
+            return on_nearest(signal.values, np.rint((signal.stamps - grid.times[0]) * grid.rate_hz), len(grid.times))
+        near = SLACK / grid.rate_hz
         first = max(int(np.searchsorted(signal.stamps, grid.times[0] + near, side="right")) - 1, 0)
         last = int(np.searchsorted(signal.stamps, grid.times[-1] - near, side="left"))
         stamps, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
@@ -226,10 +219,7 @@ class SignalSource(Source):
         _refuse_gaps(stamps, declared.max_gap if declared.max_gap is not None else GAP / signal.rate_hz, where)
         if grid.stamps is not None and np.array_equal(stamps, grid.stamps):
             return values
-        if declared.interpolation == "hold":
-            latest = np.searchsorted(stamps, grid.times + near, side="right") - 1
-            return values[np.maximum(latest, 0)]
-        return np.interp(grid.times, stamps, values)
+        return at_ticks(values, stamps, grid.times, hold=declared.interpolation == "hold", slack=near)
 
     def _require_units(self, signals: Mapping[str, Signal], file: Path) -> None:
         if self.dataset.get("file_units", "check") == "ignore":
@@ -286,11 +276,10 @@ def _even_clock(stamps: FloatArray, where: str) -> Grid:
     """The clock of a group whose samples come evenly."""
     if len(stamps) < 2:
         return Grid(stamps, 0.0)
-    findings = checks_of_clock(stamps)
-    if findings:
-        raise DataError(f"{where} does not come evenly: {findings[0].message}; give rate_hz instead of raster")
+    if uneven := unevenness(stamps):
+        raise DataError(f"{where} does not come evenly: {uneven}; give rate_hz instead of raster")
     clock = uniform_clock(stamps, where)
-    return Grid(clock.start_time + np.arange(clock.n_samples) / clock.rate_hz, clock.rate_hz, stamps)
+    return Grid(clock.ticks(), clock.rate_hz, stamps)
 
 
 def _valid_span(signal: Signal, where: str) -> tuple[float, float]:
@@ -313,19 +302,10 @@ def _refuse_invalid(stamps: FloatArray, values: FloatArray, where: str) -> None:
 
 def _refuse_gaps(stamps: FloatArray, limit: float, where: str) -> None:
     steps = np.diff(stamps)
-    gaps = np.flatnonzero(steps > limit * (1.0 + TICK))
+    gaps = np.flatnonzero(steps > limit * (1.0 + SLACK))
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         raise DataError(
             f"{where} is not measured for {steps[longest]:.6g} s after {stamps[longest]:.6g} s, {len(gaps)} such gaps in all "
             f"(longer than {limit:.6g} s); cut the range out, or declare max_gap if values may be interpolated over that time"
         )
-
-
-def _nearest(signal: Signal, grid: Grid) -> FloatArray:
-    """Every sample on its nearest tick, NaN on the others: interpolation would invent what was not measured."""
-    values = np.full(len(grid.times), np.nan)
-    ticks = np.rint((signal.stamps - grid.times[0]) * grid.rate_hz)
-    kept = (ticks >= 0) & (ticks < len(values)) & ~np.isnan(signal.values)
-    values[ticks[kept].astype(np.int64)] = signal.values[kept]
-    return values

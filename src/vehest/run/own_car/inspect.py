@@ -22,7 +22,7 @@ from vehest.data.splits import check_name
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
-from vehest.sources.columns import plain_rate
+from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit

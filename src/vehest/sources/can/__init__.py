@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_clock
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
@@ -21,6 +20,7 @@ from vehest.data.text_files import first_line
 from vehest.sources.base import matching_files, require_files
 from vehest.sources.can.database import Database, Message, read_database
 from vehest.sources.can.logs import frames_of
+from vehest.sources.clocks import require_clock
 from vehest.sources.signals import Signal, SignalOptions, SignalSource
 
 FEWEST = 2
@@ -96,9 +96,7 @@ class CanSource(SignalSource):
         for name, (stamps, values) in series.items():
             message = wanted[name].message
             where = f"'{file}': message '{message.name}', which carries '{wanted[name].signal}',"
-            for finding in checks_of_clock(stamps):
-                if finding.check == "clock":
-                    raise DataError(f"{where}: {finding.message}; where two buses carry it, say which by bus: …")
+            require_clock(stamps, where, "where two buses carry it, say which by bus: …")
             signals[name] = Signal(f"message '{message.name}'", stamps, values, message.units[wanted[name].signal])
         rates = {signal.origin.removeprefix("message ").strip("'"): round(signal.rate_hz, 3) for signal in signals.values()}
         return signals, {"dbc": self.dbc.name, "messages": rates}
