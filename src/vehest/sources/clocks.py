@@ -87,8 +87,7 @@ def _median_step(stamps: FloatArray, where: str) -> float:
     step = float(np.median(np.diff(stamps)))
     if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
         raise DataError(
-            f"{where}: the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); "
-            f"correct the unit of time, which is declared in conf/dataset"
+            f"{where}: the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); correct the unit of time"
         )
     return step
 
@@ -220,7 +219,7 @@ def uniform_times(
     """
     if len(stamps) < FEWEST:
         raise DataError(f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed")
-    _require_order(stamps, where, fix, may_repeat=True)
+    _require_order(stamps, where, "repair or cut the range out", may_repeat=True)
     number = np.arange(len(stamps), dtype=np.float64)
     step, first = _robust_line(number, stamps)
     found = 1.0 / step if step > 0 else math.inf
