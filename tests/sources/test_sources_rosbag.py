@@ -764,7 +764,7 @@ def test_a_chunk_must_unpack_to_what_it_announces(tmp_path: Path, compression: s
         ({"channels": {"vx": {"topic": "motor", "field": "motor.rpm", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
         ({"channels": {"speed": CHANNELS["vx"]}}, "channel 'speed' is not known"),
         ({"channels": {"vx": {"topic": "motor", "unit": "m/s"}}}, "must say field, topic, unit"),
-        ({"channels": {"vx": CHANNELS["vx"] | {"sign": 2}}}, "sign must be 1 or -1"),
+        ({"channels": {"vx": CHANNELS["vx"] | {"sign": 2}}}, "sign '2' is not one of: 1, -1"),
         ({"channels": {"vx": CHANNELS["vx"] | {"offset": "none"}}}, "offset must be a number"),
         ({"channels": {"vx_ref": CHANNELS["vx"]}}, "'vx_ref' comes both from channels and from pose"),
         ({"channels": {}, "pose": None}, "neither channels nor a pose"),

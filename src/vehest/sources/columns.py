@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
@@ -14,6 +16,7 @@ from vehest.data.units import factor_to_si
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
+Positive = Annotated[float, Field(gt=0)]
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Column:
 
     column: str
     unit: str
-    sign: int = 1
+    sign: Literal[1, -1] = 1
     factor: Annotated[float, "a number other than 0"] = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
@@ -38,58 +41,58 @@ class Column:
         return values if factor == 1.0 else values * factor
 
 
-def columns_from_config(entries: Mapping[str, Any], dataset: str) -> dict[str, Column]:
+def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column) -> dict[str, Column]:
     """The map of channels that a data set declares.
+
+    Args:
+        entries: channel -> its declaration.
+        dataset: for messages.
+        kind: of which the declarations are.
 
     Raises:
         ConfigurationError: an unknown channel, unit or key.
     """
-    if not isinstance(entries, Mapping):
-        raise ConfigurationError(f"data set '{dataset}': channels must map a channel to its column and unit, not {entries}")
     columns = {}
     for name, entry in entries.items():
         where = f"data set '{dataset}': channel '{name}'"
         try:
-            described = channel(str(name))
-            column = column_from_config(entry, where)
-            factor_to_si(column.unit, described.unit)
+            unit = channel(str(name)).unit
         except DataError as error:
             raise ConfigurationError(f"{where}: {error}") from None
-        columns[str(name)] = column
+        columns[str(name)] = column_from_config(entry, where, unit, kind)
     return columns
 
 
-def column_from_config(entry: Any, where: str) -> Column:
+def column_from_config(entry: Any, where: str, si_unit: str | None = None, kind: type[Column] = Column) -> Column:
     """One column's declaration.
 
+    Args:
+        entry: mapping of column, unit and, if need be, sign and factor.
+        where: for messages.
+        si_unit: to which the unit must be convertible; None for any.
+        kind: of which the declaration is.
+
     Raises:
-        ConfigurationError: it does not say column and unit, or says something else too.
+        ConfigurationError: a key is missing or unknown, or the unit is of another quantity.
     """
     if not isinstance(entry, Mapping):
         raise ConfigurationError(f"{where} must say column, unit and, if need be, sign and factor, not {str(entry)[:80]}")
     name = entry.get("column")
     named = {**entry, "column": str(name)} if type(name) is int else dict(entry)  # YAML reads a column called 3 as a number
-    column = validated(Column, named, where, error=ConfigurationError)
-    if column.sign not in (1, -1):
-        raise ConfigurationError(f"{where}: sign must be 1 or -1, not {column.sign}")
+    column = validated(kind, named, where, error=ConfigurationError)
     if column.factor == 0:
         raise ConfigurationError(f"{where}: factor must be a number other than 0")
+    if si_unit is not None:
+        try:
+            factor_to_si(column.unit, si_unit)
+        except DataError as error:
+            raise ConfigurationError(f"{where}: {error}") from None
     return column
 
 
 def time_column_from_config(entry: Any, dataset: str) -> Column:
-    """The declaration of the time column.
-
-    Raises:
-        ConfigurationError: it does not say column and unit, or the unit is none of time.
-    """
-    where = f"data set '{dataset}': time"
-    column = column_from_config(entry, where)
-    try:
-        factor_to_si(column.unit, "s")
-    except DataError as error:
-        raise ConfigurationError(f"{where}: {error}") from None
-    return column
+    """The declaration of the time column; raises `ConfigurationError` as `column_from_config` does."""
+    return column_from_config(entry, f"data set '{dataset}': time", "s")
 
 
 def identity_columns(names: list[str]) -> dict[str, Column]:

@@ -1,16 +1,17 @@
-"""Signals that come each at a time of its own, in groups of several rasters or in frames of a bus, brought to one clock.
+"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that says otherwise is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that contradicts it is refused.
+
+file -> a `Signal` each channel -> ticks on which all that are not gappy have values -> channels
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
@@ -20,27 +21,24 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
 from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, unevenness, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, columns_from_config
 from vehest.sources.unit_spellings import require_unit
 
-OWN_KEYS = frozenset({"interpolation", "max_gap"})  # of a channel, beside those of every column
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 FASTER = 1.05  # than the raster: the rest would fold into it
 
 
 @dataclass(frozen=True)
-class SignalChannel:
+class SignalChannel(Column):
     """How a channel comes from a signal.
 
     Args:
-        column: name, unit, sign and factor.
         interpolation: ``linear``, or ``hold`` for values that stand until the next one.
         max_gap: longest time between two samples that is interpolated [s]; None for three median intervals.
     """
 
-    column: Column
-    interpolation: str = "linear"
-    max_gap: float | None = None
+    interpolation: Literal["linear", "hold"] = "linear"
+    max_gap: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -82,55 +80,69 @@ class Signal:
 
 @dataclass(frozen=True)
 class SignalOptions:
-    """Options of every source of signals, by type; what is None is not said."""
+    """Options of every source of signals.
+
+    Args:
+        channels: channel -> its declaration, see `SignalChannel`.
+        path: folder of the files.
+        files: pattern inside it.
+        rate_hz: of the recordings.
+        raster: channel whose clock is taken instead.
+        gappy: channels in which NaN means "not measured".
+        file_units: whether units that the files state are checked.
+    """
 
     channels: ChannelMap
     path: str | None = None
-    files: str | None = None
-    rate_hz: float | None = None
+    files: str = "*"
+    rate_hz: Positive | None = None
     raster: str | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"
 
 
 class SignalSource(Source):
-    """Files of signals, a recording each.
-
-    Options: ``path`` and ``files`` (glob), ``rate_hz`` or ``raster`` (a channel whose clock is taken), ``channels``, ``gappy`` and
-    ``file_units`` (``check`` or ``ignore``).
+    """Files of signals, a recording each; options: `SignalOptions`.
 
     Attributes:
-        pattern: of files, where the data set names none.
-        own_keys: of a channel, beside those that every source of signals has.
+        own_keys: of a channel's declaration, which the source itself reads.
     """
 
-    keys = frozenset({"path", "files", "rate_hz", "raster", "channels", "gappy", "file_units"})
-    pattern: ClassVar[str]
+    options_type = SignalOptions
+    options: SignalOptions
     own_keys: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.where = f"data set '{self.name}'"
-        self.channels = channels_from_config(dataset.get("channels"), self.name, self.own_keys)
-        self.gappy = self._gappy(dataset.get("gappy") or [])
-        self.rate_hz, self.raster = dataset.get("rate_hz"), dataset.get("raster")
-        if (self.rate_hz is None) == (self.raster is None):
+        options = self.options
+        entries = {
+            name: {key: value for key, value in entry.items() if key not in self.own_keys} if isinstance(entry, Mapping) else entry
+            for name, entry in options.channels.items()
+        }
+        self.channels = cast(dict[str, SignalChannel], columns_from_config(entries, self.name, SignalChannel))
+        self.gappy = frozenset(options.gappy or ())
+        if not self.channels:
+            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        if unknown := sorted(self.gappy - set(self.channels)):
+            raise ConfigurationError(f"{self.where}: gappy names '{unknown[0]}', which is not one of its channels")
+        if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken")
-        if self.rate_hz is not None:
-            _require_positive(self.rate_hz, f"{self.where}: rate_hz")
-        if self.raster is not None and (self.raster not in self.channels or self.raster in self.gappy):
-            raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{self.raster}'")
-        pattern = dataset.get("files", self.pattern)
-        if not pattern or Path(pattern).is_absolute():
-            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '{self.pattern}', not '{pattern}'")
+        if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
+            raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
+        if not options.files or Path(options.files).is_absolute():
+            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '*.mf4', not '{options.files}'")
 
     def ids(self) -> list[str]:
         """Stems of the files, in alphabetical order."""
-        return [file.stem for file in matching_files(self.dataset, self.pattern)]
+        return [file.stem for file in self.files()]
 
     def inputs(self) -> dict[str, str | Path]:
         """The files of signals."""
-        return {file.name: file for file in matching_files(self.dataset, self.pattern)}
+        return {file.name: file for file in self.files()}
+
+    def files(self) -> list[Path]:
+        """The files of signals, in alphabetical order; raises as `matching_files` does."""
+        return matching_files(self.dataset, self.options.files)
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one file by its stem.
@@ -139,7 +151,7 @@ class SignalSource(Source):
             MissingError: there is none of that name.
             DataError: it is damaged, more than the limits, lacks a signal, or its signals cannot be brought to one clock.
         """
-        for file in matching_files(self.dataset, self.pattern):
+        for file in self.files():
             if file.stem == recording_id:
                 return self.read_raw_file(file)
         raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {', '.join(self.ids())})")
@@ -153,11 +165,13 @@ class SignalSource(Source):
         """
         require_files([file], self.name)
         signals, provenance = self._read_signals(file)
-        self._require_units(signals, file)
+        if self.options.file_units == "check":
+            for name, signal in signals.items():
+                where = self._signal_name(name, signal, file)
+                require_unit(signal.unit, self.channels[name], channel(name).unit, where, "set file_units: ignore")
         grid = self._grid(signals, file)
         channels = {
-            name: self.channels[name].column.to_si(self._on_grid(name, signal, grid, file), channel(name).unit)
-            for name, signal in signals.items()
+            name: self.channels[name].to_si(self._on_grid(name, signal, grid, file), channel(name).unit) for name, signal in signals.items()
         }
         try:
             return Recording(
@@ -175,7 +189,7 @@ class SignalSource(Source):
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, and what is to be known of the file.
+        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance.
 
         Raises:
             DataError: it is damaged, more than the limits, or lacks a signal.
@@ -187,11 +201,10 @@ class SignalSource(Source):
         spans = {name: _valid_span(signal, self._signal_name(name, signal, file)) for name, signal in spanning.items()}
         late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
         begin, end = spans[late][0], spans[early][1]
-        if self.raster is None:
-            rate = float(self.rate_hz or 0.0)
-            grid = Grid(common_ticks(begin, end, rate, f"'{file}'"), rate)
+        if self.options.rate_hz is not None:
+            grid = Grid(common_ticks(begin, end, self.options.rate_hz, f"'{file}'"), self.options.rate_hz)
         else:
-            signal = signals[self.raster]
+            signal = signals[str(self.options.raster)]
             stamps = signal.stamps[(signal.stamps >= begin) & (signal.stamps <= end)]
             grid = _even_clock(stamps, f"'{file}': {signal.origin}, whose clock is taken,")
         if len(grid.times) < 2:
@@ -203,10 +216,10 @@ class SignalSource(Source):
 
     def _on_grid(self, name: str, signal: Signal, grid: Grid, file: Path) -> FloatArray:
         """A signal's values at the ticks, in the file's unit."""
-        declared, where = self.channels[name], self._signal_name(name, signal, file)
-        if signal.rate_hz > FASTER * grid.rate_hz and "aliasing" not in (self.dataset.get("accept") or []):
+        declared, where, rate_hz = self.channels[name], self._signal_name(name, signal, file), signal.rate_hz
+        if rate_hz > FASTER * grid.rate_hz and "aliasing" not in (self.dataset.get("accept") or []):
             raise DataError(
-                f"{where} comes at {signal.rate_hz:.6g} Hz, faster than the raster of {grid.rate_hz:.6g} Hz, into which vibrations "
+                f"{where} comes at {rate_hz:.6g} Hz, faster than the raster of {grid.rate_hz:.6g} Hz, into which vibrations "
                 f"would fold; take that rate here and let 'vehest downsample' filter, or accept: [aliasing]"
             )
         if name in self.gappy:
@@ -216,60 +229,13 @@ class SignalSource(Source):
         last = int(np.searchsorted(signal.stamps, grid.times[-1] - near, side="left"))
         stamps, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
         _refuse_invalid(stamps, values, where)
-        _refuse_gaps(stamps, declared.max_gap if declared.max_gap is not None else GAP / signal.rate_hz, where)
+        _refuse_gaps(stamps, declared.max_gap or GAP / rate_hz, where)
         if grid.stamps is not None and np.array_equal(stamps, grid.stamps):
             return values
         return at_ticks(values, stamps, grid.times, hold=declared.interpolation == "hold", slack=near)
 
-    def _require_units(self, signals: Mapping[str, Signal], file: Path) -> None:
-        if self.dataset.get("file_units", "check") == "ignore":
-            return
-        for name, signal in signals.items():
-            where = self._signal_name(name, signal, file)
-            require_unit(signal.unit, self.channels[name].column, channel(name).unit, where, "set file_units: ignore")
-
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
-        return f"'{file}': signal '{self.channels[name].column.column}' of {signal.origin}, for channel '{name}',"
-
-    def _gappy(self, names: Any) -> frozenset[str]:
-        for name in names:
-            if name not in self.channels:
-                raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")
-        return frozenset(names)
-
-
-def channels_from_config(entries: Any, dataset: str, further: frozenset[str] = frozenset()) -> dict[str, SignalChannel]:
-    """The map of channels, with what only signals have.
-
-    Args:
-        entries: channel -> its declaration.
-        dataset: for messages.
-        further: keys that the source itself looks at.
-
-    Raises:
-        ConfigurationError: an unknown channel, unit or key.
-    """
-    if not isinstance(entries, Mapping) or not entries:
-        raise ConfigurationError(f"data set '{dataset}': channels must map a channel to its column and unit, not {entries}")
-    plain = {
-        name: {key: value for key, value in entry.items() if key not in OWN_KEYS | further} if isinstance(entry, Mapping) else entry
-        for name, entry in entries.items()
-    }
-    channels = {}
-    for name, column in columns_from_config(plain, dataset).items():
-        own, where = entries[name], f"data set '{dataset}': channel '{name}'"
-        interpolation, max_gap = own.get("interpolation", "linear"), own.get("max_gap")
-        if interpolation not in ("linear", "hold"):
-            raise ConfigurationError(f"{where}: interpolation '{interpolation}' is not one of: linear, hold")
-        if max_gap is not None:
-            _require_positive(max_gap, f"{where}: max_gap")
-        channels[name] = SignalChannel(column, str(interpolation), max_gap)
-    return channels
-
-
-def _require_positive(value: Any, where: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise ConfigurationError(f"{where} must be a positive number, not {value}")
+        return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
 
 
 def _even_clock(stamps: FloatArray, where: str) -> Grid:
@@ -283,7 +249,7 @@ def _even_clock(stamps: FloatArray, where: str) -> Grid:
 
 
 def _valid_span(signal: Signal, where: str) -> tuple[float, float]:
-    """Times of the first and last sample that holds [s]."""
+    """Times of the first and last valid sample [s]."""
     valid = np.flatnonzero(~np.isnan(signal.values))
     if len(valid) == 0:
         raise DataError(f"{where} holds no valid sample; leave the channel out")
