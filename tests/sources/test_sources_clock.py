@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.sources.clocks import require_clock, stamped_times, unevenness, uniform_clock, uniform_times
 from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config
+from vehest.sources.surveys import survey
 
 RATES = [10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
 PROPERTY = settings(max_examples=120, deadline=None, derandomize=True, database=None)
@@ -192,6 +194,14 @@ def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(pol
     assert str(error.value).startswith("'lap.csv': ")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("rows", [1000, 400])
+def test_a_survey_names_a_stray_time_stamp(tmp_path: Path, rows: int) -> None:
+    stamps = np.where(np.arange(1000) == rows - 1, 1e9, EVEN)
+    np.savetxt(tmp_path / "lap.csv", np.stack([stamps, EVEN], axis=1), delimiter=",", header="time,vx", comments="", fmt="%.3f")
+    with pytest.raises(DataError, match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} \(1000000000 s\)"):
+        survey(tmp_path / "lap.csv")
 
 
 def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples() -> None:

@@ -13,10 +13,12 @@ from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
+from vehest.sources.clocks import HIGHEST_RATE
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
 Positive = Annotated[float, Field(gt=0)]
+Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
 from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, unevenness, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
@@ -95,7 +95,7 @@ class SignalOptions:
     channels: ChannelMap
     path: str | None = None
     files: str = "*"
-    rate_hz: Positive | None = None
+    rate_hz: Rate | None = None
     raster: str | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"

@@ -1,6 +1,6 @@
-"""What a log holds before anybody has said what its columns are: names, units as written, numbers, and what looks like a clock.
+"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column that looks like a clock.
 
-Nothing is made a channel here; ``vehest.alignment.proposals`` says what speaks for which.
+Nothing is made a channel here; ``vehest.alignment.proposals`` finds which column is which channel.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
+from vehest.sources.clocks import require_span
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.tables import survey_table
 
@@ -18,11 +19,11 @@ MDF, VBO, BAGS = (".mf4", ".mdf", ".dat"), (".vbo",), (".db3", ".mcap", ".zip", 
 
 
 def survey(path: Path) -> Log:
-    """What one file, or a bag's folder, holds.
+    """Columns of one file, or of a bag's folder.
 
     Raises:
         MissingError: it is not there or empty, or a package is missing that its format needs.
-        DataError: it is of no format that is read, damaged, or holds no numbers.
+        DataError: it is of no format that is read, damaged, holds no numbers, or a time stamp is a stray one.
     """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
@@ -49,6 +50,12 @@ def survey(path: Path) -> Log:
         log = survey_table(path)
     if not log.columns:
         raise DataError(f"'{path}' holds no column of numbers")
+    if log.seconds is not None:
+        for run in log.runs:
+            require_span(log.seconds[run], f"'{path}'")
+    for column in log.columns:
+        if column.stamps is not None:
+            require_span(column.stamps, f"'{path}': '{column.name}'")
     return log
 
 
