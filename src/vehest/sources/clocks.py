@@ -38,67 +38,66 @@ MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
 RATE_TOLERANCE = 5e-3
 
 
-def require_clock(stamps: FloatArray, where: str, fix: str = SORT) -> None:
-    """Check the rule for the clock of every recording: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
+def require_clock(stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False) -> None:
+    """Refuse time stamps that have a `clock_fault`; ``where`` names file and signal.
+
+    Raises:
+        DataError: they have one.
+    """
+    if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
+        raise DataError(f"{where}: {fault}")
+
+
+def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
+    """How time stamps break the rule for every recording: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
 
     Args:
-        stamps: times [s], shape (T,).
-        where: file and signal, for messages.
-        fix: how to repair the order, for messages.
+        stamps: time stamps [s], shape (T,).
+        fix: how to repair their order.
+        may_repeat: whether they may repeat, as those with software delay do.
 
-    Raises:
-        DataError: the times break the rule.
+    Returns:
+        The fault and what to do about it, in words; empty where the rule holds.
     """
-    _require_order(stamps, where, fix)
-    _median_step(stamps, where)
-    require_span(stamps, where)
+    if fault := _order_fault(stamps, fix, may_repeat):
+        return fault
+    step = float(np.median(np.diff(stamps)))
+    if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
+        return f"the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); correct the unit of time"
+    return span_fault(stamps)
 
 
-def require_span(stamps: FloatArray, where: str) -> None:
-    """Refuse a stray time stamp: more than 1e8 median steps from the first to the last stamp [s], shape (T,); they may repeat.
+def span_fault(stamps: FloatArray) -> str:
+    """A stray one among time stamps, more than 1e8 median steps from the others, in words; empty where none is.
 
-    Raises:
-        DataError: they span more.
+    Args:
+        stamps: in any unit, at least two, shape (T,); they may repeat.
     """
     steps = np.diff(stamps)
-    step = float(np.median(steps)) or float(steps.mean()) if len(steps) else math.inf
-    if stamps[-1] - stamps[0] > MOST_STEPS * step:
-        at = int(np.argmax(steps))
-        raise DataError(
-            f"{where}: time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of {steps[at]:.6g} s between sample {at} "
-            f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, or what lies on one side"
-        )
+    step = float(np.median(steps)) or float(steps.mean())
+    if not stamps[-1] - stamps[0] > MOST_STEPS * step:
+        return ""
+    at = int(np.argmax(steps))
+    return (
+        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of {steps[at]:.6g} s between sample {at} "
+        f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, or what lies on one side"
+    )
 
 
-def _require_order(stamps: FloatArray, where: str, fix: str, *, may_repeat: bool = False) -> None:
-    if found := _disorder(stamps, may_repeat):
-        raise DataError(f"{where}: {found}; {fix}")
-
-
-def _disorder(stamps: FloatArray, may_repeat: bool) -> str:
+def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
     if len(stamps) < 2:
-        return "fewer than two time stamps"
+        return f"fewer than two time stamps; {fix}"
     odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
     if len(odd):
         time = float(stamps[odd[0]])
         what = f"{time:.6g} s, which is no time of a drive" if math.isfinite(time) else "not a number"
-        return f"time stamp of sample {odd[0]} is {what}"
+        return f"time stamp of sample {odd[0]} is {what}; {fix}"
     steps = np.diff(stamps)
     for what, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
         if bad.any():
             first = int(np.argmax(bad)) + 1
-            return f"time {what} {bad.sum()} times, first at sample {first} ({stamps[first]:.12g} s)"
+            return f"time {what} {bad.sum()} times, first at sample {first} ({stamps[first]:.12g} s); {fix}"
     return ""
-
-
-def _median_step(stamps: FloatArray, where: str) -> float:
-    """Median step [s] of ordered stamps, which lies between that of 1e5 Hz and a day."""
-    step = float(np.median(np.diff(stamps)))
-    if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
-        raise DataError(
-            f"{where}: the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); correct the unit of time"
-        )
-    return step
 
 
 def unevenness(stamps: FloatArray) -> str:
@@ -169,14 +168,12 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
         DataError: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
             hold more samples than the limits allow.
     """
-    intervals = len(stamps) - 1
+    require_clock(stamps, where, may_repeat=policy == "uniform")
+    start, elapsed, intervals = float(stamps[0]), float(stamps[-1] - stamps[0]), len(stamps) - 1
     if policy == "uniform":
-        _require_order(stamps, where, SORT, may_repeat=True)
-        nominal = plain_rate(1.0 / _median_step(stamps, where), INTERPOLATED_TOLERANCE)
+        nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
         sampled = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
         return Clock(float(sampled.times[0]), plain_rate(float(sampled.rate_hz or 0.0), min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
-    require_clock(stamps, where)
-    start, elapsed = float(stamps[0]), float(stamps[-1] - stamps[0])
     if policy == "interpolate":
         rate = plain_rate(1.0 / mean_step(np.diff(stamps)), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
@@ -228,7 +225,8 @@ def uniform_times(
     """
     if len(stamps) < FEWEST:
         raise DataError(f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed")
-    _require_order(stamps, where, "repair or cut the range out", may_repeat=True)
+    if fault := _order_fault(stamps, "repair or cut the range out", may_repeat=True):
+        raise DataError(f"{where}: {fault}")
     number = np.arange(len(stamps), dtype=np.float64)
     step, first = _robust_line(number, stamps)
     found = 1.0 / step if step > 0 else math.inf

@@ -5,11 +5,12 @@ Nothing is made a channel here; ``vehest.alignment.proposals`` finds which colum
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
-from vehest.sources.clocks import require_span
+from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.tables import survey_table
 
@@ -48,14 +49,14 @@ def survey(path: Path) -> Log:
         raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
     else:
         log = survey_table(path)
+    for run in log.runs:
+        if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
+            raise DataError(f"'{path}': {fault}")
+    faults = {one.name: clock_fault(one.stamps, may_repeat=True) for one in log.columns if one.stamps is not None}
+    skipped = tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
+    log = replace(log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=log.skipped + skipped)
     if not log.columns:
-        raise DataError(f"'{path}' holds no column of numbers")
-    if log.seconds is not None:
-        for run in log.runs:
-            require_span(log.seconds[run], f"'{path}'")
-    for column in log.columns:
-        if column.stamps is not None:
-            require_span(column.stamps, f"'{path}': '{column.name}'")
+        raise DataError(f"'{path}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     return log
 
 
