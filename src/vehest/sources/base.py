@@ -23,12 +23,8 @@ from vehest.sources.clocks import require_clock
 
 TEMPLATES = {
     ".vbo": "vbo",
-    ".mf4": "mdf",
-    ".mdf": "mdf",
-    ".dat": "mdf",
-    ".bag": "f1tenth_bag",
-    ".db3": "f1tenth_bag",
-    ".mcap": "f1tenth_bag",
+    **dict.fromkeys((".mf4", ".mdf", ".dat"), "mdf"),
+    **dict.fromkeys((".bag", ".db3", ".mcap"), "f1tenth_bag"),
 }
 """Ending of a file that is no table -> data set that shows how such files are declared."""
 DERIVED = "derived"
@@ -73,15 +69,15 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 def origin_in_words(recording: Recording) -> list[str]:
     """Where a recording's channels were measured and which were derived, by its data set, a line each."""
-    told = recording.provenance.get(DERIVED) or {}
+    declared = recording.provenance.get(DERIVED) or {}
     lines = []
-    if "reference_point" in told:
-        moved = ", moved to it" if told.get("moved_to_centre_of_gravity") else ""
-        lines.append(f"reference measured {_point_in_words(told['reference_point'])}{moved}")
-    if "imu_point" in told:
-        lines.append(f"inertial unit {_point_in_words(told['imu_point'])}")
-    if told.get("transforms"):
-        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in told['transforms'])}")
+    if "reference_point" in declared:
+        moved = ", moved to it" if declared.get("moved_to_centre_of_gravity") else ""
+        lines.append(f"reference measured {_point_in_words(declared['reference_point'])}{moved}")
+    if "imu_point" in declared:
+        lines.append(f"inertial unit {_point_in_words(declared['imu_point'])}")
+    if declared.get("transforms"):
+        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in declared['transforms'])}")
     held = recording.provenance.get("held")
     if held:
         lines.append(f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between")
@@ -159,7 +155,7 @@ class Source(ABC):
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
-        """What the recordings are made from: name -> file, or a version where there is no file.
+        """Inputs of the recordings: name -> file, or a version where there is no file.
 
         Raises:
             MissingError: a file or folder is not there.
@@ -170,20 +166,21 @@ class Source(ABC):
         """Names of the recordings, in order."""
 
     def read(self, recording_id: str) -> Recording:
-        """Make one recording, with the channels that the data set derives and its reference at the centre of gravity.
+        """One recording, with the channels that the data set derives and its reference at the centre of gravity.
 
         Raises:
-            DataError: its files cannot be used as they are.
+            MissingError: there is none of that name, or a file is missing.
+            DataError: its files cannot be used.
         """
         return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
-        """Make a recording of a file wherever it is, or of what else one recording is made of, as `read` does.
+        """A recording of a file, or of a bag's folder, wherever it is, as `read` makes it.
 
         Raises:
-            ConfigurationError: this source's recordings are none of a file.
-            MissingError: it is not there.
-            DataError: it cannot be used as it is.
+            ConfigurationError: this source reads no single files.
+            MissingError: the file is not there.
+            DataError: it cannot be used.
         """
         return self._prepared(self.read_raw_file(file))
 
@@ -198,32 +195,21 @@ class Source(ABC):
         point, moved = self.reference_point, False
         if isinstance(point, Point) and (point.x or point.y) and "vy_ref" in recording:
             recording, moved = ReferenceLever(point.x, point.y)(recording), True
-        told = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
-        if not told:
+        declared = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
+        if not declared:
             return recording
-        noted = {DERIVED: {**told, "moved_to_centre_of_gravity": moved}}
-        return replace(recording, provenance={**recording.provenance, **noted})
+        return replace(recording, provenance={**recording.provenance, DERIVED: {**declared, "moved_to_centre_of_gravity": moved}})
 
     @abstractmethod
     def read_raw(self, recording_id: str) -> Recording:
-        """Make one recording of what its files hold.
-
-        Raises:
-            DataError: they cannot be used as they are.
-        """
+        """One recording of its files as they are; raises as `read` does."""
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Make a recording of what a file holds.
-
-        Raises:
-            ConfigurationError: this source's recordings are none of a file.
-            MissingError: it is not there.
-            DataError: it cannot be used as it is.
-        """
+        """A recording of a file as it is; raises as `read_file` does."""
         raise ConfigurationError(f"{self.where}: source '{self.dataset.get('source')}' reads no single files")
 
     def file_names(self) -> list[str]:
-        """Files that the recordings are made of, as far as the configuration alone tells: what ``download`` fetches if it lists none."""
+        """Files that the configuration alone names, which ``download`` fetches if it lists none."""
         return []
 
     def recordings(self) -> Iterator[Recording]:
@@ -283,9 +269,7 @@ def existing_folder(path: Any, dataset: str) -> Path:
         MissingError: no root was given, or the folder is not there.
     """
     if str(path or "None").split("/")[0] in {"None", "null"}:
-        raise MissingError(
-            f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA to the folder with the recordings"
-        )
+        raise MissingError(f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA")
     folder = Path(str(path)).expanduser()
     if not folder.is_dir():
         raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
@@ -316,7 +300,7 @@ def matching_files(dataset: Mapping[str, Any], default: str) -> list[Path]:
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:
-    """See that files are there and hold something.
+    """Refuse missing and empty files.
 
     Raises:
         MissingError: one is not there or is empty.

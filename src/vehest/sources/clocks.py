@@ -155,7 +155,7 @@ class Clock:
         return at_ticks(samples, elapsed, np.arange(self.n_samples) / self.rate_hz)
 
 
-def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict") -> Clock:
+def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE) -> Clock:
     """The uniform clock behind a file's time stamps.
 
     Args:
@@ -163,6 +163,7 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
         where: file, for messages.
         policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the rows
             as evenly sampled and their stamps as late, and refuses missing rows.
+        fix: what to do where ``strict`` finds no even clock.
 
     Raises:
         DataError: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
@@ -180,7 +181,7 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
         check_limit("samples", n_samples, f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples")
         return Clock(start, rate, n_samples, stamps)
     if uneven := unevenness(stamps):
-        raise DataError(f"{where}: {uneven}; {BRIDGE}")
+        raise DataError(f"{where}: {uneven}; {fix}")
     return Clock(start, plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4)), len(stamps))
 
 

@@ -20,7 +20,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, unevenness, uniform_clock
+from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.unit_spellings import require_unit
 
@@ -80,17 +80,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class SignalOptions:
-    """Options of every source of signals.
-
-    Args:
-        channels: channel -> its declaration, see `SignalChannel`.
-        path: folder of the files.
-        files: pattern inside it.
-        rate_hz: of the recordings.
-        raster: channel whose clock is taken instead.
-        gappy: channels in which NaN means "not measured".
-        file_units: whether units that the files state are checked.
-    """
+    """Options of every source of signals; docs/sources/mdf.md describes them."""
 
     channels: ChannelMap
     path: str | None = None
@@ -102,7 +92,7 @@ class SignalOptions:
 
 
 class SignalSource(Source):
-    """Files of signals, a recording each; options: `SignalOptions`.
+    """Files of signals, a recording each.
 
     Attributes:
         own_keys: of a channel's declaration, which the source itself reads.
@@ -202,17 +192,20 @@ class SignalSource(Source):
         late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
         begin, end = spans[late][0], spans[early][1]
         if self.options.rate_hz is not None:
-            grid = Grid(common_ticks(begin, end, self.options.rate_hz, f"'{file}'"), self.options.rate_hz)
+            ticks = common_ticks(begin, end, self.options.rate_hz, f"'{file}'")
         else:
-            signal = signals[str(self.options.raster)]
-            stamps = signal.stamps[(signal.stamps >= begin) & (signal.stamps <= end)]
-            grid = _even_clock(stamps, f"'{file}': {signal.origin}, whose clock is taken,")
-        if len(grid.times) < 2:
+            raster = signals[str(self.options.raster)]
+            ticks = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
+        if len(ticks) < 2:
             raise DataError(
                 f"'{file}': channel '{late}' ({signals[late].origin}) begins at {begin:.6g} s, channel '{early}' ("
                 f"{signals[early].origin}) ends at {end:.6g} s: nothing is common to all; leave one out or declare it gappy"
             )
-        return grid
+        if self.options.rate_hz is not None:
+            return Grid(ticks, self.options.rate_hz)
+        where = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
+        clock = uniform_clock(ticks, where, fix="give rate_hz instead of raster")
+        return Grid(clock.ticks(), clock.rate_hz, ticks)
 
     def _on_grid(self, name: str, signal: Signal, grid: Grid, file: Path) -> FloatArray:
         """A signal's values at the ticks, in the file's unit."""
@@ -236,16 +229,6 @@ class SignalSource(Source):
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
         return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
-
-
-def _even_clock(stamps: FloatArray, where: str) -> Grid:
-    """The clock of a group whose samples come evenly."""
-    if len(stamps) < 2:
-        return Grid(stamps, 0.0)
-    if uneven := unevenness(stamps):
-        raise DataError(f"{where} does not come evenly: {uneven}; give rate_hz instead of raster")
-    clock = uniform_clock(stamps, where)
-    return Grid(clock.ticks(), clock.rate_hz, stamps)
 
 
 def _valid_span(signal: Signal, where: str) -> tuple[float, float]:

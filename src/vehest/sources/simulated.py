@@ -54,19 +54,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class SimulatedOptions:
-    """Options of the source.
-
-    Args:
-        vehicles: name -> configuration, in place of the one ``vehicle``.
-        drives: what is driven.
-        seed: from which those of the drives follow.
-        rate_hz: of the recordings.
-        sensors: levels of the sensors, or a preset's name.
-        surface: name or configuration.
-        stability_control: whether it is switched on.
-        vary: parameters of the vehicle that differ from drive to drive, with ranges.
-        vary_sensors: likewise of the sensors.
-    """
+    """Options of the source; docs/sources/simulated.md describes them."""
 
     vehicles: dict[str, Any] | None = None
     drives: tuple[Drive, ...] | None = None
@@ -80,7 +68,7 @@ class SimulatedOptions:
 
 
 class SimulatedSource(Source):
-    """Simulated drives, a recording each; options: `SimulatedOptions`, and ``vehicle`` (from conf/vehicle)."""
+    """Simulated drives, a recording each."""
 
     options_type = SimulatedOptions
     options: SimulatedOptions
