@@ -237,7 +237,7 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     """
     template = TEMPLATES.get(file.suffix.lower())
     if dataset.get("source") == "tabular" and template is not None:
-        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, say there what the columns are, and add dataset=NAME"
+        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, declare the columns there, and add dataset=NAME"
         raise ConfigurationError(f"'{file}' is no table; {what}")
     return open_source(dataset).read_file(file)
 

@@ -145,7 +145,7 @@ class Clock:
     def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
         """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
 
-        A gappy channel's samples go to the nearest tick instead: interpolation would lose every one that stands between two gaps.
+        A gappy channel's samples go to the nearest tick instead: interpolation would lose those between two gaps.
         """
         if self.stamps is None:
             return samples
@@ -219,7 +219,7 @@ def uniform_times(
         rate_hz: the sensor's nominal rate [Hz].
         where: file and topic, for messages.
         tolerated: wandering of the stamps about the line that does not matter [s].
-        fix: what messages say to do where samples are missing.
+        fix: what to do where samples are missing, for messages.
 
     Raises:
         DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.

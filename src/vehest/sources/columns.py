@@ -23,7 +23,7 @@ Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 
 @dataclass(frozen=True)
 class Column:
-    """How a channel is found in a file.
+    """Declaration of a column that becomes a channel.
 
     Args:
         column: the column's name in the file.

@@ -30,10 +30,10 @@ FASTER = 1.05  # than the raster: the rest would fold into it
 
 @dataclass(frozen=True)
 class SignalChannel(Column):
-    """How a channel comes from a signal.
+    """Declaration of a signal that becomes a channel.
 
     Args:
-        interpolation: ``linear``, or ``hold`` for values that stand until the next one.
+        interpolation: ``linear``, or ``hold`` for values that hold until the next one.
         max_gap: longest time between two samples that is interpolated [s]; None for three median intervals.
     """
 

@@ -117,7 +117,7 @@ class SimulatedSource(Source):
         return int(np.random.SeedSequence([self.options.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0]) if own is None else own
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
-        """What simulates a drive, its vehicle varied."""
+        """The simulation of a drive, with its vehicle varied."""
         from vehest.simulation.road.surface import surface_from_config
         from vehest.simulation.sensors.recording import sensor_levels_from_config
 
@@ -182,7 +182,7 @@ def _simulator_of(
     payload: Mapping[str, float] | None = None,
     tyres: Mapping[str, float] | None = None,
 ) -> Callable[..., Recording]:
-    """What simulates drives of a vehicle, varied as the seed of a drive draws it, with a payload and with tyres that age."""
+    """The simulator of a vehicle, varied by the seed of a drive, with a payload and with tyres that age."""
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
     from vehest.simulation.planar_drive import simulate_planar_drive

@@ -57,18 +57,18 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     candidates = []
     for place, (name, values) in enumerate(columns.items()):
         step = _step(values)
-        unit, told = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
-        counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or told)
-        stamps = None if step is None or counts_rows else _stamps(name, step, unit, told)
+        unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
+        counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
+        stamps = None if step is None or counts_rows else _stamps(name, step, unit, named)
         if step is not None and stamps is not None:
-            candidates.append((2 * bool(unit) + told, -place, step, stamps))
+            candidates.append((2 * bool(unit) + named, -place, step, stamps))
     if not candidates:
         return Found(None, None, (slice(0, n_rows),))
     *_, step, stamps = max(candidates, key=lambda candidate: candidate[:2])
     values = columns[stamps.column]
     steps, seconds = np.diff(values), (values - values[0]) * UNITS[stamps.unit]
-    named = [name for name in columns if name != stamps.column and COUNTER.match(plain_name(name))]
-    for name, starts in _counters(columns, named):
+    numbers = [name for name in columns if name != stamps.column and COUNTER.match(plain_name(name))]
+    for name, starts in _counters(columns, numbers):
         if 0 < starts.sum() <= MOST_RESTARTS * n_rows:
             return Found(stamps, seconds, runs_between(starts, n_rows), name)
     breaks = (steps < 0) | (steps > LONG_GAP * step)
@@ -99,10 +99,10 @@ def _step(values: FloatArray) -> float | None:
     return step if step > 0 and np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR else None
 
 
-def _stamps(name: str, step: float, unit: str, told: bool) -> Stamps | None:
+def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     """A column of time in the unit in which a step makes a rate that loggers have; None where no unit does."""
     fitting = [own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]]
-    chosen = unit or (fitting[0] if fitting else "s" if told else "")
+    chosen = unit or (fitting[0] if fitting else "s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
