@@ -14,6 +14,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
+from vehest.sources.base import open_source
 from vehest.sources.clocks import require_clock, stamped_times, unevenness, uniform_clock, uniform_times
 from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config
 from vehest.sources.surveys import survey
@@ -194,6 +195,15 @@ def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(pol
     assert str(error.value).startswith("'lap.csv': ")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_every_recording_of_a_source_keeps_the_rule(tmp_path: Path) -> None:
+    (tmp_path / "lap.csv").write_text("vx\n" + "1.0\n" * 100, encoding="utf-8")
+    declared = {"name": "mine", "source": "tabular", "path": str(tmp_path), "channels": {"vx": {"column": "vx", "unit": "m/s"}}}
+    assert open_source({**declared, "rate_hz": 9e4}).read("lap").rate_hz == 9e4
+    for read in (lambda source: source.read("lap"), lambda source: source.read_file(tmp_path / "lap.csv")):
+        with pytest.raises(DataError, match="data set 'mine', recording 'lap': the time stamps lie 5e-06 s apart"):
+            read(open_source({**declared, "rate_hz": 2e5}))
 
 
 @pytest.mark.parametrize("rows", [1000, 400])
