@@ -15,11 +15,11 @@ from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.sources.base import open_source
-from vehest.sources.clocks import require_clock, stamped_times, unevenness, uniform_clock, uniform_times
+from vehest.sources.clocks import stamped_times, unevenness, uniform_clock, uniform_times
 from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config
 from vehest.sources.surveys import survey
 
-RATES = [10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
+RATES = [1e-3, 10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
 PROPERTY = settings(max_examples=120, deadline=None, derandomize=True, database=None)
 
 
@@ -66,13 +66,6 @@ def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation(amplitude:
     else:
         with pytest.raises(DataError, match="set clock: interpolate"):
             uniform_clock(stamps, "'file'")
-    assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
-
-
-def test_a_drifting_clock_needs_interpolation() -> None:
-    stamps = np.concatenate([[0.0], np.cumsum(np.linspace(0.00995, 0.01005, 5000))])
-    with pytest.raises(DataError, match=r"'file': the clock drifts.*set clock: interpolate"):
-        uniform_clock(stamps, "'file'")
     assert uniform_clock(stamps, "'file'", "interpolate").rate_hz == 100.0
 
 
@@ -220,14 +213,6 @@ def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples() -> None:
         uniform_clock(stamps, "'lap.csv'", "interpolate")
     with use_limits(Limits(samples=30_000_001)):
         assert uniform_clock(stamps, "'lap.csv'", "interpolate").n_samples == 30_000_001
-
-
-@PROPERTY
-@given(st.integers(2, 300), st.sampled_from([1e-3, 0.2, 20.0, 1000.0 / 3.0, 1e5]), st.sampled_from([0.0, 149.99, 1e6]))
-def test_an_even_clock_keeps_the_rule_and_is_even(length: int, rate: float, start: float) -> None:
-    stamps = start + np.arange(length) / rate
-    require_clock(stamps, "'file'")
-    assert unevenness(stamps) == ""
 
 
 @pytest.mark.parametrize(
