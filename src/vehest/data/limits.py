@@ -21,6 +21,7 @@ class Limits:
         columns: columns that the header of a table may name.
         unpacked_bytes: what one file may unpack to, in memory or on disk [bytes].
         expansion: how many times its packed size a file may unpack to, once that is more than 64 MiB.
+        memory: what reading one file may take beyond ten times its size [bytes].
         filter_samples: reach of a filter, or length of an estimator's window, in samples.
         jobs: trainings of one sweep or study.
         links: blocks that one file may chain one after another.
@@ -34,6 +35,7 @@ class Limits:
     columns: int = 10_000
     unpacked_bytes: int = 8 * 2**30
     expansion: int = 250
+    memory: int = 1_600_000_000
     filter_samples: int = 1_000_000
     jobs: int = 10_000
     links: int = 1_000_000

@@ -10,7 +10,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files
-from vehest.sources.columns import Clock
+from vehest.sources.clocks import Clock
 from vehest.sources.tables import listed
 
 
@@ -47,13 +47,13 @@ class FileSource(Source):
         return matching_files(self.dataset, self.options.files)
 
     def _no_recording(self, recording_id: str) -> MissingError:
-        return MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {listed(self.ids())})")
+        return MissingError(f"{self.where} has no recording '{recording_id}' (it has {listed(self.ids())})")
 
     def _require_pattern(self) -> None:
         """See that ``files`` is a pattern inside the folder."""
         pattern = self.options.files
         if not pattern or Path(pattern).is_absolute():
-            raise ConfigurationError(f"data set '{self.name}': files must be a pattern inside path, such as '*.csv', not '{pattern}'")
+            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '*.csv', not '{pattern}'")
 
     def _recording(
         self, recording_id: str, where: str, clock: Clock, channels: Mapping[str, FloatArray], provenance: Mapping[str, Any]
@@ -81,5 +81,5 @@ class FileSource(Source):
         """Channels that the option ``gappy`` names, which must be among the data set's."""
         gappy = frozenset(self.options.gappy or ())
         for name in sorted(gappy - set(channels)):
-            raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
+            raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")
         return gappy

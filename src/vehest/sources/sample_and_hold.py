@@ -13,7 +13,8 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
-from vehest.sources.columns import Clock, Column
+from vehest.sources.clocks import Clock
+from vehest.sources.columns import Column
 
 
 @dataclass(frozen=True)
@@ -84,10 +85,12 @@ def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndH
         ConfigurationError: it names a channel that the data set does not declare, or makes no sense.
     """
     held = validated(SampleAndHold, entry, where, error=ConfigurationError)
-    delayed = held.delay if isinstance(held.delay, dict) else {}
-    for name in (*held.channels, *delayed):
-        if name not in (known if name in held.channels else ()):
-            raise ConfigurationError(f"{where} names '{name}', which is not one of {'its' if name in delayed else "the data set's"} channels")
+    for name in held.channels:
+        if name not in known:
+            raise ConfigurationError(f"{where} names '{name}', which is not one of the data set's channels")
+    for name in held.delay if isinstance(held.delay, dict) else ():
+        if name not in held.channels:
+            raise ConfigurationError(f"{where}: delay names '{name}', which is not one of its channels")
     return held
 
 

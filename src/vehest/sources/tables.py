@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
@@ -86,7 +85,7 @@ def first_lines(file: Path, layout: TextLayout) -> list[str]:
     return [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
 
 
-def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str = "") -> dict[str, FloatArray]:
+def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None) -> dict[str, FloatArray]:
     """Columns of numbers, shape (T,) each, NaN where a sample is missing.
 
     Args:
@@ -121,7 +120,7 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
 
 
 def parse_columns(
-    file: Path, opened: Callable[[], pa.NativeFile], wanted: Sequence[str], layout: TextLayout, clock: str = ""
+    file: Path, opened: Callable[[], pa.NativeFile], wanted: Sequence[str], layout: TextLayout, clock: str | None = None
 ) -> dict[str, FloatArray]:
     """Columns of numbers of a table of text, as `read_columns` does.
 
@@ -176,7 +175,7 @@ def table_stream(file: Path) -> pa.NativeFile:
         OSError: it cannot be opened, or is damaged.
     """
     packed = PACKED.get(regular_file(file).suffix.lower())
-    stream = pa.input_stream(open(file, "rb"), compression=packed)  # pyarrow opens no name that is not UTF-8
+    stream = pa.input_stream(open(file, "rb"), compression=packed)  # noqa: SIM115 (pyarrow opens no name that is not UTF-8)
     if packed is None:
         return stream
     blocks, size = [], 0

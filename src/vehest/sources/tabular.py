@@ -14,22 +14,13 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.columns import (
-    ChannelMap,
-    ChannelNames,
-    Clock,
-    ClockPolicy,
-    Column,
-    columns_from_config,
-    identity_columns,
-    time_column_from_config,
-    uniform_clock,
-)
+from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config, identity_columns, time_column_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
-from vehest.sources.tables import TextLayout, column_names, listed, read_columns, require_columns
+from vehest.sources.tables import TextLayout, column_names, listed, read_columns
 
 MOST_SKIPPED_ROWS = 10_000
 
@@ -61,10 +52,11 @@ class TabularSource(FileSource):
     """Tables, a recording each, or one for each uninterrupted run that a column of them counts."""
 
     options_type = TabularOptions
+    written_clock: str | None = None  # column of times that are written as a clock's
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        options, where = self.options, f"data set '{self.name}'"
+        options, where = self.options, self.where
         self.columns = None if options.channels is None else columns_from_config(options.channels, self.name)
         self.time = None if options.time is None else self._time_column(options.time)
         if self.time is None and options.rate_hz is None:
@@ -129,7 +121,7 @@ class TabularSource(FileSource):
         Raises:
             ConfigurationError: an option of it makes no sense.
         """
-        options, where = self.options, f"data set '{self.name}'"
+        options, where = self.options, self.where
         for name in ("delimiter", "decimal"):
             if len(getattr(options, name)) != 1:
                 raise ConfigurationError(f"{where}: {name} must be one character, not '{getattr(options, name)}'")
@@ -138,7 +130,7 @@ class TabularSource(FileSource):
         except (LookupError, ValueError):
             raise ConfigurationError(f"{where}: encoding '{options.encoding}' is not known; use for example utf8 or latin-1") from None
         if not 0 <= options.skip_rows <= MOST_SKIPPED_ROWS:
-            raise ConfigurationError(f"{where}: skip_rows must be a whole number of lines up to {MOST_SKIPPED_ROWS}, not {options.skip_rows}")
+            raise ConfigurationError(f"{where}: skip_rows must be a whole number up to {MOST_SKIPPED_ROWS}, not {options.skip_rows}")
         return TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
 
     def _read(self, file: Path, run: int | None) -> Recording:
@@ -153,7 +145,7 @@ class TabularSource(FileSource):
             )
         wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
         extra = [self.time and self.time.column, self.runs, self.held and self.held.updated]
-        values = self._values(file, list(dict.fromkeys([*wanted, *(name for name in extra if name)])))
+        values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
         if run is not None:
             rows = self._runs_of(file)[run]
             values = {name: samples[rows] for name, samples in values.items()}
@@ -161,7 +153,7 @@ class TabularSource(FileSource):
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out."""
-        values = read_columns(file, wanted, self.layout)
+        values = read_columns(file, wanted, self.layout, self.written_clock)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values
@@ -173,7 +165,7 @@ class TabularSource(FileSource):
         n_rows = len(next(iter(values.values())))
         where = f"'{file}'" if run is None else f"'{file}', run {run}"
         if self.time is not None:
-            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock, n_channels=len(columns))
+            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock)
         else:
             clock = Clock(0.0, float(self.options.rate_hz), n_rows)
         held = () if self.held is None else self.held.channels
@@ -205,13 +197,13 @@ class TabularSource(FileSource):
         stems, patterns = {file.stem for file in found}, self.options.exclude or ()
         for pattern in patterns:
             if not any(fnmatchcase(stem, pattern) for stem in stems):
-                raise MissingError(f"data set '{self.name}': exclude names '{pattern}', which no file is called")
+                raise MissingError(f"{self.where}: exclude names '{pattern}', which no file is called")
         for stem in self.dropped:
             if stem not in stems:
-                raise MissingError(f"data set '{self.name}': drop_rows names '{stem}', which no file is called")
+                raise MissingError(f"{self.where}: drop_rows names '{stem}', which no file is called")
         kept = [file for file in found if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)]
         if not kept:
-            raise MissingError(f"data set '{self.name}': exclude leaves none of its files")
+            raise MissingError(f"{self.where}: exclude leaves none of its files")
         return kept
 
     def _found(self) -> dict[str, tuple[Path, int | None]]:

@@ -6,27 +6,27 @@ The format as its files have it: ``[header]`` and ``[column names]`` name the co
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
+from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
-from vehest.data.parquet import DAMAGE
 from vehest.data.recording import Recording
-from vehest.data.text_files import first_line
-from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import ChannelMap, ChannelNames, ClockPolicy, columns_from_config, uniform_clock
-from vehest.sources.text_tables import check_size
+from vehest.sources.base import require_files
+from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, columns_from_config
+from vehest.sources.file_source import FileSource
+from vehest.sources.tables import TextLayout, parse_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
@@ -42,7 +42,7 @@ OFFSETS = re.compile(r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?[\d.]+)\s+([-+]?[
 
 @dataclass(frozen=True)
 class VboOptions:
-    """Options of the source, by type; what is None is not said."""
+    """Options of the source; docs/sources/vbo.md describes them."""
 
     channels: ChannelMap
     path: str | None = None
@@ -53,14 +53,14 @@ class VboOptions:
 
 @dataclass(frozen=True)
 class Log:
-    """A file's rows and what it says of itself.
+    """Rows and sections of a file.
 
     Args:
         columns: name -> values in the file's unit, (T,).
         units: name -> unit as the file writes it; only of columns that have one.
         seconds: clock time since midnight, going on past it [s], (T,).
         offsets: point (``CoG``, ``FL``, …) -> lateral and longitudinal distance from the antenna at which slip is given [m].
-        created: what the first line says.
+        created: first line of the file.
         n_dropped: rows at the end that were cut off or came late.
     """
 
@@ -72,47 +72,18 @@ class Log:
     n_dropped: int = 0
 
 
-class VboSource(Source):
-    """Logs, a recording each.
-
-    Options: ``path`` and ``files`` (glob), ``channels``, ``clock`` (``strict`` or ``interpolate``), ``gappy``.
-    """
+class VboSource(FileSource):
+    """Logs, a recording each."""
 
     options_type = VboOptions
-    keys = frozenset({"path", "files", "channels", "clock", "gappy"})
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.columns = columns_from_config(dataset["channels"], self.name)
+        self.columns = columns_from_config(self.options.channels, self.name)
         if not self.columns:
-            raise ConfigurationError(f"data set '{self.name}': channels must map a channel to its column and unit")
-        for name in dataset.get("gappy") or []:
-            if name not in self.columns:
-                raise ConfigurationError(f"data set '{self.name}': gappy names '{name}', which is not one of its channels")
-        self.gappy = frozenset(dataset.get("gappy") or [])
-        pattern = str(dataset.get("files", VboOptions.files))
-        if not pattern or Path(pattern).is_absolute():
-            raise ConfigurationError(f"data set '{self.name}': files must be a pattern inside path, such as '*.vbo', not '{pattern}'")
-
-    def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order."""
-        return [file.stem for file in self._files()]
-
-    def inputs(self) -> dict[str, str | Path]:
-        """The logs."""
-        return {file.name: file for file in self._files()}
-
-    def read_raw(self, recording_id: str) -> Recording:
-        """Read one log by its stem.
-
-        Raises:
-            MissingError: there is none of that name.
-            DataError: see `read_file`.
-        """
-        for file in self._files():
-            if file.stem == recording_id:
-                return self.read_raw_file(file)
-        raise MissingError(f"data set '{self.name}' has no recording '{recording_id}' (it has {', '.join(self.ids())})")
+            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        self.gappy = self._gappy_among(self.columns)
+        self._require_pattern()
 
     def read_raw_file(self, file: Path) -> Recording:
         """Read a log wherever it is.
@@ -124,46 +95,25 @@ class VboSource(Source):
         """
         require_files([file], self.name)
         log = read_log(file)
+        used = [column.column for column in self.columns.values()]
+        require_columns(file, list(log.columns), used)
         for name, column in self.columns.items():
-            if column.column not in log.columns:
-                known = ", ".join(log.columns)
-                raise DataError(
-                    f"'{file}' has no column '{column.column}' (it has {known}); correct the map in conf/dataset/{self.name}.yaml"
-                )
             where = f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, channel(name).unit, where, "declare a factor")
-        used = {column.column for column in self.columns.values()}
         if any(name.startswith(("Slip_", "Lat._Vel")) for name in used) and SLIP_CHECK not in (self.dataset.get("accept") or []):
             require_slip_offsets(log, f"'{file}'")
-        clock = uniform_clock(log.seconds, f"'{file}'", self.dataset.get("clock", "strict"), n_channels=len(self.columns))
+        clock = uniform_clock(log.seconds, f"'{file}'", self.options.clock)
         channels = {
             name: clock.align(column.to_si(log.columns[column.column], channel(name).unit), gappy=name in self.gappy)
             for name, column in self.columns.items()
         }
-        offsets = {point: list(pair) for point, pair in log.offsets.items()}
-        try:
-            return Recording(
-                id=file.stem,
-                vehicle=str(self.dataset.get("vehicle", "unknown")),
-                rate_hz=clock.rate_hz,
-                start_time=clock.start_time,
-                channels=channels,
-                kind=self.kind,
-                gappy=self.gappy,
-                provenance={
-                    "dataset": self.name,
-                    "source": "vbo",
-                    "file": file.name,
-                    "created": log.created,
-                    "slip_offsets_lateral_longitudinal_m": offsets,
-                    "rows_dropped_at_the_end": log.n_dropped,
-                },
-            )
-        except DataError as error:
-            raise DataError(f"'{file}': {error}") from None
-
-    def _files(self) -> list[Path]:
-        return matching_files(self.dataset, VboOptions.files)
+        provenance = {
+            "file": file.name,
+            "created": log.created,
+            "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in log.offsets.items()},
+            "rows_dropped_at_the_end": log.n_dropped,
+        }
+        return self._recording(file.stem, f"'{file}'", clock, channels, provenance)
 
 
 def read_log(file: Path) -> Log:
@@ -174,22 +124,15 @@ def read_log(file: Path) -> Log:
     Raises:
         DataError: it is no such file, is damaged, or is more than the limits allow.
     """
-    check_size(file, 1)
-    content = file.read_bytes()
+    content = regular_file(file).read_bytes()
     head, mark, rows = content.partition(b"[data]")
     if not mark or len(head) > LONGEST_HEAD:
         raise DataError(f"'{file}' has no section [data]; is it a log of a VBOX?")
     sections = _sections(head.decode("latin-1"))
     names = " ".join(sections.get("column names", [])).split()
-    if "time" not in names:
-        raise DataError(f"'{file}' names no column 'time' under [column names]; is it a log of a VBOX?")
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise DataError(f"'{file}' has {names.count(doubled[0])} columns called '{printable(doubled[0])}'; rename all but one")
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-    check_size(file, len(names))
-    values, n_dropped = _numbers(rows, len(names), file)
-    columns = dict(zip(names, values, strict=True))
+    require_columns(file, names, ["time", *names])
+    columns, n_dropped = _numbers(rows, names, file)
     seconds = _seconds(columns.pop("time"), file)
     if len(seconds) > 2 and seconds[-1] - seconds[-2] > JUMP * float(np.median(np.diff(seconds))):
         columns, seconds, n_dropped = {name: own[:-1] for name, own in columns.items()}, seconds[:-1], n_dropped + 1
@@ -250,28 +193,14 @@ def _units(sections: Mapping[str, list[str]], names: list[str]) -> dict[str, str
     return {name: unit for name, unit in {**known, **own}.items() if unit}
 
 
-def _numbers(rows: bytes, n_columns: int, file: Path) -> tuple[list[FloatArray], int]:
+def _numbers(rows: bytes, names: list[str], file: Path) -> tuple[dict[str, FloatArray], int]:
     """Columns of numbers, (T,) each, and how many rows at the end were cut off."""
     text = re.sub(rb"[ \t]+", b" ", rows.strip())
     text = re.sub(rb" ?\r?\n ?", b"\n", text)
-    text = re.sub(rb"(^|[ \n])\+", rb"\1", text)  # pyarrow takes no plus sign
-    if not text:
-        raise DataError(f"'{file}' has no rows under [data]")
     last = text.rfind(b"\n") + 1
-    cut_off = last > 0 and text.count(b" ", last) < n_columns - 1
-    names = [str(number) for number in range(n_columns)]
-    try:
-        table = pc.read_csv(
-            io.BytesIO(text[:last] if cut_off else text),
-            pc.ReadOptions(column_names=names, encoding="latin-1"),
-            pc.ParseOptions(delimiter=" "),
-            pc.ConvertOptions(column_types=dict.fromkeys(names, pa.float64())),
-        )
-    except DAMAGE as error:
-        raise DataError(
-            f"'{file}' cannot be read as rows of {n_columns} numbers under [data] ({first_line(error)}); is it damaged?"
-        ) from None
-    return [table.column(name).to_numpy() for name in names], int(cut_off)
+    cut_off = last > 0 and text.count(b" ", last) < len(names) - 1
+    opened = partial(pa.BufferReader, text[:last] if cut_off else text)
+    return parse_columns(file, opened, names, TextLayout(delimiter=" ", names=tuple(names))), int(cut_off)
 
 
 def _seconds(stamps: FloatArray, file: Path) -> FloatArray:

@@ -19,7 +19,6 @@ from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked
 from vehest.data.text_files import first_line
-from vehest.sources.text_tables import check_size
 
 SUFFIXES = (".asc", ".blf", ".log")
 LONGEST_LINE = 1 << 16  # bytes; a frame of CAN FD takes 400
@@ -74,7 +73,17 @@ def check_log(file: Path) -> None:
     if file.suffix.lower() == ".blf":
         _check_blf(file)
     else:
-        check_size(file, 1, LONGEST_LINE)
+        _check_lines(file)
+
+
+def _check_lines(file: Path) -> None:
+    lines = 0
+    with open(regular_file(file), "rb") as stream:
+        while line := stream.readline(LONGEST_LINE + 1):
+            lines += 1
+            if len(line) > LONGEST_LINE:
+                raise DataError(f"'{file}': line {lines} is longer than {LONGEST_LINE} bytes; is it a log of a bus?")
+    check_limit("samples", lines, f"'{file}' has {lines} rows or more")
 
 
 @contextmanager

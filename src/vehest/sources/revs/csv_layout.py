@@ -7,19 +7,15 @@ rows as they are: transcoding all of it takes about as long as reading it.
 from __future__ import annotations
 
 import csv
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pc
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.parquet import DAMAGE
-from vehest.sources.text_tables import check_size, table_stream
+from vehest.sources.tables import TextLayout, listed, read_columns, require_columns
 
 LONGEST_LINE = 1 << 16  # bytes, of the lines above the rows
 LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but broken
@@ -69,12 +65,10 @@ def read_csv_head(file: Path, needed: Iterable[str], preamble_lines: int = 10) -
     if needed[0] not in names:
         elsewhere = [number for number, row in enumerate(cells, start=1) if needed[0] in row]
         hint = f"line {elsewhere[0]} has it: set preamble_lines: {elsewhere[0] - 1}" if elsewhere else "is it an official Revs file?"
-        raise DataError(f"'{file}': line {preamble_lines + 1} should name the columns and has no '{needed[0]}' ({_listed(names)}); {hint}")
-    for name in needed:
-        if names.count(name) > 1:
-            raise DataError(f"'{file}' has {names.count(name)} columns called '{name}'; rename or remove all but one")
-        if name not in names:
-            raise DataError(f"'{file}' has no column '{name}' ({_listed(names)}); correct the map in conf/dataset")
+        raise DataError(
+            f"'{file}': line {preamble_lines + 1} should name the columns and has no '{needed[0]}' (it has {listed(names)}); {hint}"
+        )
+    require_columns(file, names, needed)
     if len(units) != len(names):
         raise DataError(
             f"'{file}': line {preamble_lines + 1} names {len(names)} columns, line {preamble_lines + 2} has {len(units)} units; "
@@ -105,17 +99,11 @@ def read_csv_columns(
         DataError: a row or cell cannot be read, or a column is blank after its head.
     """
     names, gappy = list(dict.fromkeys([time, *columns])), set(gappy)
-    check_size(file, len(names))
-    table = _read_rows(file, head, names)
-    if not table.num_rows:
-        raise DataError(f"'{file}' has a header and no rows; the copy is incomplete")
-    if table.column(time).null_count:
-        row = int(np.argmax(np.isnan(table.column(time).to_numpy())))
-        raise DataError(f"'{file}': column '{time}' is blank in line {head.n_lines + 1 + row}; time stamps are needed")
-    parts = {name: table.column(name) for name in names}
-    n_rows, blanks = table.num_rows, {name for name in names if table.column(name).null_count and name not in gappy}
-    del table
-    values = {name: parts.pop(name).to_numpy() for name in names}  # the parts go as their copies come
+    values = read_columns(file, names, TextLayout(skip_rows=head.n_lines, names=head.names))
+    n_rows, missing_stamps = len(values[time]), np.flatnonzero(np.isnan(values[time]))
+    if len(missing_stamps):
+        raise DataError(f"'{file}': column '{time}' is blank in line {head.n_lines + 1 + missing_stamps[0]}; time stamps are needed")
+    blanks = {name for name in names if name not in gappy and np.isnan(values[name]).any()}
     first = 0
     for name in blanks:
         start = int(np.argmin(np.isnan(values[name])))
@@ -136,45 +124,6 @@ def read_csv_columns(
                 f"({values[time][row]:.12g} s); cut the range out, or declare its channel in 'gappy' if a blank means 'not measured'"
             )
     return {name: samples[first:] for name, samples in values.items()}, first
-
-
-def _read_rows(file: Path, head: CsvHead, names: list[str]) -> pa.Table:
-    try:
-        return _read_table(file, head, names, threads=True)
-    except DAMAGE:
-        pass
-    try:
-        return _read_table(file, head, names, threads=False)  # only here errors name their row
-    except DAMAGE as error:
-        raise _unreadable(file, head, str(error)) from None
-
-
-def _read_table(file: Path, head: CsvHead, names: list[str], *, threads: bool) -> pa.Table:
-    with table_stream(file) as stream:
-        return pc.read_csv(
-            stream,
-            pc.ReadOptions(use_threads=threads, skip_rows=head.n_lines, column_names=list(head.names)),
-            convert_options=pc.ConvertOptions(include_columns=names, column_types=dict.fromkeys(names, pa.float64())),
-        )
-
-
-def _unreadable(file: Path, head: CsvHead, said: str) -> DataError:
-    said = said or "it cannot be held in memory"
-    text = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", said, re.DOTALL)
-    if text:
-        name, line, value = head.names[int(text[1])], text[2], ascii(text[3][:40])[1:-1]
-        return DataError(f"'{file}': column '{name}' holds the text '{value}' in line {line}; numbers are needed")
-    cells = re.search(r"Row #(\d+): Expected (\d+) columns, got (\d+)", said)
-    if cells:
-        return DataError(
-            f"'{file}': line {cells[1]} has {cells[3]} cells where the header names {cells[2]} columns; "
-            f"the copy is truncated or damaged, fetch it again"
-        )
-    if "Could not skip initial" in said:
-        return DataError(f"'{file}' has a header and no rows; the copy is incomplete")
-    return DataError(
-        f"'{file}' cannot be read as a table ({ascii(said.splitlines()[0][:160])[1:-1]}); is it truncated or of another format?"
-    )
 
 
 def _first_lines(file: Path, n_lines: int) -> list[str]:
@@ -207,7 +156,3 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _listed(names: Sequence[str]) -> str:
-    return "it has " + (", ".join(filter(None, names[:12])) + (", …" if len(names) > 12 else "") or "nothing")

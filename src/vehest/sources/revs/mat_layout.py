@@ -12,7 +12,8 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.limits import check_limit
-from vehest.sources.columns import ClockPolicy, Column, uniform_clock
+from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.columns import Column
 from vehest.sources.revs.mat_files import MatArray, read_mat_file
 
 _VALUE = "value"

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 
-import numpy as np
-
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
-from vehest.data.text_files import first_line
-from vehest.sources.text_tables import check_size
-
-LONGEST_LINE = 1 << 12  # bytes
+from vehest.sources.tables import TextLayout, read_columns
 
 
 def text_file(folder: Path, column: str) -> Path:
@@ -42,17 +36,4 @@ def read_text_columns(folder: Path, columns: Iterable[str], time: str) -> dict[s
 
 def _read_numbers(file: Path) -> FloatArray:
     """One number a line."""
-    check_size(file, 1, LONGEST_LINE)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that there are no numbers is said below
-            values = np.loadtxt(file, dtype=np.float64, ndmin=1, encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
-    except (ValueError, OverflowError, MemoryError) as error:
-        raise DataError(f"'{file}' holds something that is not a number ({first_line(error)}); repair or remove the line") from None
-    if values.size == 0:
-        raise DataError(f"'{file}' holds no numbers; the copy is incomplete")
-    if values.ndim != 1:
-        raise DataError(f"'{file}' holds {values.shape[1]} numbers a line; one is expected")
-    return values
+    return read_columns(file, ["number"], TextLayout(names=("number",)))["number"]

@@ -15,18 +15,16 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.archive import MOST_BYTES
 from vehest.sources.base import Source, existing_folder
+from vehest.sources.clocks import SampleTimes, at_ticks, common_ticks, stamped_times, uniform_times
 from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag.declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
 from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
-from vehest.sources.stamps import SampleTimes, stamped_times, uniform_times
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval
-LATEST_TICK = 10**15
 
 
 @dataclass(frozen=True)
@@ -105,8 +103,7 @@ class RosbagSource(Source):
     def _read(self, recording_id: str, path: Path) -> Recording:
         bag = read_bag(path, self._wanted(), self.layouts, self.most_bytes)
         series = {name: self._series(topic, bag, path) for name, topic in self.topics.items() if topic.topic in bag.topics}
-        first, n_samples = self._grid(series, path)
-        grid = (first + np.arange(n_samples)) / self.rate_hz
+        grid = self._grid(series, path)
         channels = {name: series[source.topic].at(source.field, grid, source.to_si) for name, source in self.channels.items()}
         if self.pose is not None:
             channels |= self._reference(self.pose, series[self.pose.topic], grid, path)
@@ -191,21 +188,18 @@ class RosbagSource(Source):
             times = stamped_times(stamps, where)
         return Series(topic, times, fields, _latency(data)).averaged()
 
-    def _grid(self, series: Mapping[str, Series], path: Path) -> tuple[int, int]:
-        """Number of the first tick that all topics reach, counted from the bag's first message, and how many there are."""
+    def _grid(self, series: Mapping[str, Series], path: Path) -> FloatArray:
+        """Ticks that all topics reach [s]."""
         begins = {one.times[0]: one.topic.topic for one in series.values()}
         ends = {one.times[-1]: one.topic.topic for one in series.values()}
         begin, end = max(begins), min(ends)
-        first, last = math.ceil(begin * self.rate_hz - 1e-6), math.floor(end * self.rate_hz + 1e-6)
-        if not max(abs(first), abs(last)) < LATEST_TICK:
-            raise DataError(f"'{path}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {self.rate_hz:g} Hz; it is damaged")
-        if last <= first:
+        grid = common_ticks(begin, end, self.rate_hz, f"'{path}'")
+        if len(grid) < 2:
             raise DataError(
                 f"'{path}': topic '{begins[begin]}' begins at {begin:.6g} s, when '{ends[end]}' has ended at {end:.6g} s; "
                 f"do their stamps come from different clocks? then set stamps: received"
             )
-        check_limit("samples", last - first + 1, f"'{path}' would become {last - first + 1} samples at {self.rate_hz:g} Hz")
-        return first, last - first + 1
+        return grid
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
         """Reference channels from the poses."""
@@ -264,11 +258,7 @@ class Series:
 
     def at(self, field: str, grid: FloatArray, change: Any) -> FloatArray:
         """A field on another clock."""
-        values = change(self.fields[field])
-        if self.topic.interpolation == "hold":
-            latest = np.searchsorted(self.times, grid + 1e-9, side="right") - 1
-            return values[np.maximum(latest, 0)]
-        return np.interp(grid, self.times, values)
+        return at_ticks(change(self.fields[field]), self.times, grid, hold=self.topic.interpolation == "hold", slack=1e-9)
 
     def averaged(self) -> Series:
         """The same with the declared moving average; half its width is lost at either end."""

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -23,8 +24,8 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
+from vehest.sources.tables import TextLayout, is_parquet, parse_table, table_stream
 from vehest.sources.text_log import CLOCK
-from vehest.sources.text_tables import check_size, table_stream
 from vehest.sources.unit_spellings import plain_unit
 
 HEAD = 1 << 18  # bytes that are looked at
@@ -33,7 +34,6 @@ MOST_BEFORE = 200  # lines before the names
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 MOST_CONTROLS = 0.01
-BLOCK = 1 << 24
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
@@ -59,6 +59,11 @@ class Shape:
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
 
+    @property
+    def layout(self) -> TextLayout:
+        """The same for reading."""
+        return TextLayout(self.delimiter, self.decimal, self.encoding, self.skip_rows, rows_below_names=1 if self.units else 0)
+
 
 def survey_table(file: Path) -> Log:
     """What a table holds.
@@ -66,7 +71,7 @@ def survey_table(file: Path) -> Log:
     Raises:
         DataError: it is no table, has no names, or holds no numbers.
     """
-    if file.suffix.lower() in (".parquet", ".pq"):
+    if is_parquet(file):
         with parquet_file(file) as table:
             schema = table.schema_arrow
             names = [name for name in schema.names if pa.types.is_integer(kind := schema.field(name).type) or pa.types.is_floating(kind)]
@@ -75,7 +80,6 @@ def survey_table(file: Path) -> Log:
         return _log(file, Read(values), {}, {})
     shape = shape_of(file)
     check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
-    check_size(file, len(shape.names))
     read = _values(file, shape)
     units = {name: unit for name, unit in zip(shape.names, shape.units, strict=True) if unit} if shape.units else {}
     options: dict[str, object] = {"delimiter": shape.delimiter, "decimal": shape.decimal}
@@ -284,16 +288,12 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
 
 
 def _values(file: Path, shape: Shape) -> Read:
-    read = pc.ReadOptions(
-        block_size=BLOCK, encoding=shape.encoding, skip_rows=shape.skip_rows, skip_rows_after_names=1 if shape.units else 0
-    )
-    parse = pc.ParseOptions(delimiter=shape.delimiter)
-    convert = pc.ConvertOptions(decimal_point=shape.decimal)
+    layout, opened = shape.layout, partial(table_stream, file)
     try:
-        with table_stream(file) as stream:
-            table = pc.read_csv(stream, read, parse, convert)
+        table = parse_table(opened, layout, pc.ConvertOptions(decimal_point=shape.decimal))
     except DAMAGE:
-        table = _as_text(file, shape, read, parse)
+        table = _as_text(file, shape)
+    check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     values, clocks, skipped = {}, {}, []
     marks: set[str] = set()
     for place, name in enumerate(shape.names):
@@ -323,12 +323,11 @@ def _clock_of(column: pa.ChunkedArray) -> FloatArray | None:
     return seconds_of_text(column if pa.types.is_string(kind) else column.cast(pa.string()))
 
 
-def _as_text(file: Path, shape: Shape, read: pc.ReadOptions, parse: pc.ParseOptions) -> pa.Table:
+def _as_text(file: Path, shape: Shape) -> pa.Table:
     """All cells as they stand, where some columns hold numbers first and text later."""
     kinds = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
     try:
-        with table_stream(file) as stream:
-            return pc.read_csv(stream, read, parse, kinds)
+        return parse_table(partial(table_stream, file), shape.layout, kinds)
     except DAMAGE as error:
         remedy = (
             "its columns are aligned by blanks; write one delimiter between cells"

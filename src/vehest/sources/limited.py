@@ -1,0 +1,160 @@
+"""Reads one file in a process of its own, with limits on memory and time.
+
+file and request (JSON) -> function of a reader's module, in the limited process -> arrays and a summary (Arrow) -> caller
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from vehest.data import errors
+from vehest.data.errors import DataError, MissingError, VehestError, printable
+from vehest.data.limits import Limits, current_limits, use_limits
+
+Arrays = dict[str, NDArray[Any]]
+
+SECONDS = 15.0  # of processor time for a small file
+SECONDS_PER_BYTE = 1e-6
+WAITING = 8.0  # times the processor time: a busy machine, or one without limits of its own
+MEMORY_PER_BYTE = 10.0
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a reader returned.
+
+    Args:
+        arrays: name -> samples, one-dimensional.
+        summary: everything else, as JSON holds it.
+    """
+
+    arrays: Arrays
+    summary: dict[str, Any]
+
+
+def read_limited(reader: str, file: Path, **request: Any) -> Reading:
+    """Call ``reader(file, **request)`` in a process that may not exceed its memory and time or write a file.
+
+    Processor time is 15 s and 1 s for each MB of the file, memory is ``limits.memory`` and ten times the file's size. Where the system
+    has no such limits (Windows), eight times that time is all that ends it.
+
+    Args:
+        reader: ``module:function``, which returns arrays and a summary.
+        file: a file, or a folder of files.
+        request: further arguments, as JSON holds them.
+
+    Raises:
+        VehestError: as the reader raises it.
+        DataError: the process ended otherwise: the file is damaged, or asks for more than the limits.
+    """
+    size = sum(part.stat().st_size for part in (file.rglob("*") if file.is_dir() else [file]) if part.is_file())
+    seconds, memory = SECONDS + SECONDS_PER_BYTE * size, current_limits().memory + MEMORY_PER_BYTE * size
+    order = {"reader": reader, "file": str(file), "request": request, "limits": asdict(current_limits())}
+    order |= {"seconds": seconds, "memory": memory}
+    environment = {**os.environ, **_ONE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    command = [sys.executable, "-P", "-m", "vehest.sources.limited"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        timer = threading.Timer(WAITING * seconds, process.kill)
+        timer.start()
+        try:
+            with suppress(BrokenPipeError), process.stdin as stdin:
+                stdin.write(json.dumps(order).encode())
+            table = pa.ipc.open_stream(process.stdout).read_all()
+        except (pa.ArrowException, OSError):
+            raise _ended(file, process.wait(), seconds, memory) from None
+        finally:
+            timer.cancel()
+            process.kill()
+    answer = json.loads(table.schema.metadata[b"answer"])
+    if "error" in answer:
+        raise getattr(errors, answer["error"])(answer["message"])
+    arrays = {name: table.column(name).chunk(0).values.to_numpy(zero_copy_only=False) for name in table.column_names}
+    return Reading(arrays, answer)
+
+
+def require_package(module: str, extra: str, what: str) -> None:
+    """See that an optional package is installed.
+
+    Raises:
+        MissingError: it is not.
+    """
+    if find_spec(module) is None:
+        raise MissingError(f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'")
+
+
+def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
+    """The error of a reading process that gave no answer."""
+    if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
+        return DataError(f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format")
+    if code == _NO_MEMORY:
+        return DataError(f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise it: limits.memory=NUMBER")
+    return DataError(f"'{file}' is damaged: reading it ends with status {code}")
+
+
+_NO_MEMORY = 77
+
+
+def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
+    """What the reader returns, or the error that it raises."""
+    module, _, name = order["reader"].partition(":")
+    file, read = Path(order["file"]), getattr(importlib.import_module(module), name)
+    _limit(int(order["memory"]), int(order["seconds"]))
+    try:
+        with use_limits(Limits(**order["limits"])):
+            return read(file, **order["request"])
+    except VehestError as error:
+        return {}, {"error": type(error).__name__, "message": str(error)}
+    except MemoryError:
+        os._exit(_NO_MEMORY)
+    except Exception as error:
+        first = next(iter(str(error).splitlines()), "")[:160]
+        return {}, {"error": "DataError", "message": f"'{file}' is damaged ({printable(first) or type(error).__name__}); make it again"}
+
+
+def _limit(memory: int, seconds: int) -> None:
+    """Limit this process: memory [bytes], processor time [s], no file written."""
+    with suppress(ImportError):
+        import resource
+
+        for kind, most in (
+            (resource.RLIMIT_DATA, memory),
+            (resource.RLIMIT_CPU, seconds),
+            (resource.RLIMIT_FSIZE, 0),
+            (resource.RLIMIT_CORE, 0),
+        ):
+            with suppress(ValueError, OSError):
+                resource.setrlimit(kind, (most, most))
+
+
+def _send(stream: BinaryIO, arrays: Arrays, answer: Mapping[str, Any]) -> None:
+    columns = [pa.LargeListArray.from_arrays(pa.array([0, len(array)], pa.int64()), pa.array(array)) for array in arrays.values()]
+    kinds = [pa.field(name, column.type) for name, column in zip(arrays, columns, strict=True)]
+    schema = pa.schema(kinds, metadata={"answer": json.dumps(answer)})
+    with pa.ipc.new_stream(stream, schema) as writer:
+        writer.write_batch(pa.record_batch(columns, schema=schema))
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends it
+    with os.fdopen(os.dup(1), "wb") as answers:
+        os.dup2(2, 1)  # what a library prints is no answer
+        _send(answers, *_answer(json.load(sys.stdin)))
