@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -80,20 +79,13 @@ def test_line_endings_blank_lines_and_byte_order_marks_do_not_matter(folder: Pat
     np.testing.assert_array_equal(RevsSource(configuration(folder)).read("lap")["vx"], expected)
 
 
-def test_a_missing_root_folder_or_recording_is_named(folder: Path) -> None:
-    assert "VEHEST_DATA" in refusal(folder, MissingError, path="None/revs")
-    assert "nowhere" in refusal(folder / "nowhere", MissingError)
-    with pytest.raises(MissingError, match=r"no folder .*other"):
-        RevsSource(configuration(folder, recordings=["other"])).inputs()
-
-
 def test_a_missing_or_empty_channel_file_is_named(folder: Path) -> None:
     (folder / "lap" / "vx.txt").unlink()
     assert "vx.txt" in refusal(folder, MissingError)
     (folder / "lap" / "vx.txt").touch()
     assert "vx.txt' is empty" in refusal(folder, MissingError)
     (folder / "lap" / "vx.txt").write_text("\n\n")
-    assert "vx.txt' holds no numbers" in refusal(folder)
+    assert "vx.txt' has no rows" in refusal(folder)
 
 
 def test_text_among_numbers_is_found_with_its_row(folder: Path) -> None:
@@ -113,16 +105,7 @@ def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
 
 def test_several_numbers_a_line_are_refused(folder: Path) -> None:
     np.savetxt(folder / "lap" / "vx.txt", np.zeros((N, 2)))
-    assert "2 numbers a line" in refusal(folder)
-
-
-def test_nan_and_disordered_time_are_refused(folder: Path) -> None:
-    samples = np.linspace(10, 20, N)
-    samples[7] = np.nan
-    np.savetxt(folder / "lap" / "vx.txt", samples)
-    assert "channel 'vx' holds 1 NaN between 150.06 s and 150.06 s" in refusal(folder)
-    np.savetxt(folder / "lap" / "t.txt", np.repeat(np.arange(N / 2), 2))
-    assert "t.txt': time repeats 150 times" in refusal(folder)
+    assert "column 'number' holds the text '0.000000000000000000e+00 0.0" in refusal(folder)
 
 
 @pytest.mark.parametrize(
@@ -165,27 +148,10 @@ def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari: Recording) -> Non
     assert residual.mean() == pytest.approx(-0.028, abs=5e-4)  # -0.03 in Table I of Da Lio et al. 2023
 
 
-def test_the_ferraris_sideslip_is_that_of_its_velocities(ferrari: Recording) -> None:
-    np.testing.assert_allclose(ferrari["sideslip_ref"], np.arctan2(ferrari["vy_ref"], ferrari["vx_ref"]), rtol=0, atol=1e-8)
-
-
 def test_the_ferrari_passes_every_check(ferrari: Recording) -> None:
     assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []
 
 
-def test_the_ferrari_with_vy_turned_round_is_reported(ferrari: Recording) -> None:
-    turned = Recording("t", "car", 100.0, 0.0, {**ferrari.channels, "vy_ref": -ferrari["vy_ref"]})
-    assert [(one.check, one.channel) for one in checks_of_recording(turned) if one.level != "note"] == [("sign", "vy_ref")]
-
-
-def test_a_line_without_end_and_more_lines_than_the_limit_are_not_read(folder: Path) -> None:
+def test_more_lines_than_the_limit_are_refused(folder: Path) -> None:
     with use_limits(Limits(samples=N - 1)):
-        assert f"has {N} rows or more, more than the limit of {N - 1}" in refusal(folder)
-    (folder / "lap" / "vx.txt").write_text("1 " * 3000)
-    assert "line 1 is longer than 4096 bytes" in refusal(folder)
-
-
-def test_a_pipe_is_no_text_file(folder: Path) -> None:
-    (folder / "lap" / "vx.txt").unlink()
-    os.mkfifo(folder / "lap" / "vx.txt")
-    assert "is a pipe, not a file" in refusal(folder)
+        assert f"has {N} rows, more than the limit of {N - 1}" in refusal(folder)

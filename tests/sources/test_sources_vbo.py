@@ -73,13 +73,13 @@ def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_pa
     ("old", "new", "message"),
     [
         (b"[data]", b"[rows]", r"has no section \[data\]"),
-        (b"[column names]", b"[names]", "names no column 'time'"),
+        (b"[column names]", b"[names]", r"has no column 'time' \(it has \)"),
         (b" Y_Accel ", b" X_Accel ", "has 2 columns called 'X_Accel'"),
         (b" Y_Accel ", b" Other ", "has no column 'Y_Accel'"),
         (b"053 104751.450", b"053 109951.450", "is no clock time hhmmss"),
-        (b"053 104751.450", b"053 x", "cannot be read as rows of 18 numbers"),
+        (b"053 104751.450", b"053 x", "column 'time' holds the text 'x' in data row 101"),
         (b"053 104751.450", b"053 999999.450", "is no clock time hhmmss"),
-        (b"053 104751.450 ", b"053 ", "cannot be read as rows of 18 numbers"),
+        (b"053 104751.450 ", b"053 ", r"Row #101: Expected 18 columns, got 17"),
     ],
 )
 def test_a_damaged_log_is_one_clear_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:

@@ -71,7 +71,9 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
     else:
         try:
             lines = first_lines(file, layout)
-            names = next(csv.reader(lines[:1], delimiter=layout.delimiter), [])
+            names = next(csv.reader(lines[:1], delimiter=layout.delimiter))
+        except StopIteration:
+            raise DataError(f"'{file}' holds nothing but empty lines") from None
         except (*DAMAGE, csv.Error) as error:
             raise _unreadable(file, error) from None
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
@@ -145,7 +147,7 @@ def parse_columns(
         except DAMAGE as error:
             raise _wrong_cell(file, layout, str(error)) or _unreadable(file, error) from None
     if not table.num_rows:
-        raise DataError(f"'{file}' has a header and no rows")
+        raise DataError(f"'{file}' has {'a header and ' if layout.names is None else ''}no rows")
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
     del table
@@ -210,5 +212,5 @@ def _wrong_cell(file: Path, layout: TextLayout, message: str) -> DataError | Non
 
 
 def _unreadable(file: Path, error: Exception) -> DataError:
-    problem = printable(first_line(error))
+    problem = f"a line is longer than {BLOCK} bytes" if "straddl" in str(error) else printable(first_line(error))
     return DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?")
