@@ -199,7 +199,7 @@ def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
 
 
 def test_runs_are_told_by_a_column_or_by_time_not_both(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="time_restarts cannot begin runs where a column counts its runs"):
+    with pytest.raises(ConfigurationError, match="time_restarts needs a time column, and no column that counts runs"):
         source(tmp_path, runs="run", time_restarts=True)
 
 

@@ -33,7 +33,7 @@ from vehest.run.downsample import resampled
 from vehest.run.estimate import estimate_recording, open_model, read_table
 from vehest.run.printing import SCORE_HEADER, TerminalTable, complain, counted, note, score_cells
 from vehest.sources.base import read_single
-from vehest.sources.tabular import column_names
+from vehest.sources.tables import column_names
 from vehest.sources.unit_spellings import plain_unit
 from vehest.studies.kit.standing import standing_columns, verdict_sentences
 
@@ -96,7 +96,7 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     if file.suffix == ".parquet":
         with suppress(DataError):  # a table of another tool
             return read_estimate(file)
-    names = column_names(file, {})
+    names = column_names(file)
     found: dict[str, dict[str, str]] = {}
     for quantity, spellings in SPELLINGS.items():
         for name in names:
