@@ -340,9 +340,9 @@ def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
     [
         ("mass\nkg\n", "has 2 lines"),
         ("mass,wheelbase\n982,2.4\n982,2.4\n", "line 2 should hold units and holds numbers"),
-        ("mass,mass\nkg,kg\n1,2\n", "names 'mass' twice"),
-        ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 has no name"),
-        ("mass\nkg\n1,2\n", "line 3 has 2 cells, line 1 names 1 columns"),
+        ("mass,mass\nkg,kg\n1,2\n", "column 2 is called 'mass'"),
+        ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 is called ''"),
+        ("mass\nkg\n1,2\n", "column 2 is called ''"),
         ("mass\nkg\n1\nabc\n", "parameter 'mass' holds the text 'abc' in line 4"),
         ("a,b\nkg,m\n1,1\n,2\n3,3\n", "parameter 'a' is blank in line 4"),
         ('mass\nkg\n"1\n', "cannot be read as a table"),

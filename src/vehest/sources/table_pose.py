@@ -11,7 +11,6 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
-from vehest.data.units import factor_to_si
 from vehest.sources.clocks import Clock
 from vehest.sources.columns import Column, column_from_config
 from vehest.sources.pose import POSE_CHANNELS, planar_motion, require_filter, require_pose_channels
@@ -20,8 +19,20 @@ UNITS = {"x": "m", "y": "m", "yaw": "rad"}
 
 
 @dataclass(frozen=True)
-class TablePoseOptions:
-    """What a data set says of its poses."""
+class TablePose:
+    """How reference channels are made of poses; see `vehest.sources.pose.planar_motion`.
+
+    Args:
+        x: column of the position and its unit, z up.
+        y: the same.
+        yaw: column of the yaw angle and its unit.
+        window: samples of the Savitzky-Golay filter.
+        order: of its polynomial.
+        yaw_offset: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+        lever_x: from the rigid body's origin forward to the reference point [m].
+        lever_y: to the left [m].
+        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
+    """
 
     x: dict[str, Any]
     y: dict[str, Any]
@@ -33,26 +44,10 @@ class TablePoseOptions:
     lever_y: float = 0.0
     channels: Annotated[tuple[str, ...], "a list of channels"] = POSE_CHANNELS
 
-
-@dataclass(frozen=True)
-class TablePose:
-    """How reference channels are made of poses; see `vehest.sources.pose.planar_motion`.
-
-    Args:
-        columns: of ``x``, ``y`` [m] and ``yaw`` [rad], z up.
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
-        yaw_offset: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-        lever: from the rigid body's origin to the reference point, forward and left [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
-    """
-
-    columns: Mapping[str, Column]
-    window: int
-    order: int
-    yaw_offset: float
-    lever: tuple[float, float]
-    channels: tuple[str, ...]
+    @property
+    def columns(self) -> dict[str, Column]:
+        """Columns of ``x``, ``y`` [m] and ``yaw`` [rad]."""
+        return {name: column_from_config(getattr(self, name), f"pose: {name}", unit) for name, unit in UNITS.items()}
 
     def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
         """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window.
@@ -65,10 +60,8 @@ class TablePose:
             samples = column.to_si(values[column.column], UNITS[name])
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                what = (
-                    f"pose column '{column.column}' holds {len(odd)} values that are no numbers, the first in row {odd[0] + 1} of the run"
-                )
-                raise DataError(f"{where}: {what}; leave them out by drop_rows")
+                what = f"pose column '{column.column}' holds {len(odd)} values that are no numbers, the first in row {odd[0] + 1}"
+                raise DataError(f"{where}: {what} of the run; leave them out by drop_rows")
             found[name] = clock.align(np.unwrap(samples) if name == "yaw" else samples)
         if len(found["x"]) < self.window:
             raise DataError(f"{where}: {len(found['x'])} poses are fewer than the {self.window} of the filter's window")
@@ -79,7 +72,7 @@ class TablePose:
             window=self.window,
             order=self.order,
             mounting_yaw=self.yaw_offset,
-            lever=self.lever,
+            lever=(self.lever_x, self.lever_y),
         )
         return motion.channels(self.channels)
 
@@ -90,14 +83,9 @@ def table_pose_from_config(entry: Any, where: str) -> TablePose:
     Raises:
         ConfigurationError: it lacks a column or a unit, or says something else.
     """
-    options = validated(TablePoseOptions, entry, where, error=ConfigurationError)
-    columns = {}
+    pose = validated(TablePose, entry, where, error=ConfigurationError)
     for name, unit in UNITS.items():
-        columns[name] = column_from_config(getattr(options, name), f"{where}: {name}")
-        try:
-            factor_to_si(columns[name].unit, unit)
-        except DataError as error:
-            raise ConfigurationError(f"{where}: {name}: {error}") from None
-    window, order = require_filter(options.window, options.order, where)
-    channels = require_pose_channels(options.channels, where)
-    return TablePose(columns, window, order, options.yaw_offset, (options.lever_x, options.lever_y), channels)
+        column_from_config(getattr(pose, name), f"{where}: {name}", unit)
+    require_filter(pose.window, pose.order, where)
+    require_pose_channels(pose.channels, where)
+    return pose

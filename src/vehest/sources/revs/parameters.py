@@ -25,23 +25,15 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
     rows = _rows(file)
     if len(rows) < 3:
         raise DataError(f"'{file}' has {len(rows)} lines; a table of vehicle parameters has one of names, one of units and values below")
-    names, units, values = rows[0], rows[1], rows[2:]
-    while names and not names[-1]:
-        names = names[:-1]
-    if not names or not all(names):
-        raise DataError(f"'{file}': line 1 should name every column; column {names.index('') + 1 if names else 1} has no name")
-    doubled = next((name for name in names if names.count(name) > 1), None)
-    if doubled is not None:
-        raise DataError(f"'{file}' names '{doubled}' twice; remove one of the columns")
+    width = max(column + 1 for row in rows for column, cell in enumerate(row) if cell)
+    names, units, *values = [[*row, *[""] * width][:width] for row in rows]
+    for column, name in enumerate(names):
+        if not name or names.index(name) != column:
+            raise DataError(f"'{file}': line 1 should name every column once, column {column + 1} is called '{name}'")
     if any(_number(unit) is not None for unit in units):
         raise DataError(f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?")
-    for number, row in enumerate(rows[1:], start=2):
-        if any(row[len(names) :]):
-            raise DataError(f"'{file}': line {number} has {len(row)} cells, line 1 names {len(names)} columns; the copy is damaged")
-    return {
-        name: {"value": _values(file, name, [_cell(row, index) for row in values]), "unit": _cell(units, index)}
-        for index, name in enumerate(names)
-    }
+    columns = zip(names, units, *values, strict=True)
+    return {name: {"value": _values(file, name, cells), "unit": unit} for name, unit, *cells in columns}
 
 
 def _values(file: Path, name: str, cells: list[str]) -> Any:
@@ -83,7 +75,3 @@ def _number(text: str) -> float | None:
     except ValueError:
         return None
     return number if math.isfinite(number) else None
-
-
-def _cell(row: list[str], index: int) -> str:
-    return row[index] if index < len(row) else ""
