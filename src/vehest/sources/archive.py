@@ -54,7 +54,7 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
         DataError: the archive is refused, truncated or corrupt.
         MissingError: the archive cannot be opened, or there is no room to unpack it.
     """
-    with _temporary_folder(file) as folder:
+    with temporary_folder(file) as folder:
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 targets = _targets(file, archive.infolist(), most_bytes, most_files)
@@ -71,7 +71,12 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
 
 
 @contextmanager
-def _temporary_folder(file: Path) -> Iterator[Path]:
+def temporary_folder(file: Path) -> Iterator[Path]:
+    """Yield a folder to unpack a file into, which is removed afterwards.
+
+    Raises:
+        MissingError: there is no room for one.
+    """
     try:
         kept = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
     except OSError as error:
