@@ -5,11 +5,13 @@ bag -> connections of the wanted topics -> messages, deserialised as declared ->
 
 from __future__ import annotations
 
+import os
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import apsw
 import numpy as np
@@ -46,7 +48,7 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
         DataError: the bag does not hold the topics, types and layouts that are wanted, or fewer messages than it says.
     """
     types = _types(layouts)
-    with Reader(bag) as reader:
+    with _opened(bag) as reader:
         return _read(bag, reader, types, topics), {"start": _start(bag, reader)}
 
 
@@ -62,7 +64,7 @@ def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[
         arrays as `read_topics`, the topics, and a sentence for each that cannot be read.
     """
     types, arrays, found, skipped = _types({}), Arrays(), [], []
-    with Reader(bag) as reader:
+    with _opened(bag) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
         for name, kind in topics.items():
             if name.strip("/").split("/")[-1] in ignored:
@@ -77,6 +79,29 @@ def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[
             except DataError as error:
                 skipped.append(str(error).removeprefix(f"'{bag}': "))
     return arrays, {"topics": found, "skipped": skipped}
+
+
+class _UriPath(type(Path())):  # type: ignore[misc]
+    """A path that rosbags can write into the URI of a SQLite database."""
+
+    def __format__(self, _: str) -> str:
+        return quote(os.fsencode(self), safe="/:\\")
+
+
+def _opened(bag: Path) -> Reader:
+    """A bag, unless a SQLite file of it ends within a page: SQLite would fill that up with zeros.
+
+    Source:
+        SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
+    """
+    for file in [bag] if bag.is_file() else bag.iterdir():
+        if file.is_file():
+            with open(file, "rb") as stream:
+                head = stream.read(18)
+            page = int.from_bytes(head[16:], "big")
+            if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page):
+                raise DataError(f"'{bag}': '{file.name}' is truncated; fetch it again")
+    return Reader(_UriPath(bag))
 
 
 def _start(bag: Path, reader: Reader) -> int:
