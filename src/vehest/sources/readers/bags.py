@@ -41,7 +41,7 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
         layouts: definitions of message types that ROS 2 Humble does not ship, by type.
 
     Returns:
-        ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, ``TOPIC.FIELD``, and when the bag starts [ns].
+        ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, ``TOPIC.FIELD`` and the start of the bag.
 
     Raises:
         ConfigurationError: a layout cannot be read, or a type or field that does not exist.
