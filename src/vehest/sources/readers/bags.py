@@ -144,7 +144,8 @@ def _numbers(types: Any, kind: str, prefix: str = "") -> list[str]:
 
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
     """What takes a number out of a message."""
-    node, detail = Nodetype.NAME, kind
+    node: Nodetype = Nodetype.NAME
+    detail: Any = kind
     for part in path.split("."):
         if node in ARRAYS and part.isdigit():
             node, detail = detail[0]

@@ -35,14 +35,9 @@ def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[A
         DataError: it holds no frame, more than the limits, or a time that is none.
     """
     kept = None if wanted is None else {(int(identifier), bool(extended)) for identifier, extended in wanted}
-    times, identifiers, flags, data = (
-        array("d"),
-        array("L"),
-        {name: bytearray() for name in ("extended", "fd", "fast", "length")},
-        bytearray(),
-    )
+    times, identifiers, buses, data = array("d"), array("L"), array("L"), bytearray()
+    flags = {name: bytearray() for name in ("extended", "fd", "fast", "length")}
     numbers: dict[Any, int] = {}
-    buses = array("L")
     count = 0
     with _opened(file) as reader:
         if isinstance(reader, BLFReader) and reader.file_size > file.stat().st_size:

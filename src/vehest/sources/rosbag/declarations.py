@@ -129,9 +129,9 @@ class RosbagOptions:
             raise ValueError(f"topics lists '{doubled[0]}' twice; name its channels under one")
         if self.start is not None and self.stop is not None and not self.stop > self.start:
             raise ValueError(f"stop must be above start, {self.start:g}, not {self.stop}")
-        for name, source in [*channels.items(), *([("pose", self.pose)] if self.pose else [])]:
-            if source.topic not in topics:
-                raise ValueError(f"{name}: topic '{source.topic}' is not one of topics: {', '.join(topics) or 'none'}")
+        for topic in [*(declared.topic for declared in channels.values()), *([self.pose.topic] if self.pose else [])]:
+            if topic not in topics:
+                raise ValueError(f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}")
         for name, declared in channels.items():
             try:
                 factor_to_si(declared.unit, channel(name).unit)
