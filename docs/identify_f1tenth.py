@@ -25,10 +25,10 @@ from scipy import signal
 from vehest.data.errors import VehestError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
+from vehest.sources.clocks import uniform_times
 from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag import POSE_FIELDS
 from vehest.sources.rosbag.topics import Bag, Wanted, read_bag
-from vehest.sources.stamps import uniform_times
 
 Array = NDArray[np.float64]
 

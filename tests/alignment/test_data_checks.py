@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from vehest.alignment.checks import Finding, checks_of_clock, checks_of_recording
+from vehest.alignment.checks import Finding, checks_of_recording
 from vehest.data.recording import Recording
 
 RATE = 100.0
@@ -275,71 +273,6 @@ def test_resting_values_are_not_saturated() -> None:
 def test_a_manoeuvre_of_one_exact_step_is_not_saturated() -> None:
     steer = np.where(np.arange(400) < 350, 0.01 * np.sin(np.arange(400)), 0.1)
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
-
-
-# --- clocks ------------------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("start", [0.0, 149.99, 1.7e9])
-@pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0 / 3.0, 1000.0])
-def test_a_uniform_clock_gets_no_complaint(start: float, rate: float) -> None:
-    assert checks_of_clock(start + np.arange(3000) / rate) == []
-
-
-def test_a_gap_is_found_with_its_length_and_time() -> None:
-    time = np.delete(np.arange(1000) / 100.0, np.s_[300:350])
-    (found,) = checks_of_clock(time)
-    assert (found.level, found.check) == ("error", "gap")
-    assert "1 gaps, the longest of 0.51 s after 2.99 s" in found.message
-
-
-def test_one_lost_sample_is_a_gap() -> None:
-    assert [found.check for found in checks_of_clock(np.delete(np.arange(1000) / 100.0, 500))] == ["gap"]
-
-
-def test_backward_and_repeated_times_are_found_with_their_sample() -> None:
-    time = np.arange(100) / 100.0
-    backward, repeated = time.copy(), time.copy()
-    backward[50:] -= 0.2
-    repeated[50] = repeated[49]
-    (found,) = checks_of_clock(backward)
-    assert (found.level, found.check) == ("error", "clock")
-    assert "goes backwards 1 times, first at sample 50 (0.3 s)" in found.message
-    (found,) = checks_of_clock(repeated)
-    assert "repeats 1 times, first at sample 50 (0.49 s)" in found.message
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_time_stamp_that_is_no_number_is_found(value: float) -> None:
-    time = np.arange(10.0)
-    time[4] = value
-    (found,) = checks_of_clock(time)
-    assert "sample 4 is not a number" in found.message
-
-
-@pytest.mark.parametrize("length", [0, 1])
-def test_fewer_than_two_time_stamps_are_no_clock(length: int) -> None:
-    (found,) = checks_of_clock(np.zeros(length))
-    assert (found.level, found.check) == ("error", "clock")
-
-
-def test_jitter_is_found_and_measured() -> None:
-    time = np.arange(1000) / 100.0
-    time[1::2] += 0.0005
-    (found,) = checks_of_clock(time)
-    assert (found.level, found.check) == ("warning", "jitter")
-    assert "up to 9.5 % from the median of 0.0105 s" in found.message
-
-
-def test_a_clock_that_speeds_up_slowly_drifts() -> None:
-    intervals = np.linspace(0.00995, 0.01005, 5000)
-    assert [found.check for found in checks_of_clock(np.concatenate([[0.0], np.cumsum(intervals)]))] == ["drift"]
-
-
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
-@given(st.integers(2, 300), st.floats(1.0, 2000.0), st.floats(-1e6, 1e6))
-def test_no_uniform_clock_is_refused(length: int, rate: float, start: float) -> None:
-    assert [found for found in checks_of_clock(start + np.arange(length) / rate) if found.level == "error"] == []
 
 
 def test_a_reference_in_kilometres_an_hour_is_found_by_its_scale() -> None:

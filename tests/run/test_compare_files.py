@@ -36,13 +36,18 @@ def test_errors_are_those_that_were_put_in(drive, tmp_path):
     assert found.stop - found.start == pytest.approx(120.0, abs=0.2)
 
 
-def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_path):
+def test_an_angle_in_degrees_is_the_same_estimate_as_its_velocity(drive, tmp_path, capsys):
     vy = drive["vy_ref"] + 0.1
     beta = np.degrees(np.arctan2(vy, drive["vx"]))
     pd.DataFrame({"Time [s]": drive.time, "Beta [deg]": beta}).to_csv(tmp_path / "angle.csv", index=False)
     pd.DataFrame({"t": drive.time, "V_y": vy}).to_csv(tmp_path / "speed.csv", index=False)
     angle, speed = (read_estimate_table(tmp_path / f"{name}.csv", drive) for name in ("angle", "speed"))
     assert angle["vy"] == pytest.approx(speed["vy"], abs=1e-9)
+    assert capsys.readouterr().err == ""
+    pd.DataFrame({"t": drive.time, "beta": 100.0 * beta}).to_csv(tmp_path / "nameless.csv", index=False)
+    read_estimate_table(tmp_path / "nameless.csv", drive)
+    assert "nameless.csv': sideslip_ref: " in (said := capsys.readouterr().err)
+    assert "beyond what a vehicle can do" in said
 
 
 def test_the_better_one_is_called_so_only_with_the_baselines_below_it(drive, tmp_path):

@@ -14,7 +14,6 @@ from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.config import compose_config, missing_keys
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
-from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.recording import SensorLevels
 from vehest.sources.base import kind_of, open_source, source_class, source_names
 from vehest.sources.simulated import SimulatedSource
@@ -72,16 +71,16 @@ def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed(
 
 def test_a_drive_without_a_seed_has_one_of_its_own_from_the_data_sets_seed_and_its_name() -> None:
     drives = [drive("a"), drive("b")]
-    seeds = {name: entry.seed for name, entry in SimulatedSource(simulated(drives=drives, seed=1)).drives.items()}
-    assert seeds["a"] != seeds["b"]
-    assert SimulatedSource(simulated(drives=drives[1:], seed=1)).drives["b"].seed == seeds["b"], "whatever other drives there are"
-    assert SimulatedSource(simulated(drives=drives, seed=2)).drives["b"].seed != seeds["b"]
+    source = SimulatedSource(simulated(drives=drives, seed=1))
+    assert source.seed_of("a") != source.seed_of("b")
+    assert SimulatedSource(simulated(drives=drives[1:], seed=1)).seed_of("b") == source.seed_of("b"), "whatever other drives there are"
+    assert SimulatedSource(simulated(drives=drives, seed=2)).seed_of("b") != source.seed_of("b")
 
 
 def test_count_makes_as_many_drives_with_seeds_of_their_own() -> None:
     source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
     assert source.ids() == ["a_001", "a_002", "a_003"]
-    assert len({entry.seed for entry in source.drives.values()}) == 3
+    assert len({source.seed_of(name) for name in source.ids()}) == 3
 
 
 def test_of_several_vehicles_each_drive_has_the_one_it_names() -> None:
@@ -168,32 +167,19 @@ def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
     [
         ({"drives": [{"id": "a", "seed": 1}]}, "dataset.drives.0.manoeuvre is missing"),
         ({"drives": [drive("a", color=1)]}, "dataset.drives.0.color is not an option of dataset.drives.0; options: id, manoeuvre, count"),
-        ({"drives": ["a"]}, "dataset.drives.0 must be a group of options, not 'a'; options: id, manoeuvre, count, seed, vehicle, surface"),
-        (
-            {"drives": [{"id": "a", "manoeuvre": "laps"}]},
-            "dataset.drives.0.manoeuvre must be a mapping with a name, such as {name: laps}, not 'laps'",
-        ),
-        ({"drives": [drive("a", seed="one")]}, "dataset.drives.0.seed must be a whole number, zero or positive, not 'one'"),
-        ({"drives": [drive("a", seed=-1)]}, "drive 'a': seed must be a whole number, zero or positive, not -1"),
+        ({"drives": [drive("a", seed=-1)]}, "dataset.drives.0.seed: input should be greater than or equal to 0, not -1"),
         ({"drives": [drive("a", seed=1, count=2)]}, "drive 'a': give seed for a single drive, or count, not both"),
-        ({"drives": [drive("a", count=1.5)]}, "dataset.drives.0.count must be a whole number of drives, not 1.5"),
-        ({"drives": [drive("a", count=-1)]}, "drive 'a': count must be a whole number of drives, not -1"),
-        ({"drives": [drive("a", stability_control="on")]}, "dataset.drives.0.stability_control must be true or false, not 'on'"),
+        ({"drives": [drive("a", count=-1)]}, "dataset.drives.0.count: input should be greater than or equal to 0, not -1"),
         ({"drives": [drive("a", surface="icy")]}, "there is no surface 'icy'; there are dry, wet, patchy"),
         ({"drives": [drive("a", 0.0)]}, "data set 'sim': manoeuvre 'laps': duration must lie between"),
         ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
         ({"drives": 5}, "dataset.drives must be a list of mappings, not 5"),
-        ({"rate_hz": "abc"}, "dataset.rate_hz must be a number between 1 and 1000, not 'abc'"),
-        ({"rate_hz": 1e-9}, "rate_hz must be a number between 1 and 1000, not 1e-09"),
-        ({"accept": 5}, "dataset.accept must be a list of checks, not 5"),
+        ({"rate_hz": 1e-9}, "dataset.rate_hz: input should be greater than or equal to 1, not 1e-09"),
         ({"drives": [{"id": "a", "manoeuvre": {"name": ["laps"]}}]}, "there is no manoeuvre '('laps',)'"),
         ({"drives": [drive("a", (1, 2))]}, "manoeuvre 'laps': duration must be a number, not [1, 2]"),
         ({"drives": [{"id": "a", "manoeuvre": {"name": "random_steer", "band": [0.1]}}]}, "band must be a pair of numbers, not [0.1]"),
         ({"drives": [{"id": "a", "manoeuvre": {"name": "slalom", "cones": True}}]}, "cones must be a whole number, not True"),
-        ({"drives": [drive("a", vehicle=["b"])]}, "dataset.drives.0.vehicle must be the name of one of the vehicles, not ['b']"),
         ({"drives": [drive("a", vehicle="b")]}, "drive 'a': vehicle 'b' is not one of"),
-        ({"drives": [drive("a", surface=5)]}, f"dataset.drives.0.surface must be one of {', '.join(SURFACES)}, or a mapping such as"),
-        ({"surface": 5}, f"dataset.surface must be one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not 5"),
         ({"drives": [drive("a", surface={"friction": "x"})]}, "surface 'own': friction must be a number, not 'x'"),
         ({"drives": [drive("a", surface={"patches": 0.5, "patch_length": 5})]}, "patch_length is a pair"),
         ({"vary": [{"parameters": 5, "factor": [1, 1]}]}, "vary: an entry is {parameters"),
@@ -203,8 +189,7 @@ def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
         ({"vehicle": {**VEHICLE, "overrides": {"R_w": 0}}}, "R_w must be positive"),
         ({"vehicle": {**VEHICLE, "overrides": 5}}, "overrides"),
         ({"vehicle": {**VEHICLE, "parameter_set": True}}, "parameter set True"),
-        ({"seed": -1}, "seed must be a whole number, zero or positive, not -1"),
-        ({"vary": {"m": 1}}, "dataset.vary must be a list of {parameters, factor}, not {'m': 1}"),
+        ({"seed": -1}, "dataset.seed: input should be greater than or equal to 0, not -1"),
         ({"vary": [{"parameters": ["m"], "factor": [2, 1]}]}, "vary: a range is a pair [lowest, highest] of scales, not [2, 1]"),
         ({"vary_sensors": {"hum": [0, 1]}}, "vary_sensors is a mapping from"),
         ({"sensors": "perfect"}, "default, race, ideal"),

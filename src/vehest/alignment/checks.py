@@ -1,7 +1,4 @@
-"""What may be wrong with a recording: each check looks for one thing and says where it found it.
-
-``checks_of_clock`` looks at the raw time stamps of a file, ``checks_of_recording`` at the samples.
-"""
+"""What may be wrong with a recording: each check looks for one thing and says where it found it."""
 
 from __future__ import annotations
 
@@ -27,18 +24,15 @@ from vehest.alignment.signs import (
     wrong_unit,
 )
 from vehest.alignment.standstill import long_runs, standstill
-from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 
-__all__ = ["Finding", "checks_of_clock", "checks_of_recording"]
+__all__ = ["Finding", "checks_of_recording"]
 
 MOST_WRONG_UNITS = 3
 STUCK_SECONDS = 1.0
 SATURATED_FRACTION = 2e-3
 SATURATED_EXCESS = 4  # a quantised sine sits at its peak 2.4 times as often as one level below
-MOST_DRIFT = 0.5  # intervals
-LATEST_TIME = 1e15  # s; beyond it a double tells no two samples apart
 STRAIGHT_YAW_RATE = 0.02  # rad/s, slow enough to count as straight ahead
 STRAIGHT_SPEED = 3.0  # m/s, fast enough for it
 STRAIGHT_SECONDS = 3.0
@@ -50,62 +44,6 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
-
-
-def checks_of_clock(time: FloatArray) -> list[Finding]:
-    """Look at raw time stamps: order, repeats, gaps and jitter.
-
-    Args:
-        time: time stamps [s], shape (T,).
-    """
-    findings: list[Finding] = []
-    if len(time) < 2:
-        return [Finding("error", "clock", "time", "fewer than two time stamps")]
-    if not np.isfinite(time).all():
-        row = int(np.flatnonzero(~np.isfinite(time))[0])
-        return [Finding("error", "clock", "time", f"time stamp of sample {row} is not a number")]
-    if np.abs(time).max() > LATEST_TIME:
-        row = int(np.argmax(np.abs(time)))
-        return [Finding("error", "clock", "time", f"time stamp of sample {row} is {time[row]:.6g} s, which is no time of a drive")]
-    steps = np.diff(time)
-    for what, bad in (("goes backwards", steps < 0), ("repeats", steps == 0)):
-        if bad.any():
-            where = np.flatnonzero(bad)
-            findings.append(
-                Finding(
-                    "error",
-                    "clock",
-                    "time",
-                    f"time {what} {len(where)} times, first at sample {where[0] + 1} ({time[where[0] + 1]:.12g} s)",
-                )
-            )
-    if findings:
-        return findings
-    interval = float(np.median(steps))
-    gaps = np.flatnonzero(steps > 1.5 * interval)
-    if len(gaps):
-        longest = gaps[np.argmax(steps[gaps])]
-        findings.append(
-            Finding(
-                "error",
-                "gap",
-                "time",
-                f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {time[longest]:.12g} s (interval {interval:.6g} s)",
-            )
-        )
-    jitter = float(np.abs(steps[steps <= 1.5 * interval] - interval).max() / interval)
-    if jitter > 0.01:
-        findings.append(
-            Finding("warning", "jitter", "time", f"intervals deviate by up to {100 * jitter:.2g} % from the median of {interval:.6g} s")
-        )
-    uniform = np.linspace(time[0], time[-1], len(time))
-    drift = float(np.abs(time - uniform).max() / interval)
-    if drift > MOST_DRIFT and not len(gaps):
-        worst = time[np.argmax(np.abs(time - uniform))]
-        findings.append(
-            Finding("warning", "drift", "time", f"the clock drifts: at {worst:.12g} s it is {drift:.2g} intervals away from a uniform one")
-        )
-    return findings
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError
@@ -69,7 +69,7 @@ def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Se
     source = open_source({key: value for key, value in told.items() if value is not None})
     assert isinstance(source, CanSource)
     database, wanted = source.wanted()
-    columns = {channel: source.channels[channel].column for channel in wanted}
+    columns = {channel: source.channels[channel] for channel in wanted}
     if dataset.get("file_units", "check") != "ignore":
         _require_units(database, wanted, columns)
     return BusSignals(database, wanted, _factors(columns), dataset.get("bus"))
@@ -109,7 +109,7 @@ def from_names(dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), t
 
 def _told(word: str) -> tuple[str, Column]:
     name, equals, rest = word.strip().partition("=")
-    sign = -1 if rest.startswith("-") else 1
+    sign: Literal[1, -1] = -1 if rest.startswith("-") else 1
     signal, _, unit = rest.removeprefix("-").partition(":")
     if not equals or not signal:
         raise ConfigurationError(f"--signals takes CHANNEL=MESSAGE.SIGNAL, for example ay=-IMU.AccLat:m/s^2, not '{word}'")

@@ -15,7 +15,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.sources.columns import plain_rate
+from vehest.sources.clocks import mean_step, plain_rate
 
 GAIN = 0.02
 """Share of the deviation of an arrival by which the next instant is moved: a time constant of 50 samples."""
@@ -56,7 +56,7 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     Raises:
         ConfigurationError: a rate that is no rate.
     """
-    periods = {name: _period(np.diff(times)) for name, times in stamps.items()}
+    periods = {name: mean_step(np.diff(times)) for name, times in stamps.items()}
     clock = min(periods, key=lambda name: periods[name])
     if not all(period > 0 for period in periods.values()):
         raise ConfigurationError("frames of the bus repeat their time stamps; where two buses carry the same identifiers, say which")
@@ -71,14 +71,6 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     first = max(times[0] for times in stamps.values() if len(times))
     start = first + (middle - first) % cycle
     return Timing(rate_hz, periods, clock, offset, start)
-
-
-def _period(steps: FloatArray) -> float:
-    """The interval behind stamps that jitter [s]: the mean, a gap counting as the frames that it lacks."""
-    period = float(np.median(steps))
-    for _ in range(3 if period > 0 else 0):
-        period = float(steps.sum() / np.maximum(np.rint(steps / period), 1.0).sum())
-    return period
 
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vehest.alignment.checks import checks_of_recording
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
@@ -107,6 +108,9 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
         raise DataError(f"'{file}' has no column {wanted} (it has {counted(names)})")
     options = {"name": file.stem, "source": "tabular", "vehicle": "unknown", "clock": "interpolate", "gappy": [channel]}
     table = read_single({**options, "time": time, "channels": {channel: found[channel]}}, file)
+    for finding in checks_of_recording(table):
+        if finding.check == "impossible":
+            complain(f"warning: '{file}': {finding.channel}: {finding.message}")
     values = table[channel]
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])

@@ -1,4 +1,4 @@
-"""What every source does, and how a source is found by its name."""
+"""The interface of every source, and how a source is found by its name."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import importlib
 import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import vehest.sources as package
 from vehest.data.derived import ScaleToWheelbase
@@ -18,52 +18,37 @@ from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
 from vehest.data.splits import check_name
-from vehest.data.transforms import ReferenceLever, Transform, transform_from_config
-
-COMMON_KEYS = frozenset(
-    {
-        *("name", "title", "kind", "vehicle", "licence", "citation", "source", "accept", "download"),
-        *("transforms", "reference_point", "imu_point"),
-    }
-)
-
+from vehest.data.transforms import ReferenceLever, transform_from_config
+from vehest.sources.clocks import require_clock
 
 TEMPLATES = {
     ".vbo": "vbo",
-    ".mf4": "mdf",
-    ".mdf": "mdf",
-    ".dat": "mdf",
-    ".bag": "f1tenth_bag",
-    ".db3": "f1tenth_bag",
-    ".mcap": "f1tenth_bag",
+    **dict.fromkeys((".mf4", ".mdf", ".dat"), "mdf"),
+    **dict.fromkeys((".bag", ".db3", ".mcap"), "f1tenth_bag"),
 }
 """Ending of a file that is no table -> data set that shows how such files are declared."""
 DERIVED = "derived"
-"""Key of a recording's provenance: how its data set made channels of others, and where they were measured."""
+"""Key of a recording's provenance: transforms of its data set, and where its channels were measured."""
 SIMULATED = "simulated"
-"""Name of the source whose recordings never are real, whatever a configuration says."""
+"""Name of the source whose recordings are never real."""
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
-    """Whether a data set's recordings are ``real`` or ``simulated``."""
+    """The kind of a data set's recordings."""
     return "simulated" if SIMULATED in (dataset.get("source"), dataset.get("kind")) else "real"
 
 
 @dataclass(frozen=True)
 class Point:
-    """Where something was measured, from the centre of gravity [m]: ``x`` ahead of it, ``y`` to its left."""
+    """Where something was measured, from the centre of gravity [m]: ``x`` ahead, ``y`` to the left."""
 
     x: float = 0.0
     y: float = 0.0
 
 
-UNKNOWN = "unknown"
-"""What a data set says of a point that nobody knows."""
-
-
 @dataclass(frozen=True)
 class CommonOptions:
-    """What every data set says; see docs/data.md."""
+    """Options of every data set; see docs/data.md."""
 
     source: str
     name: str = "unnamed"
@@ -79,17 +64,20 @@ class CommonOptions:
     imu_point: Annotated[Point | Literal["unknown"], "{x: …, y: …} in metres, or unknown"] | None = None
 
 
+COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
+
+
 def origin_in_words(recording: Recording) -> list[str]:
-    """What a data set says of where a recording's channels were measured and what they were made of, a line each."""
-    told = recording.provenance.get(DERIVED) or {}
+    """Where a recording's channels were measured and which were derived, by its data set, a line each."""
+    declared = recording.provenance.get(DERIVED) or {}
     lines = []
-    if "reference_point" in told:
-        moved = ", moved to it" if told.get("moved_to_centre_of_gravity") else ""
-        lines.append(f"reference measured {_point_in_words(told['reference_point'])}{moved}")
-    if "imu_point" in told:
-        lines.append(f"inertial unit {_point_in_words(told['imu_point'])}")
-    if told.get("transforms"):
-        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in told['transforms'])}")
+    if "reference_point" in declared:
+        moved = ", moved to it" if declared.get("moved_to_centre_of_gravity") else ""
+        lines.append(f"reference measured {_point_in_words(declared['reference_point'])}{moved}")
+    if "imu_point" in declared:
+        lines.append(f"inertial unit {_point_in_words(declared['imu_point'])}")
+    if declared.get("transforms"):
+        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in declared['transforms'])}")
     held = recording.provenance.get("held")
     if held:
         lines.append(f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between")
@@ -97,12 +85,15 @@ def origin_in_words(recording: Recording) -> list[str]:
 
 
 def _point_in_words(point: Any) -> str:
-    if point == UNKNOWN:
+    if point == "unknown":
         return "at a point that is not known"
     x, y = float(point.get("x", 0.0)), float(point.get("y", 0.0))
     parts = [f"{abs(x):g} m {'ahead of' if x > 0 else 'behind'}"] if x else []
     parts += [f"{abs(y):g} m to the {'left' if y > 0 else 'right'} of"] if y else []
     return f"{' and '.join(parts)} the centre of gravity" if parts else "at the centre of gravity"
+
+
+Options = TypeVar("Options")
 
 
 class Source(ABC):
@@ -112,42 +103,50 @@ class Source(ABC):
         dataset: its configuration, as conf/dataset/*.yaml holds it.
 
     Attributes:
-        keys: options of its own.
-        options_type: dataclass of those options, which says of what type they are.
+        options_type: dataclass of its own options, with their types and defaults.
+        keys: names of those options, which follow from ``options_type``.
+        options: the options of this data set.
         version: raised when the recordings that it makes change.
 
     Raises:
-        ConfigurationError: a key that this source does not know, or one that is missing.
+        ConfigurationError: an unknown or missing option, or a value of the wrong type.
     """
 
-    keys: ClassVar[frozenset[str]] = frozenset()
-    options_type: ClassVar[type | None] = None
+    options_type: ClassVar[type]
+    keys: ClassVar[frozenset[str]]
+    options: Any
     version: ClassVar[str] = "1"
     slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
+
+    def __init_subclass__(cls) -> None:
+        if "options_type" in vars(cls):
+            cls.keys = frozenset(field.name for field in fields(cls.options_type))
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
         self.name = str(dataset.get("name", "unnamed"))
+        self.where = f"data set '{self.name}'"
         check_name(self.name, "data set")
         unknown = sorted(set(dataset) - COMMON_KEYS - self.keys)
         if unknown:
-            known = ", ".join(sorted(self.keys))
-            raise ConfigurationError(
-                f"data set '{self.name}': source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {known}"
-            )
-
-        told = {key: value for key, value in dataset.items() if key in COMMON_KEYS}
-        common = validated(CommonOptions, told, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
-        self.reference_point, self.imu_point = common.reference_point, common.imu_point
-        self.transforms = self._transforms(common.transforms or ())
+            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {', '.join(sorted(self.keys))}"
+            raise ConfigurationError(f"{self.where}: {what}")
+        common = self._validated(CommonOptions, COMMON_KEYS)
+        self.reference_point = common.reference_point
+        try:
+            self.transforms = [transform_from_config(entry) for entry in common.transforms or ()]
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{self.where}: {error}") from None
         if isinstance(self.reference_point, Point) and any(isinstance(transform, ScaleToWheelbase) for transform in self.transforms):
-            what = "a reference point is in metres of the car as it is; move the reference by the transform reference_lever, before"
-            raise ConfigurationError(f"data set '{self.name}': {what} scale_to_wheelbase")
-        if dataset.get("source") == SIMULATED and dataset.get("kind", "simulated") != "simulated":
-            raise ConfigurationError(f"data set '{self.name}': what source '{SIMULATED}' makes is simulated; leave kind out")
-        if self.options_type is not None:
-            own = {key: value for key, value in dataset.items() if key in self.keys}
-            validated(self.options_type, own, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
+            what = "a reference point is in metres of the unscaled car; move the reference by the transform reference_lever, before"
+            raise ConfigurationError(f"{self.where}: {what} scale_to_wheelbase")
+        if dataset.get("source") == SIMULATED and common.kind != SIMULATED and "kind" in dataset:
+            raise ConfigurationError(f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out")
+        self.options = self._validated(self.options_type, self.keys)
+
+    def _validated(self, kind: type[Options], keys: frozenset[str]) -> Options:
+        own = {key: value for key, value in self.dataset.items() if key in keys}
+        return validated(kind, own, self.where, error=ConfigurationError, group="dataset")
 
     @property
     def kind(self) -> Kind:
@@ -156,7 +155,7 @@ class Source(ABC):
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
-        """What the recordings are made from: name -> file, or a version where there is no file.
+        """Inputs of the recordings: name -> file, or a version where there is no file.
 
         Raises:
             MissingError: a file or folder is not there.
@@ -167,25 +166,28 @@ class Source(ABC):
         """Names of the recordings, in order."""
 
     def read(self, recording_id: str) -> Recording:
-        """Make one recording, with the channels that the data set derives and its reference at the centre of gravity.
+        """One recording, with the channels that the data set derives and its reference at the centre of gravity.
 
         Raises:
-            DataError: its files cannot be used as they are.
+            MissingError: there is none of that name, or a file is missing.
+            DataError: its files cannot be used.
         """
         return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
-        """Make a recording of a file wherever it is, or of what else one recording is made of, as `read` does.
+        """A recording of a file, or of a bag's folder, wherever it is, as `read` makes it.
 
         Raises:
-            ConfigurationError: this source's recordings are none of a file.
-            MissingError: it is not there.
-            DataError: it cannot be used as it is.
+            ConfigurationError: this source reads no single files.
+            MissingError: the file is not there.
+            DataError: it cannot be used.
         """
         return self._prepared(self.read_raw_file(file))
 
     def _prepared(self, recording: Recording) -> Recording:
-        """What the data set's transforms and its reference point make of a recording, unless it has been through them; they are noted."""
+        """A recording after the data set's transforms and with its reference at the centre of gravity, unless it has been through them."""
+        if len(recording) > 1:
+            require_clock(recording.time, f"{self.where}, recording '{recording.id}'", "correct time or rate_hz")
         if DERIVED in recording.provenance:
             return recording
         for transform in self.transforms:
@@ -193,41 +195,21 @@ class Source(ABC):
         point, moved = self.reference_point, False
         if isinstance(point, Point) and (point.x or point.y) and "vy_ref" in recording:
             recording, moved = ReferenceLever(point.x, point.y)(recording), True
-        told = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
-        if not told:
+        declared = {key: self.dataset[key] for key in ("transforms", "reference_point", "imu_point") if self.dataset.get(key)}
+        if not declared:
             return recording
-        noted = {DERIVED: {**told, "moved_to_centre_of_gravity": moved}}
-        return replace(recording, provenance={**recording.provenance, **noted})
-
-    def _transforms(self, entries: Sequence[Mapping[str, Any]]) -> list[Transform]:
-        made = []
-        for entry in entries:
-            try:
-                made.append(transform_from_config(entry))
-            except ConfigurationError as error:
-                raise ConfigurationError(f"data set '{self.name}': {error}") from None
-        return made
+        return replace(recording, provenance={**recording.provenance, DERIVED: {**declared, "moved_to_centre_of_gravity": moved}})
 
     @abstractmethod
     def read_raw(self, recording_id: str) -> Recording:
-        """Make one recording of what its files hold.
-
-        Raises:
-            DataError: they cannot be used as they are.
-        """
+        """One recording of its files as they are; raises as `read` does."""
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Make a recording of what a file holds.
-
-        Raises:
-            ConfigurationError: this source's recordings are none of a file.
-            MissingError: it is not there.
-            DataError: it cannot be used as it is.
-        """
-        raise ConfigurationError(f"data set '{self.name}': source '{self.dataset.get('source')}' reads no single files")
+        """A recording of a file as it is; raises as `read_file` does."""
+        raise ConfigurationError(f"{self.where}: source '{self.dataset.get('source')}' reads no single files")
 
     def file_names(self) -> list[str]:
-        """Files that the recordings are made of, as far as the configuration alone tells: what ``download`` fetches if it lists none."""
+        """Files that the configuration alone names, which ``download`` fetches if it lists none."""
         return []
 
     def recordings(self) -> Iterator[Recording]:
@@ -255,7 +237,7 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     """
     template = TEMPLATES.get(file.suffix.lower())
     if dataset.get("source") == "tabular" and template is not None:
-        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, say there what the columns are, and add dataset=NAME"
+        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, declare the columns there, and add dataset=NAME"
         raise ConfigurationError(f"'{file}' is no table; {what}")
     return open_source(dataset).read_file(file)
 
@@ -286,10 +268,8 @@ def existing_folder(path: Any, dataset: str) -> Path:
     Raises:
         MissingError: no root was given, or the folder is not there.
     """
-    if path is None or str(path) in {"", "None", "null"} or str(path).startswith(("None/", "null/")):
-        raise MissingError(
-            f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA to the folder with the recordings"
-        )
+    if str(path or "None").split("/")[0] in {"None", "null"}:
+        raise MissingError(f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA")
     folder = Path(str(path)).expanduser()
     if not folder.is_dir():
         raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
@@ -320,7 +300,7 @@ def matching_files(dataset: Mapping[str, Any], default: str) -> list[Path]:
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:
-    """See that files are there and hold something.
+    """Refuse missing and empty files.
 
     Raises:
         MissingError: one is not there or is empty.

@@ -1,4 +1,4 @@
-"""Times that a table writes as a clock does: of a day, or with a date before it."""
+"""Times of day in text, with or without a date."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ WRITTEN = (
 
 
 def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
-    """Times ``10:59:30.25``, ``2024-05-03T10:59:30.25Z`` or ``3.5.2024 10:59:30,25`` in seconds, (N,); None of other text.
+    """Times ``10:59:30.25``, ``2024-05-03T10:59:30.25Z`` or ``3.5.2024 10:59:30,25`` in seconds, (N,); None for other text.
 
-    With a date they count from 1970, without one from midnight, and on beyond the next. The zone is taken for one and the same.
+    With a date they count from 1970, without one from midnight, and on beyond the next. The zone is not read.
 
     Args:
         column: strings, (N,).
@@ -38,7 +38,7 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
 
 
 def _days(dates: list[str]) -> FloatArray | None:
-    """Days since 1970, (N,); None where one is none."""
+    """Days since 1970, (N,); None where one is no date."""
     known: dict[str, float] = {}
     for date in set(dates):
         parts = date.split(".")

@@ -1,4 +1,4 @@
-"""Velocities in a car's own axes from where a motion capture system saw it."""
+"""Velocities in a car's axes from poses of motion capture."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from vehest.data.errors import ConfigurationError, DataError
 
 UpAxis = Literal["y", "z"]
 POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
-"""What can be made of poses."""
+"""Channels that poses give."""
 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """What a car does in the plane, in ISO 8855 axes.
+    """Motion of a car in the plane, in ISO 8855 axes.
 
     Args:
         vx: forward velocity of the reference point [m/s], shape (T,).
@@ -82,7 +82,7 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
     Args:
         positions: x, y, z in the world [m], shape (T, 3).
         orientations: quaternions x, y, z, w from the rigid body's axes to the world's, shape (T, 4).
-        up: the world's and the rigid body's upward axis; ``y`` is the custom of motion capture, ``z`` of ROS.
+        up: the world's and the rigid body's upward axis; ``y`` is usual in motion capture, ``z`` in ROS.
         where: file and topic, for messages.
 
     Returns:
@@ -108,22 +108,14 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
 
 
 def require_filter(window: Any, order: Any, where: str) -> tuple[int, int]:
-    """Window and order of a Savitzky-Golay filter as a data set declares them.
-
-    Raises:
-        ConfigurationError: they are none.
-    """
+    """Window and order of a Savitzky-Golay filter as a data set declares them; raises `ConfigurationError` where they are none."""
     if not isinstance(window, int) or not isinstance(order, int) or not 1 <= order < window or window % 2 == 0:
         raise ConfigurationError(f"{where}: window must be an odd number of samples above an order of 1 or more, not {window} and {order}")
     return window, order
 
 
 def require_pose_channels(names: Any, where: str) -> tuple[str, ...]:
-    """Channels to make of poses as a data set declares them.
-
-    Raises:
-        ConfigurationError: something else stands among them.
-    """
+    """Channels of poses as a data set declares them; raises `ConfigurationError` for another one."""
     unknown = [name for name in names if name not in POSE_CHANNELS] if isinstance(names, list | tuple) else [names]
     if unknown:
         raise ConfigurationError(f"{where}: channels must be a list of {', '.join(POSE_CHANNELS)}, not '{unknown[0]}'")

@@ -1,49 +1,44 @@
-"""Signals that come each at a time of its own, in groups of several rasters or in frames of a bus, brought to one clock.
+"""Signals with times of their own, in groups of several rasters or in frames of a bus, brought to one clock.
 
-Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that says otherwise is refused.
+Which signal is which channel, and in which unit and sign, is declared in conf/dataset; a file that contradicts it is refused.
+
+file -> a `Signal` each channel -> ticks on which all that are not gappy have values -> channels
 """
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_clock
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config, uniform_clock
+from vehest.sources.clocks import SLACK, at_ticks, common_ticks, on_nearest, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.unit_spellings import require_unit
 
-OWN_KEYS = frozenset({"interpolation", "max_gap"})  # of a channel, beside those of every column
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
 FASTER = 1.05  # than the raster: the rest would fold into it
-LATEST_TICK = 1e12  # 30 years at 1 kHz
-TICK = 1e-6  # of an interval; times that are nearer are the same
 
 
 @dataclass(frozen=True)
-class SignalChannel:
-    """How a channel comes from a signal.
+class SignalChannel(Column):
+    """Declaration of a signal that becomes a channel.
 
     Args:
-        column: name, unit, sign and factor.
-        interpolation: ``linear``, or ``hold`` for values that stand until the next one.
+        interpolation: ``linear``, or ``hold`` for values that hold until the next one.
         max_gap: longest time between two samples that is interpolated [s]; None for three median intervals.
     """
 
-    column: Column
-    interpolation: str = "linear"
-    max_gap: float | None = None
+    interpolation: Literal["linear", "hold"] = "linear"
+    max_gap: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -85,12 +80,12 @@ class Signal:
 
 @dataclass(frozen=True)
 class SignalOptions:
-    """Options of every source of signals, by type; what is None is not said."""
+    """Options of every source of signals; docs/sources/mdf.md describes them."""
 
     channels: ChannelMap
     path: str | None = None
-    files: str | None = None
-    rate_hz: float | None = None
+    files: str = "*"
+    rate_hz: Rate | None = None
     raster: str | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"
@@ -99,41 +94,45 @@ class SignalOptions:
 class SignalSource(Source):
     """Files of signals, a recording each.
 
-    Options: ``path`` and ``files`` (glob), ``rate_hz`` or ``raster`` (a channel whose clock is taken), ``channels``, ``gappy`` and
-    ``file_units`` (``check`` or ``ignore``).
-
     Attributes:
-        pattern: of files, where the data set names none.
-        own_keys: of a channel, beside those that every source of signals has.
+        own_keys: of a channel's declaration, which the source itself reads.
     """
 
-    keys = frozenset({"path", "files", "rate_hz", "raster", "channels", "gappy", "file_units"})
-    pattern: ClassVar[str]
+    options_type = SignalOptions
+    options: SignalOptions
     own_keys: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.where = f"data set '{self.name}'"
-        self.channels = channels_from_config(dataset.get("channels"), self.name, self.own_keys)
-        self.gappy = self._gappy(dataset.get("gappy") or [])
-        self.rate_hz, self.raster = dataset.get("rate_hz"), dataset.get("raster")
-        if (self.rate_hz is None) == (self.raster is None):
+        options = self.options
+        entries = {
+            name: {key: value for key, value in entry.items() if key not in self.own_keys} if isinstance(entry, Mapping) else entry
+            for name, entry in options.channels.items()
+        }
+        self.channels = cast(dict[str, SignalChannel], columns_from_config(entries, self.name, SignalChannel))
+        self.gappy = frozenset(options.gappy or ())
+        if not self.channels:
+            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        if unknown := sorted(self.gappy - set(self.channels)):
+            raise ConfigurationError(f"{self.where}: gappy names '{unknown[0]}', which is not one of its channels")
+        if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken")
-        if self.rate_hz is not None:
-            _require_positive(self.rate_hz, f"{self.where}: rate_hz")
-        if self.raster is not None and (self.raster not in self.channels or self.raster in self.gappy):
-            raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{self.raster}'")
-        pattern = dataset.get("files", self.pattern)
-        if not pattern or Path(pattern).is_absolute():
-            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '{self.pattern}', not '{pattern}'")
+        if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
+            raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
+        if not options.files or Path(options.files).is_absolute():
+            raise ConfigurationError(f"{self.where}: files must be a pattern inside path, such as '*.mf4', not '{options.files}'")
 
     def ids(self) -> list[str]:
         """Stems of the files, in alphabetical order."""
-        return [file.stem for file in matching_files(self.dataset, self.pattern)]
+        return [file.stem for file in self.files()]
 
     def inputs(self) -> dict[str, str | Path]:
         """The files of signals."""
-        return {file.name: file for file in matching_files(self.dataset, self.pattern)}
+        return {file.name: file for file in self.files()}
+
+    def files(self) -> list[Path]:
+        """The files of signals, in alphabetical order; raises as `matching_files` does."""
+        return matching_files(self.dataset, self.options.files)
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one file by its stem.
@@ -142,7 +141,7 @@ class SignalSource(Source):
             MissingError: there is none of that name.
             DataError: it is damaged, more than the limits, lacks a signal, or its signals cannot be brought to one clock.
         """
-        for file in matching_files(self.dataset, self.pattern):
+        for file in self.files():
             if file.stem == recording_id:
                 return self.read_raw_file(file)
         raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {', '.join(self.ids())})")
@@ -156,11 +155,13 @@ class SignalSource(Source):
         """
         require_files([file], self.name)
         signals, provenance = self._read_signals(file)
-        self._require_units(signals, file)
+        if self.options.file_units == "check":
+            for name, signal in signals.items():
+                where = self._signal_name(name, signal, file)
+                require_unit(signal.unit, self.channels[name], channel(name).unit, where, "set file_units: ignore")
         grid = self._grid(signals, file)
         channels = {
-            name: self.channels[name].column.to_si(self._on_grid(name, signal, grid, file), channel(name).unit)
-            for name, signal in signals.items()
+            name: self.channels[name].to_si(self._on_grid(name, signal, grid, file), channel(name).unit) for name, signal in signals.items()
         }
         try:
             return Recording(
@@ -178,7 +179,7 @@ class SignalSource(Source):
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, and what is to be known of the file.
+        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance.
 
         Raises:
             DataError: it is damaged, more than the limits, or lacks a signal.
@@ -190,111 +191,48 @@ class SignalSource(Source):
         spans = {name: _valid_span(signal, self._signal_name(name, signal, file)) for name, signal in spanning.items()}
         late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
         begin, end = spans[late][0], spans[early][1]
-        if self.raster is None:
-            rate = float(self.rate_hz or 0.0)
-            if not max(abs(begin), abs(end)) * rate < LATEST_TICK:
-                raise DataError(f"'{file}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {rate:g} Hz; the file is damaged")
-            check_limit("samples", (end - begin) * rate, f"'{file}' would become {(end - begin) * rate:.0f} samples at {rate:g} Hz")
-            first, last = math.ceil(begin * rate - TICK), math.floor(end * rate + TICK)
-            grid = Grid(np.arange(first, last + 1) / rate, rate)
+        if self.options.rate_hz is not None:
+            ticks = common_ticks(begin, end, self.options.rate_hz, f"'{file}'")
         else:
-            signal = signals[self.raster]
-            stamps = signal.stamps[(signal.stamps >= begin) & (signal.stamps <= end)]
-            grid = _even_clock(stamps, f"'{file}': {signal.origin}, whose clock is taken,")
-        if len(grid.times) < 2:
+            raster = signals[str(self.options.raster)]
+            ticks = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
+        if len(ticks) < 2:
             raise DataError(
                 f"'{file}': channel '{late}' ({signals[late].origin}) begins at {begin:.6g} s, channel '{early}' ("
                 f"{signals[early].origin}) ends at {end:.6g} s: nothing is common to all; leave one out or declare it gappy"
             )
-        return grid
+        if self.options.rate_hz is not None:
+            return Grid(ticks, self.options.rate_hz)
+        where = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
+        clock = uniform_clock(ticks, where, fix="give rate_hz instead of raster")
+        return Grid(clock.ticks(), clock.rate_hz, ticks)
 
     def _on_grid(self, name: str, signal: Signal, grid: Grid, file: Path) -> FloatArray:
         """A signal's values at the ticks, in the file's unit."""
-        declared, where = self.channels[name], self._signal_name(name, signal, file)
-        if signal.rate_hz > FASTER * grid.rate_hz and "aliasing" not in (self.dataset.get("accept") or []):
+        declared, where, rate_hz = self.channels[name], self._signal_name(name, signal, file), signal.rate_hz
+        if rate_hz > FASTER * grid.rate_hz and "aliasing" not in (self.dataset.get("accept") or []):
             raise DataError(
-                f"{where} comes at {signal.rate_hz:.6g} Hz, faster than the raster of {grid.rate_hz:.6g} Hz, into which vibrations "
+                f"{where} comes at {rate_hz:.6g} Hz, faster than the raster of {grid.rate_hz:.6g} Hz, into which vibrations "
                 f"would fold; take that rate here and let 'vehest downsample' filter, or accept: [aliasing]"
             )
         if name in self.gappy:
-            return _nearest(signal, grid)
-        near = TICK / grid.rate_hz
+            return on_nearest(signal.values, np.rint((signal.stamps - grid.times[0]) * grid.rate_hz), len(grid.times))
+        near = SLACK / grid.rate_hz
         first = max(int(np.searchsorted(signal.stamps, grid.times[0] + near, side="right")) - 1, 0)
         last = int(np.searchsorted(signal.stamps, grid.times[-1] - near, side="left"))
         stamps, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
         _refuse_invalid(stamps, values, where)
-        _refuse_gaps(stamps, declared.max_gap if declared.max_gap is not None else GAP / signal.rate_hz, where)
+        _refuse_gaps(stamps, declared.max_gap or GAP / rate_hz, where)
         if grid.stamps is not None and np.array_equal(stamps, grid.stamps):
             return values
-        if declared.interpolation == "hold":
-            latest = np.searchsorted(stamps, grid.times + near, side="right") - 1
-            return values[np.maximum(latest, 0)]
-        return np.interp(grid.times, stamps, values)
-
-    def _require_units(self, signals: Mapping[str, Signal], file: Path) -> None:
-        if self.dataset.get("file_units", "check") == "ignore":
-            return
-        for name, signal in signals.items():
-            where = self._signal_name(name, signal, file)
-            require_unit(signal.unit, self.channels[name].column, channel(name).unit, where, "set file_units: ignore")
+        return at_ticks(values, stamps, grid.times, hold=declared.interpolation == "hold", slack=near)
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
-        return f"'{file}': signal '{self.channels[name].column.column}' of {signal.origin}, for channel '{name}',"
-
-    def _gappy(self, names: Any) -> frozenset[str]:
-        for name in names:
-            if name not in self.channels:
-                raise ConfigurationError(f"{self.where}: gappy names '{name}', which is not one of its channels")
-        return frozenset(names)
-
-
-def channels_from_config(entries: Any, dataset: str, further: frozenset[str] = frozenset()) -> dict[str, SignalChannel]:
-    """The map of channels, with what only signals have.
-
-    Args:
-        entries: channel -> its declaration.
-        dataset: for messages.
-        further: keys that the source itself looks at.
-
-    Raises:
-        ConfigurationError: an unknown channel, unit or key.
-    """
-    if not isinstance(entries, Mapping) or not entries:
-        raise ConfigurationError(f"data set '{dataset}': channels must map a channel to its column and unit, not {entries}")
-    plain = {
-        name: {key: value for key, value in entry.items() if key not in OWN_KEYS | further} if isinstance(entry, Mapping) else entry
-        for name, entry in entries.items()
-    }
-    channels = {}
-    for name, column in columns_from_config(plain, dataset).items():
-        own, where = entries[name], f"data set '{dataset}': channel '{name}'"
-        interpolation, max_gap = own.get("interpolation", "linear"), own.get("max_gap")
-        if interpolation not in ("linear", "hold"):
-            raise ConfigurationError(f"{where}: interpolation '{interpolation}' is not one of: linear, hold")
-        if max_gap is not None:
-            _require_positive(max_gap, f"{where}: max_gap")
-        channels[name] = SignalChannel(column, str(interpolation), max_gap)
-    return channels
-
-
-def _require_positive(value: Any, where: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):
-        raise ConfigurationError(f"{where} must be a positive number, not {value}")
-
-
-def _even_clock(stamps: FloatArray, where: str) -> Grid:
-    """The clock of a group whose samples come evenly."""
-    if len(stamps) < 2:
-        return Grid(stamps, 0.0)
-    findings = checks_of_clock(stamps)
-    if findings:
-        raise DataError(f"{where} does not come evenly: {findings[0].message}; give rate_hz instead of raster")
-    clock = uniform_clock(stamps, where)
-    return Grid(clock.start_time + np.arange(clock.n_samples) / clock.rate_hz, clock.rate_hz, stamps)
+        return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
 
 
 def _valid_span(signal: Signal, where: str) -> tuple[float, float]:
-    """Times of the first and last sample that holds [s]."""
+    """Times of the first and last valid sample [s]."""
     valid = np.flatnonzero(~np.isnan(signal.values))
     if len(valid) == 0:
         raise DataError(f"{where} holds no valid sample; leave the channel out")
@@ -313,19 +251,10 @@ def _refuse_invalid(stamps: FloatArray, values: FloatArray, where: str) -> None:
 
 def _refuse_gaps(stamps: FloatArray, limit: float, where: str) -> None:
     steps = np.diff(stamps)
-    gaps = np.flatnonzero(steps > limit * (1.0 + TICK))
+    gaps = np.flatnonzero(steps > limit * (1.0 + SLACK))
     if len(gaps):
         longest = gaps[np.argmax(steps[gaps])]
         raise DataError(
             f"{where} is not measured for {steps[longest]:.6g} s after {stamps[longest]:.6g} s, {len(gaps)} such gaps in all "
             f"(longer than {limit:.6g} s); cut the range out, or declare max_gap if values may be interpolated over that time"
         )
-
-
-def _nearest(signal: Signal, grid: Grid) -> FloatArray:
-    """Every sample on its nearest tick, NaN on the others: interpolation would invent what was not measured."""
-    values = np.full(len(grid.times), np.nan)
-    ticks = np.rint((signal.stamps - grid.times[0]) * grid.rate_hz)
-    kept = (ticks >= 0) & (ticks < len(values)) & ~np.isnan(signal.values)
-    values[ticks[kept].astype(np.int64)] = signal.values[kept]
-    return values

@@ -12,7 +12,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
-from vehest.sources.columns import Clock, Column, column_from_config
+from vehest.sources.clocks import Clock
+from vehest.sources.columns import Column, column_from_config
 from vehest.sources.pose import POSE_CHANNELS, planar_motion, require_filter, require_pose_channels
 
 UNITS = {"x": "m", "y": "m", "yaw": "rad"}

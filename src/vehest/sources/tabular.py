@@ -22,16 +22,14 @@ from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.data.text_files import first_line
 from vehest.sources.base import Source, matching_files, require_files
+from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
 from vehest.sources.columns import (
     ChannelMap,
     ChannelNames,
-    Clock,
-    ClockPolicy,
     Column,
     columns_from_config,
     identity_columns,
     time_column_from_config,
-    uniform_clock,
 )
 from vehest.sources.held import Held, between_samples, held_from_config, new_samples, with_repeats
 from vehest.sources.table_pose import TablePose, table_pose_from_config
@@ -185,7 +183,7 @@ class TabularSource(Source):
             raise DataError(f"'{file}' has a header and no rows")
         if self.time is not None:
             stamps = self.time.to_si(values[self.time.column], "s")
-            clock = uniform_clock(stamps, where, self.dataset.get("clock", "strict"), n_channels=len(columns))
+            clock = uniform_clock(stamps, where, self.dataset.get("clock", "strict"))
         else:
             clock = Clock(0.0, float(self.dataset["rate_hz"]), n_rows)
         held = () if self.held is None else self.held.channels

@@ -1,4 +1,4 @@
-"""Units as files spell them; to see whether what a file says of itself contradicts what conf/dataset declares."""
+"""Spellings of units in files, compared with the units that conf/dataset declares."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 from vehest.sources.columns import Column
 
-# without blanks, dots, stars and case -> as vehest spells it, or something that no channel is in; left out is what means two things
+# without blanks, dots, stars and case -> the spelling of vehest, or a unit of no channel; ambiguous ones are left out
 _SPELLINGS = {
     **dict.fromkeys(("m/s", "mps", "m/sec", "ms-1", "ms^-1"), "m/s"),
     **dict.fromkeys(("km/h", "kmh", "kph", "km/hr", "kmph", "kmh-1", "kmh^-1"), "km/h"),
@@ -35,27 +35,27 @@ _SPELLINGS = {
     **dict.fromkeys(("m", "meter", "metre"), "m"),
     **dict.fromkeys(("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"),
 }
-_CASES = {"kN": "kN", "Mpa": "MPa", "mPa": "another unit"}  # where upper and lower case are two things
+_CASES = {"kN": "kN", "Mpa": "MPa", "mPa": "another unit"}  # where upper and lower case differ in meaning
 
 
 def plain_unit(text: str) -> str | None:
-    """A unit's one spelling, ``another unit`` for one that no channel has; None where the spelling is not known or there is none."""
-    bare = re.sub(r"[\s·*.]", "", text.strip().strip("[]()").replace("Â", ""))  # Â: UTF-8 that was taken for Latin-1 on its way
+    """A unit as vehest spells it, ``another unit`` for one that no channel has; None for an unknown spelling or none."""
+    bare = re.sub(r"[\s·*.]", "", text.strip().strip("[]()").replace("Â", ""))  # Â: UTF-8 that was read as Latin-1
     return _CASES.get(bare) or _SPELLINGS.get(bare.lower())
 
 
 def require_unit(written: str, column: Column, si_unit: str, where: str, fix: str) -> None:
-    """See that the unit that a file writes does not contradict the declared one. A spelling that is not known says nothing.
+    """Refuse a declared unit that contradicts the file's; unknown spellings pass.
 
     Args:
-        written: in the file.
-        column: what is declared; one with a factor other than 1 is in another unit than its file on purpose.
+        written: unit in the file.
+        column: declaration; one with a factor other than 1 is in another unit than its file on purpose.
         si_unit: of the channel.
         where: file and signal, for messages.
         fix: how to let it pass, for messages.
 
     Raises:
-        DataError: it does.
+        DataError: the units differ.
     """
     plain = plain_unit(written)
     if plain is None or column.factor != 1.0:

@@ -25,7 +25,8 @@ from vehest.data.parquet import DAMAGE
 from vehest.data.recording import Recording
 from vehest.data.text_files import first_line
 from vehest.sources.base import Source, matching_files, require_files
-from vehest.sources.columns import ChannelMap, ChannelNames, ClockPolicy, columns_from_config, uniform_clock
+from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, columns_from_config
 from vehest.sources.text_tables import check_size
 from vehest.sources.unit_spellings import require_unit
 
@@ -135,7 +136,7 @@ class VboSource(Source):
         used = {column.column for column in self.columns.values()}
         if any(name.startswith(("Slip_", "Lat._Vel")) for name in used) and SLIP_CHECK not in (self.dataset.get("accept") or []):
             require_slip_offsets(log, f"'{file}'")
-        clock = uniform_clock(log.seconds, f"'{file}'", self.dataset.get("clock", "strict"), n_channels=len(self.columns))
+        clock = uniform_clock(log.seconds, f"'{file}'", self.dataset.get("clock", "strict"))
         channels = {
             name: clock.align(column.to_si(log.columns[column.column], channel(name).unit), gappy=name in self.gappy)
             for name, column in self.columns.items()

@@ -23,7 +23,7 @@ from vehest.data.supplies import supply_of
 from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
-from vehest.sources.columns import plain_rate
+from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import RawColumn
 
 POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}

@@ -17,12 +17,12 @@ from vehest.alignment.proposals.assign import possible, propose
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.limits import check_limit, limits_from_config, use_limits
 from vehest.data.splits import check_name
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
-from vehest.sources.columns import plain_rate
+from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
@@ -234,6 +234,7 @@ def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, f
     if timed:
         begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))
         rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
+        check_limit("samples", (end - begin) * rate, f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz")
         grid = np.arange(begin, end, 1.0 / rate)
         return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
@@ -243,10 +244,10 @@ def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, f
     rows = [bridged(column.values[run], stamps, BRIDGED) for column in columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     rate = plain_rate(1.0 / step, RATE_TOLERANCE)
-    grid = np.arange(stamps[0], stamps[-1], 1.0 / rate)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
-    if is_even or len(grid) > 4 * len(stamps):
+    if is_even or (stamps[-1] - stamps[0]) * rate > 4 * len(stamps):
         return np.stack(rows), rate
+    grid = np.arange(stamps[0], stamps[-1], 1.0 / rate)
     return np.stack([np.interp(grid, stamps, values) for values in rows]), rate
 
 

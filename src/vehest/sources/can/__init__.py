@@ -13,12 +13,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_clock
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.sources.base import matching_files, require_files
+from vehest.sources.base import require_files
 from vehest.sources.can.database import Database, Message, read_database
 from vehest.sources.can.logs import Frames, read_frames
+from vehest.sources.clocks import require_clock
 from vehest.sources.signals import Signal, SignalOptions, SignalSource
 
 FEWEST = 2
@@ -52,8 +52,6 @@ class CanSource(SignalSource):
     """Logs, a recording each; their frames are decoded by the data set's ``dbc``, those of one ``bus`` where a log holds several."""
 
     options_type = CanOptions
-    keys = SignalSource.keys | {"dbc", "bus"}
-    pattern = "*.asc"
     own_keys = frozenset({"invalid"})
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -70,7 +68,7 @@ class CanSource(SignalSource):
             MissingError: one of them is not there.
         """
         require_files([self.dbc], self.name)
-        return {**{file.name: file for file in matching_files(self.dataset, self.pattern)}, self.dbc.name: self.dbc}
+        return {**{file.name: file for file in self.files()}, self.dbc.name: self.dbc}
 
     def wanted(self) -> tuple[Database, dict[str, Wanted]]:
         """The DBC, and the signal of each channel.
@@ -80,10 +78,10 @@ class CanSource(SignalSource):
             DataError: it cannot be used, or lacks a signal.
         """
         require_files([self.dbc], self.name)
-        database = read_database(self.dbc, [declared.column.column for declared in self.channels.values()])
+        database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
         found = {}
         for name, declared in self.channels.items():
-            message, signal = database.places[declared.column.column]
+            message, signal = database.places[declared.column]
             found[name] = Wanted(message, signal, frozenset(message.physical(signal, raw) for raw in self.invalid[name]))
         return database, found
 
@@ -94,9 +92,7 @@ class CanSource(SignalSource):
         for name, (stamps, values) in series.items():
             message = wanted[name].message
             where = f"'{file}': message '{message.name}', which carries '{wanted[name].signal}',"
-            for finding in checks_of_clock(stamps):
-                if finding.check == "clock":
-                    raise DataError(f"{where}: {finding.message}; where two buses carry it, say which by bus: …")
+            require_clock(stamps, where, "where two buses carry it, say which by bus: …")
             signals[name] = Signal(f"message '{message.name}'", stamps, values, message.units[wanted[name].signal])
         rates = {signal.origin.removeprefix("message ").strip("'"): round(signal.rate_hz, 3) for signal in signals.values()}
         return signals, {"dbc": self.dbc.name, "messages": rates}

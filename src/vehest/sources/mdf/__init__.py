@@ -26,7 +26,6 @@ class MdfSource(SignalSource):
     """Measurements, a recording each; a channel may say in which ``group`` its signal stands."""
 
     options_type = MdfOptions
-    pattern = "*.mf4"
     own_keys = frozenset({"group"})
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
@@ -39,7 +38,7 @@ class MdfSource(SignalSource):
         return group
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        wanted = {name: Wanted(declared.column.column, self.groups[name]) for name, declared in self.channels.items()}
+        wanted = {name: Wanted(declared.column, self.groups[name]) for name, declared in self.channels.items()}
         measurement = read_measurement(file, wanted)
         rates = {signal.origin.removeprefix("group "): round(signal.rate_hz, 3) for signal in measurement.signals.values()}
         return dict(measurement.signals), {"version": measurement.version, "measured": measurement.start, "groups": rates}

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_clock
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
+from vehest.sources.clocks import require_clock
 from vehest.sources.mdf.blocks import BlockFile, shown
 from vehest.sources.mdf.conversions import TextError
 from vehest.sources.mdf.data_blocks import records_of
@@ -135,9 +135,7 @@ def _signals(file: BlockFile, contents: Contents, group: Group, places: Mapping[
             f"{_where(file, first, group)} holds {count} samples, its header says {group.samples}; the file is truncated or damaged"
         )
     stamps = _physical(times, columns[0], _where(file, clock, group))
-    for finding in checks_of_clock(stamps):
-        if finding.check == "clock":
-            raise DataError(f"{_where(file, first, group)}: {finding.message}; repair the measurement, or cut the range out")
+    require_clock(stamps, _where(file, first, group), "repair the measurement, or cut the range out")
     signals = {}
     for number, (name, field) in enumerate(fields.items(), start=1):
         values = _physical(field, columns[number], _where(file, places[name], group))

@@ -16,7 +16,8 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, existing_folder, require_files
-from vehest.sources.columns import ChannelMap, ChannelNames, ClockPolicy, columns_from_config, time_column_from_config, uniform_clock
+from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.columns import ChannelMap, ChannelNames, columns_from_config, time_column_from_config
 from vehest.sources.revs.csv_layout import read_csv_columns, read_csv_head
 from vehest.sources.revs.mat_layout import read_mat_columns
 from vehest.sources.revs.parameters import read_vehicle_parameters
@@ -139,7 +140,7 @@ class RevsSource(Source):
                 require_unit(head.unit_of(column.column), column, channel(name).unit, where, "set units_row: ignore")
         values, dropped = read_csv_columns(file, head, self.time.column, columns, self._gappy_columns())
         stamps, policy = self.time.to_si(values[self.time.column], "s"), self.dataset.get("clock", "strict")
-        clock = uniform_clock(stamps, f"'{file}'", policy, n_channels=len(self.columns))
+        clock = uniform_clock(stamps, f"'{file}'", policy)
         aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
         origin = {"file": file.name, "preamble": list(head.preamble), "rows_dropped_at_the_head": dropped}
         return clock.start_time, clock.rate_hz, aligned, origin
@@ -155,7 +156,7 @@ class RevsSource(Source):
         values = read_text_columns(folder, columns, self.time.column)
         where = f"'{text_file(folder, self.time.column)}'"
         stamps, policy = self.time.to_si(values[self.time.column], "s"), self.dataset.get("clock", "strict")
-        clock = uniform_clock(stamps, where, policy, n_channels=len(self.columns))
+        clock = uniform_clock(stamps, where, policy)
         aligned = {name: clock.align(values[name], name in self._gappy_columns()) for name in columns}
         return clock.start_time, clock.rate_hz, aligned, {}
 

@@ -13,7 +13,8 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
-from vehest.sources.columns import ClockPolicy, Column, uniform_clock
+from vehest.sources.clocks import ClockPolicy, uniform_clock
+from vehest.sources.columns import Column
 from vehest.sources.limited import read_limited
 
 _VALUE = "value"

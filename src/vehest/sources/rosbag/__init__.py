@@ -16,30 +16,25 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
-from vehest.data.schema import validated
 from vehest.sources.base import Source, existing_folder
+from vehest.sources.clocks import SampleTimes, at_ticks, common_ticks, stamped_times, uniform_times
 from vehest.sources.pose import ground_plane, planar_motion
 from vehest.sources.rosbag.declarations import BagChannel, Pose, RosbagOptions, Topic
 from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
-from vehest.sources.stamps import SampleTimes, stamped_times, uniform_times
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval
-LATEST_TICK = 10**15
 
 
 class RosbagSource(Source):
     """Bags, a recording each; its options are those of `RosbagOptions`."""
 
     options_type = RosbagOptions
-    keys = frozenset(RosbagOptions.__dataclass_fields__)
+    options: RosbagOptions
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        own = {key: value for key, value in dataset.items() if key in self.keys}
-        self.options = validated(RosbagOptions, own, f"data set '{self.name}'", error=ConfigurationError, group="dataset")
         self.topics, self.channels = self.options.topics or {}, self.options.channels or {}
 
     def ids(self) -> list[str]:
@@ -74,9 +69,7 @@ class RosbagSource(Source):
     def _read(self, recording_id: str, path: Path) -> Recording:
         bag = read_bag(path, self._wanted(), self.options.messages or {}, int(1e9 * self.options.unpacked_limit))
         series = {name: self._series(topic, bag, path) for name, topic in self.topics.items() if topic.topic in bag.topics}
-        rate = self.options.rate_hz
-        first, n_samples = self._grid(series, path)
-        grid = (first + np.arange(n_samples)) / rate
+        grid = self._grid(series, path)
         channels = {name: series[source.topic].channel(name, source, grid) for name, source in self.channels.items()}
         if self.options.pose is not None:
             channels |= self._reference(self.options.pose, series[self.options.pose.topic], grid, path)
@@ -84,7 +77,7 @@ class RosbagSource(Source):
             return Recording(
                 id=recording_id,
                 vehicle=str(self.dataset.get("vehicle", "unknown")),
-                rate_hz=rate,
+                rate_hz=self.options.rate_hz,
                 start_time=float(grid[0]),
                 channels=channels,
                 kind=self.kind,
@@ -166,22 +159,18 @@ class RosbagSource(Source):
             times = stamped_times(stamps, where)
         return Series(topic, times, fields, _latency(data)).averaged()
 
-    def _grid(self, series: Mapping[str, Series], path: Path) -> tuple[int, int]:
-        """Number of the first tick that all topics reach, counted from the bag's first message, and how many there are."""
+    def _grid(self, series: Mapping[str, Series], path: Path) -> FloatArray:
+        """Ticks that all topics reach [s]."""
         begins = {one.times[0]: one.topic.topic for one in series.values()}
         ends = {one.times[-1]: one.topic.topic for one in series.values()}
         begin, end = max(begins), min(ends)
-        rate = self.options.rate_hz
-        first, last = math.ceil(begin * rate - 1e-6), math.floor(end * rate + 1e-6)
-        if not max(abs(first), abs(last)) < LATEST_TICK:
-            raise DataError(f"'{path}': its times from {begin:.6g} s to {end:.6g} s are no drive's at {rate:g} Hz; it is damaged")
-        if last <= first:
+        grid = common_ticks(begin, end, self.options.rate_hz, f"'{path}'")
+        if len(grid) < 2:
             raise DataError(
                 f"'{path}': topic '{begins[begin]}' begins at {begin:.6g} s, when '{ends[end]}' has ended at {end:.6g} s; "
                 f"do their stamps come from different clocks? then set stamps: received"
             )
-        check_limit("samples", last - first + 1, f"'{path}' would become {last - first + 1} samples at {rate:g} Hz")
-        return first, last - first + 1
+        return grid
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
         """Reference channels from the poses."""
@@ -232,10 +221,7 @@ class Series:
     def channel(self, name: str, source: BagChannel, grid: FloatArray) -> FloatArray:
         """A channel on another clock."""
         values = source.to_si(self.fields[source.field], channel(name).unit)
-        if self.topic.interpolation == "hold":
-            latest = np.searchsorted(self.times, grid + 1e-9, side="right") - 1
-            return values[np.maximum(latest, 0)]
-        return np.interp(grid, self.times, values)
+        return at_ticks(values, self.times, grid, hold=self.topic.interpolation == "hold", slack=1e-9)
 
     def averaged(self) -> Series:
         """The same with the declared moving average; half its width is lost at either end."""

@@ -1,14 +1,16 @@
-"""What a log holds before anybody has said what its columns are: names, units as written, numbers, and what looks like a clock.
+"""Columns of a log that no data set declares yet: names, units as written, numbers, and a column that looks like a clock.
 
-Nothing is made a channel here; ``vehest.alignment.proposals`` says what speaks for which.
+Nothing is made a channel here; ``vehest.alignment.proposals`` finds which column is which channel.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
+from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.tables import survey_table
 
@@ -18,11 +20,11 @@ MDF, VBO, BAGS = (".mf4", ".mdf", ".dat"), (".vbo",), (".db3", ".mcap", ".zip", 
 
 
 def survey(path: Path) -> Log:
-    """What one file, or a bag's folder, holds.
+    """Columns of one file, or of a bag's folder.
 
     Raises:
         MissingError: it is not there or empty, or a package is missing that its format needs.
-        DataError: it is of no format that is read, damaged, or holds no numbers.
+        DataError: it is of no format that is read, damaged, holds no numbers, or a time stamp is a stray one.
     """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
@@ -47,8 +49,14 @@ def survey(path: Path) -> Log:
         raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
     else:
         log = survey_table(path)
+    for run in log.runs:
+        if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
+            raise DataError(f"'{path}': {fault}")
+    faults = {one.name: clock_fault(one.stamps, may_repeat=True) for one in log.columns if one.stamps is not None}
+    skipped = tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
+    log = replace(log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=log.skipped + skipped)
     if not log.columns:
-        raise DataError(f"'{path}' holds no column of numbers")
+        raise DataError(f"'{path}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     return log
 
 

@@ -1,12 +1,13 @@
-"""Which column of a table is its clock, in which unit, and where runs begin."""
+"""Finds the column of a table that is its clock, its unit, and where runs begin."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.sources.surveys.log import Stamps, runs_between
@@ -33,7 +34,7 @@ class Found:
     """The clock of a table.
 
     Args:
-        stamps: which column it is; None where none looks like one.
+        stamps: its column; None where none looks like a clock.
         seconds: times of the rows [s], (N,).
         runs: rows of each run, the longest first.
         counted_by: column that counts the runs; empty where none does.
@@ -56,25 +57,26 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     candidates = []
     for place, (name, values) in enumerate(columns.items()):
         step = _step(values)
-        if step is None:
-            continue
-        unit, told = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
-        counts = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or told)
-        candidates.append((2 * bool(unit) + told - 2 * counts, -place, name, step, unit, told, counts))
-    for _, _, name, step, unit, told, counts in sorted(candidates, reverse=True):
-        if counts:
-            continue
-        stamps = _stamps(name, step, unit, told)
-        if stamps is not None:
-            seconds = (columns[name] - columns[name][0]) * UNITS[stamps.unit]
-            steps = np.diff(columns[name])
-            counter, breaks = _named_counter(columns, name), runs_between((steps < 0) | (steps > LONG_GAP * step), n_rows)
-            if counter:
-                breaks = runs_between(np.diff(columns[counter]) != 0, n_rows)
-            elif len(breaks) > 1:
-                counter = _counter(columns, breaks)
-            return Found(stamps, seconds, breaks if counter else runs_between(steps < 0, n_rows), counter)
-    return Found(None, None, (slice(0, n_rows),))
+        unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
+        counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
+        stamps = None if step is None or counts_rows else _stamps(name, step, unit, named)
+        if step is not None and stamps is not None:
+            candidates.append((2 * bool(unit) + named, -place, step, stamps))
+    if not candidates:
+        return Found(None, None, (slice(0, n_rows),))
+    *_, step, stamps = max(candidates, key=lambda candidate: candidate[:2])
+    values = columns[stamps.column]
+    steps, seconds = np.diff(values), (values - values[0]) * UNITS[stamps.unit]
+    numbers = [name for name in columns if name != stamps.column and COUNTER.match(plain_name(name))]
+    for name, starts in _counters(columns, numbers):
+        if 0 < starts.sum() <= MOST_RESTARTS * n_rows:
+            return Found(stamps, seconds, runs_between(starts, n_rows), name)
+    breaks = (steps < 0) | (steps > LONG_GAP * step)
+    if breaks.any():
+        for name, starts in _counters(columns, columns):
+            if (starts == breaks).all():
+                return Found(stamps, seconds, runs_between(breaks, n_rows), name)
+    return Found(stamps, seconds, runs_between(steps < 0, n_rows))
 
 
 def plain_name(name: str) -> str:
@@ -97,10 +99,10 @@ def _step(values: FloatArray) -> float | None:
     return step if step > 0 and np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR else None
 
 
-def _stamps(name: str, step: float, unit: str, told: bool) -> Stamps | None:
-    """The unit in which a step makes a rate that loggers have."""
+def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
+    """A column of time in the unit in which a step makes a rate that loggers have; None where no unit does."""
     fitting = [own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]]
-    chosen = unit or (fitting[0] if fitting else "s" if told else "")
+    chosen = unit or (fitting[0] if fitting else "s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
@@ -108,23 +110,11 @@ def _stamps(name: str, step: float, unit: str, told: bool) -> Stamps | None:
     return Stamps(name, chosen, how, asked=chosen not in fitting)
 
 
-def _named_counter(columns: Mapping[str, FloatArray], clock: str) -> str:
-    """A column that is named as a number of runs, and counts some of them, each in one piece."""
-    for name, values in columns.items():
-        if name != clock and COUNTER.match(plain_name(name)) and np.isfinite(values).all() and (values == np.rint(values)).all():
-            starts = np.flatnonzero(np.diff(values)) + 1
-            if 0 < len(starts) <= MOST_RESTARTS * len(values) and len(np.unique(values)) == len(starts) + 1:
-                return name
-    return ""
-
-
-def _counter(columns: Mapping[str, FloatArray], runs: Sequence[slice]) -> str:
-    """A column of whole numbers that changes where runs begin and nowhere else, and never takes a value again."""
-    starts = sorted(run.start for run in runs)[1:]
-    for name, values in columns.items():
+def _counters(columns: Mapping[str, FloatArray], names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Columns of whole numbers that never take a value again, each with where it changes, (N - 1,)."""
+    for name in names:
+        values = columns[name]
         if np.isfinite(values).all() and (values == np.rint(values)).all():
-            changes = np.flatnonzero(np.diff(values)) + 1
-            numbers = values[[0, *starts]]
-            if changes.tolist() == starts and len(set(numbers.tolist())) == len(numbers):
-                return name
-    return ""
+            changes = np.diff(values) != 0
+            if len(np.unique(values)) == changes.sum() + 1:
+                yield name, changes

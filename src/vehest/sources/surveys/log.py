@@ -1,4 +1,4 @@
-"""What a survey finds in a log."""
+"""Columns, clock and runs that a survey finds in a log."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class RawColumn:
 
 @dataclass(frozen=True)
 class Stamps:
-    """What looks like a clock.
+    """A column that looks like a clock.
 
     Args:
         column: its name.
         unit: of time: ``s``, ``ms``, ``us`` or ``ns``.
-        evidence: what speaks for it, for people.
-        asked: whether something else could be meant.
+        evidence: reasons for it, for people.
+        asked: whether the unit is ambiguous.
     """
 
     column: str
@@ -52,17 +52,17 @@ class Stamps:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """What a file holds.
+    """Columns of a file.
 
     Args:
         file: the file, or a bag's folder.
         source: that reads it.
         columns: without its clock.
         options: of the source, such as delimiter and decimal mark.
-        clock: column of its times; None where there is none, or where the format tells of times by itself.
+        clock: column of its times; None where there is none, or where the format has times of its own.
         seconds: times of the rows [s], (N,), from the clock; None where columns have their own or there is no clock.
         runs: rows of each uninterrupted run, the longest first; one of all where times never restart.
-        skipped: what was not read, and why.
+        skipped: parts that were not read, with the reason.
     """
 
     file: Path

@@ -1,0 +1,316 @@
+"""Checks time stamps, finds the even clock behind them, and brings samples onto it.
+
+stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_times` -> samples on the clock's ticks
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.limits import check_limit
+
+ClockPolicy = Literal["strict", "interpolate", "uniform"]
+
+HIGHEST_RATE = 1e5  # Hz
+LONGEST_STEP = 86_400.0  # s
+MOST_STEPS = 1e8  # median steps from the first to the last stamp
+LATEST_TIME = 1e11  # s; beyond it a double tells no two samples of 1e5 Hz apart
+GAP = 1.5  # median steps
+MOST_JITTER = 0.01  # of a step
+MOST_CLOCK_DRIFT = 0.5  # steps
+MOST_STRETCH = 0.1  # of a step, over a whole recording, by which a plain rate may differ from the one found
+MOST_DRIFT = 0.01  # of a step, over a whole recording, that may come from the resolution of the stamps
+INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
+SLACK = 1e-6  # of a step; times that are nearer are the same
+SORT = "repair, remove or sort the rows"
+BRIDGE = "cut the range out or set clock: interpolate"
+
+FEWEST = 20  # samples behind which an even clock is looked for
+BLOCK_SECONDS = 1.0
+REJECTED = 3.0  # standard deviations, taken from the median absolute residual
+MOST_WANDERING = 0.4  # of a step; a lost sample in the middle makes 0.5
+RATE_TOLERANCE = 5e-3
+
+
+def require_clock(stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False) -> None:
+    """Refuse time stamps that have a `clock_fault`; ``where`` names file and signal.
+
+    Raises:
+        DataError: they have one.
+    """
+    if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
+        raise DataError(f"{where}: {fault}")
+
+
+def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
+    """How time stamps break the rule for every recording: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
+
+    Args:
+        stamps: time stamps [s], shape (T,).
+        fix: how to repair their order.
+        may_repeat: whether they may repeat, as those with software delay do.
+
+    Returns:
+        The fault and what to do about it, in words; empty where the rule holds.
+    """
+    if fault := _order_fault(stamps, fix, may_repeat):
+        return fault
+    step = float(np.median(np.diff(stamps)))
+    if not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= step <= LONGEST_STEP:
+        return f"the time stamps lie {step:.6g} s apart (from {stamps[0]:.12g} s to {stamps[-1]:.12g} s); correct the unit of time"
+    return span_fault(stamps)
+
+
+def span_fault(stamps: FloatArray) -> str:
+    """A stray one among time stamps, more than 1e8 median steps from the others, in words; empty where none is.
+
+    Args:
+        stamps: in any unit, at least two, shape (T,); they may repeat.
+    """
+    steps = np.diff(stamps)
+    step = float(np.median(steps)) or float(steps.mean())
+    if not stamps[-1] - stamps[0] > MOST_STEPS * step:
+        return ""
+    at = int(np.argmax(steps))
+    return (
+        f"time spans more than {MOST_STEPS:g} steps of {step:.6g} s, with a gap of {steps[at]:.6g} s between sample {at} "
+        f"({stamps[at]:.12g} s) and {at + 1} ({stamps[at + 1]:.12g} s); remove the stray stamp, or what lies on one side"
+    )
+
+
+def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
+    if len(stamps) < 2:
+        return f"fewer than two time stamps; {fix}"
+    odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
+    if len(odd):
+        time = float(stamps[odd[0]])
+        what = f"{time:.6g} s, which is no time of a drive" if math.isfinite(time) else "not a number"
+        return f"time stamp of sample {odd[0]} is {what}; {fix}"
+    steps = np.diff(stamps)
+    for what, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
+        if bad.any():
+            first = int(np.argmax(bad)) + 1
+            return f"time {what} {bad.sum()} times, first at sample {first} ({stamps[first]:.12g} s); {fix}"
+    return ""
+
+
+def unevenness(stamps: FloatArray) -> str:
+    """Gaps, jitter or drift of increasing time stamps [s], in words; empty where they are even."""
+    steps = np.diff(stamps)
+    step = float(np.median(steps))
+    gaps = np.flatnonzero(steps > GAP * step)
+    if len(gaps):
+        longest = gaps[np.argmax(steps[gaps])]
+        return f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s (interval {step:.6g} s)"
+    jitter = float(np.abs(steps - step).max() / step)
+    if jitter > MOST_JITTER:
+        return f"intervals deviate by up to {100 * jitter:.2g} % from the median of {step:.6g} s"
+    away = np.abs(stamps - np.linspace(stamps[0], stamps[-1], len(stamps)))
+    drift = float(away.max() / step)
+    if drift > MOST_CLOCK_DRIFT:
+        return f"the clock drifts: at {stamps[np.argmax(away)]:.12g} s it is {drift:.2g} intervals away from a uniform one"
+    return ""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A uniform clock, and how to bring samples onto it.
+
+    Args:
+        start_time: time of the first sample [s].
+        rate_hz: sampling rate [Hz].
+        n_samples: samples on the uniform clock.
+        stamps: the file's own time stamps, where samples must be interpolated [s].
+    """
+
+    start_time: float
+    rate_hz: float
+    n_samples: int
+    stamps: FloatArray | None = None
+
+    def times_of_rows(self) -> FloatArray:
+        """Times of the file's rows [s]."""
+        return self.ticks() if self.stamps is None else self.stamps
+
+    def ticks(self) -> FloatArray:
+        """Times of the uniform clock [s]."""
+        return self.start_time + np.arange(self.n_samples) / self.rate_hz
+
+    def align(self, samples: FloatArray, gappy: bool = False) -> FloatArray:
+        """Samples on the uniform clock, by linear interpolation where the file's own clock jitters.
+
+        A gappy channel's samples go to the nearest tick instead: interpolation would lose those between two gaps.
+        """
+        if self.stamps is None:
+            return samples
+        elapsed = self.stamps - self.stamps[0]
+        if gappy:
+            return on_nearest(samples, np.minimum(np.rint(elapsed * self.rate_hz), self.n_samples - 1), self.n_samples)
+        return at_ticks(samples, elapsed, np.arange(self.n_samples) / self.rate_hz)
+
+
+def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE) -> Clock:
+    """The uniform clock behind a file's time stamps.
+
+    Args:
+        stamps: time stamps [s], shape (T,).
+        where: file, for messages.
+        policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the rows
+            as evenly sampled and their stamps as late, and refuses missing rows.
+        fix: what to do where ``strict`` finds no even clock.
+
+    Raises:
+        DataError: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
+            hold more samples than the limits allow.
+    """
+    require_clock(stamps, where, may_repeat=policy == "uniform")
+    start, elapsed, intervals = float(stamps[0]), float(stamps[-1] - stamps[0]), len(stamps) - 1
+    if policy == "uniform":
+        nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
+        sampled = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+        return Clock(float(sampled.times[0]), plain_rate(float(sampled.rate_hz or 0.0), min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
+    if policy == "interpolate":
+        rate = plain_rate(1.0 / mean_step(np.diff(stamps)), INTERPOLATED_TOLERANCE)
+        n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
+        check_limit("samples", n_samples, f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples")
+        return Clock(start, rate, n_samples, stamps)
+    if uneven := unevenness(stamps):
+        raise DataError(f"{where}: {uneven}; {fix}")
+    return Clock(start, plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4)), len(stamps))
+
+
+@dataclass(frozen=True)
+class SampleTimes:
+    """Times of samples and how their stamps scatter about them.
+
+    Args:
+        times: strictly increasing [s], shape (T,).
+        rate_hz: the rate found [Hz]; None where the stamps themselves are the times.
+        jitter: root mean square of stamp minus time [s]; of the intervals where the stamps themselves are the times.
+    """
+
+    times: FloatArray
+    rate_hz: float | None
+    jitter: float
+
+
+def stamped_times(stamps: FloatArray, where: str) -> SampleTimes:
+    """The stamps [s], shape (T,), themselves as times; raises `DataError` as `require_clock` does."""
+    require_clock(stamps, where, "repair or cut the range out, or take clock: uniform if samples come in batches")
+    return SampleTimes(stamps, None, float(np.diff(stamps).std()))
+
+
+def uniform_times(
+    stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = "cut the range out or set clock: stamps"
+) -> SampleTimes:
+    """Times of a sensor that samples evenly, from time stamps with software delay.
+
+    A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled
+    computer makes them, do not count. A constant latency stays in.
+
+    Args:
+        stamps: time stamps [s], shape (T,); they may repeat.
+        rate_hz: the sensor's nominal rate [Hz].
+        where: file and topic, for messages.
+        tolerated: wandering of the stamps about the line that does not matter [s].
+        fix: what to do where samples are missing, for messages.
+
+    Raises:
+        DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
+    """
+    if len(stamps) < FEWEST:
+        raise DataError(f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed")
+    if fault := _order_fault(stamps, "repair or cut the range out", may_repeat=True):
+        raise DataError(f"{where}: {fault}")
+    number = np.arange(len(stamps), dtype=np.float64)
+    step, first = _robust_line(number, stamps)
+    found = 1.0 / step if step > 0 else math.inf
+    if not abs(found / rate_hz - 1.0) <= RATE_TOLERANCE:
+        what = f"samples come at {found:.6g} Hz, not at {rate_hz:g} Hz: samples are missing, or the rate is another one"
+        raise DataError(f"{where}: {what}; {fix}")
+    times = first + step * number
+    late = stamps - times
+    # A lost sample shifts all later stamps by a step; so does a clock that drifts, little by little.
+    block = max(round(BLOCK_SECONDS * rate_hz), FEWEST // 2)
+    edges = np.arange(0, len(late), block)
+    shifts = np.array([np.median(late[edge : edge + block]) for edge in edges if not edge or len(late) - edge >= block // 2])
+    worst = int(np.argmax(np.abs(shifts)))
+    if abs(shifts[worst]) > max(MOST_WANDERING * step, tolerated):
+        raise DataError(
+            f"{where}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of {found:.6g} Hz about "
+            f"{stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
+        )
+    return SampleTimes(times, found, float(np.sqrt(np.mean(np.square(late)))))
+
+
+def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
+    """Slope and intercept, points beyond three standard deviations left out."""
+    middle, origin = number.mean(), stamps[0]
+    kept = np.ones(len(stamps), dtype=bool)
+    slope = offset = 0.0
+    for _ in range(10):
+        slope, offset = np.polyfit(number[kept] - middle, stamps[kept] - origin, 1).tolist()
+        residual = np.abs(stamps - origin - offset - slope * (number - middle))
+        fitting = residual <= REJECTED * 1.4826 * np.median(residual) + 1e-9
+        if (fitting == kept).all():
+            break
+        kept = fitting
+    return slope, offset - slope * middle + origin
+
+
+def common_ticks(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
+    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], shape (T,).
+
+    Raises:
+        DataError: they are more than the limits allow.
+    """
+    n_samples = (end - begin) * rate_hz
+    check_limit("samples", n_samples, f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
+    return np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+
+
+def at_ticks(samples: FloatArray, stamps: FloatArray, ticks: FloatArray, *, hold: bool = False, slack: float = 0.0) -> FloatArray:
+    """Samples at other times [s]: along straight lines or, to ``hold``, the last one that is at most ``slack`` [s] later than a tick."""
+    if not hold:
+        return np.interp(ticks, stamps, samples)
+    return samples[np.maximum(np.searchsorted(stamps, ticks + slack, side="right") - 1, 0)]
+
+
+def on_nearest(samples: FloatArray, ticks: FloatArray, n_samples: int) -> FloatArray:
+    """Every sample that is measured on its tick, a whole number, NaN on the others, shape (n_samples,)."""
+    placed = np.full(n_samples, np.nan)
+    kept = (ticks >= 0) & (ticks < n_samples) & ~np.isnan(samples)
+    placed[ticks[kept].astype(np.int64)] = samples[kept]
+    return placed
+
+
+def mean_step(steps: FloatArray) -> float:
+    """The sampling interval behind jittering time stamps [s]: the mean, a gap counting as the samples that it lacks."""
+    step = float(np.median(steps))
+    for _ in range(3 if step > 0 else 0):
+        step = float(steps.sum() / np.maximum(np.rint(steps / step), 1.0).sum())
+    return step
+
+
+def plain_rate(rate: float, tolerance: float) -> float:
+    """The rate that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
+
+    A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a rational multiple of any other.
+
+    Args:
+        rate: as computed from time stamps [Hz].
+        tolerance: relative deviation that is put down to the stamps.
+    """
+    for scale in (1.0, 1e3):
+        hertz = round(rate * scale) / scale
+        interval = round(1e3 * scale / rate) / (1e3 * scale)
+        candidates = [candidate for candidate in (hertz, 1.0 / interval if interval else 0.0) if abs(candidate / rate - 1.0) <= tolerance]
+        if candidates:
+            return min(candidates, key=lambda candidate: abs(candidate - rate))
+    return rate
