@@ -276,6 +276,17 @@ def test_start_and_stop_cut_a_range_out(folder: Path) -> None:
     np.testing.assert_allclose(recording["vx"], 1.0 + recording.time, rtol=0, atol=1e-8)
 
 
+def test_a_command_is_held_where_that_is_declared(folder: Path) -> None:
+    recording = read(folder, topics=topic_options("servo", interpolation="hold"))
+    sent = 0.003 + 0.05 * np.floor((recording.time - 0.003) / 0.05 + 1e-6)
+    np.testing.assert_allclose(recording["steer"], np.radians(6.0 * sent), rtol=0, atol=1e-8)
+
+
+def test_a_delay_is_taken_off(folder: Path) -> None:
+    recording = read(folder, topics=topic_options("motor", delay=0.02))
+    np.testing.assert_allclose(recording["vx"], 1.0 + recording.time + 0.02, rtol=0, atol=1e-8)
+
+
 def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
     """Vibration at 100 Hz looks like a constant to a recording of 100 Hz; an average over its period removes it."""
     topics = drive()
