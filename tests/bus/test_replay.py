@@ -199,7 +199,7 @@ def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path: Path
     lines = written.log.read_text().splitlines()
     written.log.write_text("\n".join([*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz")]))
     for speed in ("max", "10"):
-        with pytest.raises(DataError, match="cannot be read as a log of a bus"):
+        with pytest.raises(DataError, match=r"is damaged .*zz"):
             replayed(written, speed=speed)
 
 

@@ -25,10 +25,11 @@ from typing import Any
 
 from fuzz.case import GENERATORS, TEMPLATES, Case, Command, Generator, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
-from fuzz.watched import become
+from fuzz.watched import READER, become
 from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
+POLL_SECONDS = 0.02
 PLANTED = "planted"
 
 
@@ -173,42 +174,89 @@ def _watch(case: Case, command: Command) -> Outcome:
     """Run a command in a forked child and see what it does."""
     if command.unprivileged and os.getuid() == 0:
         _hand_over(case.folder)
+    pipe = case.folder / "log" / "reader"
+    os.mkfifo(pipe)
+    pipe.chmod(0o666)
     before = snapshot(case.folder)
     started = time.monotonic()
     child = os.fork()
     if child == 0:
         become(case, command)
-    process = os.pidfd_open(child)
-    while not _ends(process, case.seconds + 1.0 - _seconds(child, started)):
-        if _seconds(child, started) > case.seconds or time.monotonic() - started > MOST_WALL_SECONDS:
+    process, events = os.pidfd_open(child), os.open(pipe, os.O_RDWR | os.O_NONBLOCK)
+    readers = _Readers(child)
+    while not _ends(process, POLL_SECONDS):
+        readers.look()
+        if _seconds(child, started) - readers.waited > case.seconds or time.monotonic() - started > MOST_WALL_SECONDS:
             os.killpg(child, signal.SIGKILL)
             break
     os.close(process)
-    seconds = _seconds(child, started)
+    seconds = max(0.0, _seconds(child, started) - readers.waited)
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # whatever it has started; its number is its own until it is waited for
     _, status, used = os.wait4(child, 0)
     logs = case.folder / "log"
-    events = [json.loads(line) for line in _text(logs / "events").splitlines()]
-    imports_kb = next((value for key, value in events if key == "rss"), used.ru_maxrss)
+    noted = [json.loads(line) for line in _text(logs / "events").splitlines()]
+    with contextlib.suppress(BlockingIOError):
+        noted += [json.loads(line) for line in os.read(events, 2**16).splitlines()]
+    os.close(events)
+    imports_kb = next((value for key, value in noted if key == "rss"), used.ru_maxrss)
+    most_kb = readers.command_kb if readers.peaks_kb else used.ru_maxrss  # which counts ended children too
     return Outcome(
         exit_code=os.waitstatus_to_exitcode(status),
         seconds=seconds,
         cpu_seconds=used.ru_utime + used.ru_stime,
-        peak_mb=max(0, used.ru_maxrss - imports_kb) / 1024,
+        peak_mb=(max(0, most_kb - imports_kb) + max(readers.peaks_kb.values(), default=0)) / 1024,
         stdout=_text(logs / "stdout"),
         stderr=_text(logs / "stderr"),
-        events=tuple((key, str(value)) for key, value in events if key != "rss"),
+        events=tuple((key, str(value)) for key, value in noted if key != "rss"),
         changed=differences(before, snapshot(case.folder)),
         stack=" < ".join(line.strip() for line in _text(logs / "stack").splitlines() if line.startswith("  File"))[:1500],
     )
+
+
+class _Readers:
+    """What a command and the reading processes that it starts take, as far as repeated looks at them tell.
+
+    Args:
+        command: number of the command's process.
+
+    Attributes:
+        command_kb: most memory of the command [kB].
+        peaks_kb: reading process -> most memory [kB].
+        waited: seconds that reading processes waited for a core.
+    """
+
+    def __init__(self, command: int) -> None:
+        self._command = command
+        self.command_kb = 0
+        self.peaks_kb: dict[str, int] = {}
+        self._waits: dict[str, float] = {}
+
+    @property
+    def waited(self) -> float:
+        return sum(self._waits.values())
+
+    def look(self) -> None:
+        """Note memory and waiting of those that run."""
+        with contextlib.suppress(OSError, IndexError, StopIteration):
+            self.command_kb = max(self.command_kb, _peak_kb(str(self._command)))
+            for task in Path(f"/proc/{self._command}/task").iterdir():
+                for reader in (task / "children").read_text().split():
+                    if READER.encode() in Path(f"/proc/{reader}/cmdline").read_bytes():
+                        self.peaks_kb[reader] = _peak_kb(reader)
+                        self._waits[reader] = int(Path(f"/proc/{reader}/schedstat").read_text().split()[1]) / 1e9
+
+
+def _peak_kb(process: str) -> int:
+    with open(f"/proc/{process}/status") as stream:
+        return next(int(line.split()[1]) for line in stream if line.startswith("VmHWM:"))
 
 
 def _ends(process: int, seconds: float) -> bool:
     """Whether a process ends within some seconds."""
     poll = select.poll()
     poll.register(process, select.POLLIN)
-    return bool(poll.poll(max(seconds, 0.1) * 1000))
+    return bool(poll.poll(seconds * 1000))
 
 
 def _seconds(child: int, started: float) -> float:

@@ -12,13 +12,13 @@ from pathlib import Path
 from fuzz.case import CANARY, Case, Command
 from vehest.data.files import ASIDE_PREFIX
 
-MEMORY_MB = 1024.0
+MEMORY_MB = 2048.0
 VERDICTS = {
     "ok": "it was done, or refused with one line and its exit code",
     "executed": "code or a program ran that the input asked for, or a module was imported for it",
     "outside": "something was written outside of the output root and the named targets",
     "slow": "over 20 s, not counting those spent waiting for a core",
-    "memory": "over 1 GB above what the imports take",
+    "memory": "over 2 GB above what the imports take, with the reading process that it starts",
     "crash": "ended by a signal",
     "traceback": "a traceback was printed",
     "exit1": "exit code 1, or another that is not documented",

@@ -1,4 +1,4 @@
-"""The forked child: limits, an audit hook, and the command line run as the terminal would run it."""
+"""The forked child: limits, an audit hook, and the command line run as the terminal would run it; the reading processes that it starts."""
 
 from __future__ import annotations
 
@@ -60,6 +60,8 @@ MAKERS = (
     "ast",
 )
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
+READER = "vehest.sources.limited"
+"""The module that a command may run in a process of its own, to read one file."""
 IMPORTERS = ("importlib._bootstrap", "importlib._bootstrap_external", "_frozen_importlib", "_frozen_importlib_external")
 
 
@@ -69,10 +71,11 @@ class Watch:
     Args:
         inside: the case's folder, the only one that may be written to.
         report: file descriptor that each event is written to, a line of JSON.
+        reads: whether this is a reading process, which imports what it needs and runs nothing but code of installed files.
     """
 
-    def __init__(self, inside: Path, report: int) -> None:
-        self._inside, self._report = os.path.realpath(inside), report
+    def __init__(self, inside: Path, report: int, *, reads: bool = False) -> None:
+        self._inside, self._report, self._reads = os.path.realpath(inside), report, reads
         self._armed, self._noted = False, 0
 
     def arm(self) -> None:
@@ -100,10 +103,16 @@ class Watch:
                 raise OSError(101, "the network is out of reach here")
 
     def _code(self, event: str, arguments: tuple[Any, ...]) -> None:
-        caller = sys._getframe(2)
+        try:
+            caller = sys._getframe(2)
+        except ValueError:  # the interpreter itself, at its start
+            return
         module = str(caller.f_globals.get("__name__", "?"))
         if event == "import":
-            self._imported(str(arguments[0]))
+            if not self._reads:
+                self._imported(str(arguments[0]))
+            return
+        if self._reads and (event == "ctypes.dlopen" or _called_from(caller, IMPORTERS)):
             return
         if event in ("exec", "marshal.loads", "compile") and (module in IMPORTERS or module.startswith(MAKERS)):
             return
@@ -111,6 +120,8 @@ class Watch:
             return
         what = arguments[1] if event == "compile" else arguments[0]
         code = getattr(what, "co_filename", None) or what
+        if self._reads and event == "exec" and os.path.isabs(str(code)) and not str(code).startswith(self._inside + os.sep):
+            return
         if module == "jinja2.environment" and str(code).startswith(PAGES):
             return
         self._note("executed", f"{event} of {str(code)[:80]!r} by {module}:{caller.f_lineno}")
@@ -121,6 +132,8 @@ class Watch:
 
     def _program(self, event: str, arguments: tuple[Any, ...]) -> None:
         if event == "os.fork" or _called_from(sys._getframe(2), ("multiprocessing.",)):
+            return
+        if event == "subprocess.Popen" and [*arguments[1]][:1] + [*arguments[1]][-2:] == [sys.executable, "-m", READER]:
             return
         self._note("executed", f"{event} {str(arguments)[:120]}")
         raise PermissionError(1, "no program is started here")
@@ -181,6 +194,13 @@ def become(case: Case, command: Command) -> None:
         os._exit(code)
 
 
+def watch_reader() -> None:
+    """Watch this reading process as its command is watched; events go through a pipe, since it may write to no file."""
+    folder = Path(os.environ["FUZZ_CASE"])
+    report = os.open(folder / "log" / "reader", os.O_WRONLY | os.O_NONBLOCK)
+    Watch(folder, report, reads=True).arm()
+
+
 def _main_of(words: list[str]) -> Callable[[], None]:
     """The command line; or a planted misdeed, which shows that it is noticed."""
     if words and words[0].startswith("PLANTED:"):
@@ -232,7 +252,7 @@ def _prepare(case: Case, command: Command) -> int:
     tempfile.tempdir = str(case.folder / "tmp")
     sys.modules["__main__"] = types.ModuleType("__main__")  # the name of the program follows from it: vehest, not python -m fuzz
     sys.argv = ["vehest", *(os.fsdecode(word) for word in command.argv)]
-    sys.path[:] = [entry for entry in sys.path if entry not in ("", ".")]
+    sys.path[:] = [str(Path(__file__).parent / "reader"), *(entry for entry in sys.path if entry not in ("", "."))]
     if command.unprivileged and os.getuid() == 0:
         os.setgroups([])
         os.setgid(65534)
@@ -252,6 +272,7 @@ def _prepare(case: Case, command: Command) -> int:
 def _environment(case: Case, changes: Mapping[str, str | None]) -> None:
     for name in [name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))]:
         del os.environ[name]
+    os.environ |= {"FUZZ_CASE": str(case.folder), "PYTHONDONTWRITEBYTECODE": "1"}
     os.environ |= {"VEHEST_DATA": str(case.place / "raw"), "HOME": str(case.folder / "home"), "TMPDIR": str(case.folder / "tmp")}
     for name, value in changes.items():
         if value is None:

@@ -12,7 +12,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.units import factor_to_si
 from vehest.sources.base import open_source
 from vehest.sources.can import CanSource, Wanted, channel_values, channels_by_message
-from vehest.sources.can.database import Database, blocks_of, read_database, read_dbc
+from vehest.sources.can.database import Database, read_database, read_dbc
 from vehest.sources.columns import Column
 from vehest.sources.unit_spellings import plain_unit, require_unit
 
@@ -94,7 +94,7 @@ def from_names(dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), t
     unknown = sorted(set(entries) - set(needed))
     if unknown:
         raise ConfigurationError(f"--signals names '{unknown[0]}', which the model does not read; it reads {', '.join(needed)}")
-    named = {name for block in blocks_of(read_dbc(dbc), dbc) for name in block.signals}
+    named = {signal.name for message in read_dbc(dbc) for signal in message.signals}
     found = {name: entries.get(name, Column(name, "")) for name in needed if name in entries or name in named}
     _require_channels(needed, optional, found, f"no signal of '{dbc}' is called so; say which one it is: --signals CHANNEL=MESSAGE.SIGNAL")
     database = read_database(dbc, [column.column for column in found.values()])

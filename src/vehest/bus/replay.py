@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from vehest.bus.view import Shown, View
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.text_files import first_line
 from vehest.sources.can import decoded, is_on, never_occurs
-from vehest.sources.can.logs import frames_of
+from vehest.sources.can.logs import Frames
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0
@@ -77,11 +76,10 @@ class Survey:
     timing: Timing
 
 
-def survey(log: Path, signals: BusSignals, rate_hz: float | None = None) -> Survey:
+def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Survey:
     """Look at the first seconds of a log, and further on for signals that come later.
 
     Raises:
-        MissingError: there is no such file.
         DataError: it cannot be used, or a signal never occurs.
         ConfigurationError: the rate is none.
     """
@@ -95,14 +93,16 @@ def survey(log: Path, signals: BusSignals, rate_hz: float | None = None) -> Surv
             break
     for name, wanted in signals.wanted.items():
         if len(stamps[name]) < 2:
-            raise DataError(never_occurs(log, name, wanted, len(stamps[name]), signals.bus))
+            raise DataError(never_occurs(log.file, name, wanted, len(stamps[name]), signals.bus))
         if (np.diff(stamps[name]) <= 0).any():
-            raise DataError(f"'{log}': stamps of message '{wanted.message.name}' repeat or go back; where two buses carry it, say which")
+            raise DataError(
+                f"'{log.file}': stamps of message '{wanted.message.name}' repeat or go back; where two buses carry it, name one"
+            )
     return Survey(first, timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz))
 
 
 def replay(
-    log: Path,
+    log: Frames,
     signals: BusSignals,
     found: Survey,
     make_stepper: Callable[[], GuardedStepper],
@@ -126,7 +126,6 @@ def replay(
     Raises:
         ConfigurationError: the log or the DBC has the identifiers of the estimates.
         MissingError: the bus cannot be opened, or an output not be written.
-        DataError: the log is damaged.
     """
     for identifier in (bus.first_id, bus.first_id + 1):
         if (identifier, False) in signals.database.taken:
@@ -145,7 +144,7 @@ class _Run:
 
     def __init__(
         self,
-        log: Path,
+        log: Frames,
         signals: BusSignals,
         found: Survey,
         stepper: GuardedStepper,
@@ -184,7 +183,7 @@ class _Run:
 
     def _frames(self) -> Iterator[Any]:
         """Frames of the log, those before the first that is wanted and those of other buses left out."""
-        for frame in frames_of(self.log):
+        for frame in self.log:
             if frame.timestamp >= self.first and is_on(frame, self.signals.bus):
                 yield frame
 

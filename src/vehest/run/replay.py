@@ -16,6 +16,7 @@ from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
 from vehest.run.config import Config, compose_config
 from vehest.run.estimate import PRETRAINED, open_model, pretrained_note
+from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 
 SAME_RATE = 1e-6
@@ -55,12 +56,13 @@ def replay_log(
     folder, fitted, trust = open_model(model, Path(config["output"]), say)
     with use_limits(limits_from_config(config["limits"])):
         wanted = _signals(config if dataset else None, dbc, signals, fitted)
-        found = survey(log, wanted, bus_rate)
+        frames = read_frames(log)
+        found = survey(frames, wanted, bus_rate)
         faster = found.timing.rate_hz if abs(found.timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE else None
         if write_dbc is not None:
             outputs.write_dbc(write_dbc, bus.first_id)
         figures, output = replay(
-            log,
+            frames,
             wanted,
             found,
             lambda: GuardedStepper(fitted, trust, faster),

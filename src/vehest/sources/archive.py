@@ -51,12 +51,7 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
         DataError: the archive is refused, truncated or corrupt.
         MissingError: the archive cannot be opened, or there is no room to unpack it.
     """
-    try:
-        temporary = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
-    except OSError as error:
-        raise MissingError(f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR to one") from None
-    with temporary as name:
-        folder = Path(name)
+    with temporary_folder(file) as folder:
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
@@ -77,6 +72,21 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
                 raise writing_error(folder, error) from None
             raise DataError(f"'{file}' cannot be unpacked ({error.strerror or error}); fetch it again") from None
         yield folder
+
+
+@contextmanager
+def temporary_folder(file: Path) -> Iterator[Path]:
+    """Yield a folder to unpack a file into, which is removed afterwards.
+
+    Raises:
+        MissingError: there is no room for one.
+    """
+    try:
+        kept = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise MissingError(f"there is no temporary folder to unpack '{file}' into ({error.strerror}); set TMPDIR to one") from None
+    with kept as name:
+        yield Path(name)
 
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:

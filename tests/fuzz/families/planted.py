@@ -8,9 +8,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
+
 from fuzz.case import CANARY, Case, Command, generator
+from vehest.data.errors import DataError
+from vehest.data.limits import Limits, use_limits
+from vehest.sources.limited import read_limited
 
 MISDEEDS: dict[str, tuple[str, Callable[[], None]]] = {}
 
@@ -99,7 +105,7 @@ def sleeps() -> None:
 
 @_misdeed("memory")
 def allocates() -> None:
-    bytearray(b"x") * (1400 * 2**20)
+    bytearray(b"x") * (2400 * 2**20)
 
 
 @_misdeed("crash")
@@ -145,3 +151,58 @@ def colours_the_terminal() -> None:
 def leaves_half_a_file() -> None:
     Path("outputs").mkdir()
     Path("outputs/.writing-1-aaaaaaaa-model").write_text("")
+
+
+def _reads_by(reader: str) -> None:
+    read_limited(f"{__name__}:{reader}", Path("raw/given.csv"))
+
+
+def _reader(*_: object, **__: object) -> tuple[dict[str, object], dict[str, object]]:
+    return {"x": np.ones(3)}, {}
+
+
+@_misdeed("ok")
+def reads_in_a_process() -> None:
+    _reads_by("_reader")
+
+
+def _formula(file: Path) -> tuple[dict[str, object], dict[str, object]]:
+    return {"x": np.full(3, eval(file.read_text().splitlines()[1]))}, {}
+
+
+@_misdeed("executed")
+def evaluates_while_reading() -> None:
+    _reads_by("_formula")
+
+
+def _shell(_: Path) -> tuple[dict[str, object], dict[str, object]]:
+    os.system("true")
+    return {}, {}
+
+
+@_misdeed("executed")
+def runs_a_shell_while_reading() -> None:
+    with suppress(DataError):
+        _reads_by("_shell")
+
+
+def _write(_: Path) -> tuple[dict[str, object], dict[str, object]]:
+    os.mkdir("beside")
+    return {}, {}
+
+
+@_misdeed("outside")
+def writes_while_reading() -> None:
+    with suppress(DataError):
+        _reads_by("_write")
+
+
+def _much(_: Path) -> tuple[dict[str, object], dict[str, object]]:
+    much = bytearray(b"x") * (2400 * 2**20)
+    return {"x": np.ones(len(much) // 2**30)}, {}
+
+
+@_misdeed("memory")
+def allocates_while_reading() -> None:
+    with use_limits(Limits(memory=3_500_000_000)):
+        _reads_by("_much")

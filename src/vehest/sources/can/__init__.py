@@ -15,11 +15,9 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.limits import check_limit
-from vehest.data.text_files import first_line
 from vehest.sources.base import require_files
 from vehest.sources.can.database import Database, Message, read_database
-from vehest.sources.can.logs import frames_of
+from vehest.sources.can.logs import Frames, read_frames
 from vehest.sources.clocks import require_clock
 from vehest.sources.signals import Signal, SignalOptions, SignalSource
 
@@ -109,23 +107,24 @@ class CanSource(SignalSource):
 
 
 def decoded(
-    file: Path, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
+    frames: Frames, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
 ) -> Iterator[tuple[Any, dict[str, float]]]:
     """Frames of a log that carry anything that is wanted, each with its values, channel -> value in the unit of the DBC; NaN: invalid.
 
     Raises:
-        MissingError: there is no such file, or a package is not installed.
-        DataError: it is damaged or more than the limits, or a frame is shorter than the DBC says.
+        DataError: a frame is shorter than the DBC says.
     """
     channels_of = channels_by_message(wanted)
-    for frame in frames_of(file):
+    for frame in frames:
         message = database.messages.get((frame.arbitration_id, frame.is_extended_id))
         if message is None or not is_on(frame, bus):
             continue
         try:
             values = message.decode(frame.data)
         except DataError as error:
-            raise DataError(f"'{file}', at {frame.timestamp:.6f} s: {error}; is the file truncated, or the DBC another car's?") from None
+            raise DataError(
+                f"'{frames.file}', at {frame.timestamp:.6f} s: {error}; is the file truncated, or the DBC another car's?"
+            ) from None
         yield frame, channel_values(values, channels_of[message.name], wanted)
 
 
@@ -164,16 +163,10 @@ def read_series(
     """
     stamps = {name: array("d") for name in wanted}
     values = {name: array("d") for name in wanted}
-    count = 0
-    try:
-        for frame, found in decoded(file, database, wanted, bus):
-            for name, value in found.items():
-                stamps[name].append(frame.timestamp)
-                values[name].append(value)
-            count += len(found)
-            check_limit("values", count, f"'{file}' holds {count} values or more")
-    except MemoryError as error:
-        raise DataError(f"'{file}' asks for more memory than there is ({first_line(error)}); read fewer signals of it") from None
+    for frame, found in decoded(read_frames(file, database.messages), database, wanted, bus):
+        for name, value in found.items():
+            stamps[name].append(frame.timestamp)
+            values[name].append(value)
     for name, one in wanted.items():
         if len(stamps[name]) < FEWEST:
             raise DataError(never_occurs(file, name, one, len(stamps[name]), bus))

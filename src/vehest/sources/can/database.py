@@ -1,60 +1,29 @@
-"""What a DBC file says of the signals that are wanted, decoded by cantools.
+"""Signals of a DBC file, by cantools.
 
-A DBC can come from anywhere, and cantools makes lists as long as a message says it is. So its text is read here within limits first, and
-only the messages and signals that are wanted, with the multiplexers that they depend on, are handed on, written anew.
+DBC -> lengths of messages and signals, looked at since cantools makes lists as long -> cantools -> wanted signals with their multiplexers
 """
 
 from __future__ import annotations
 
 import difflib
-import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import DataError, MissingError, printable
+from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
+from vehest.sources.limited import require_package
 
-EXTENDED = 0x80000000
-ID_BITS = 0x1FFFFFFF
-UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
 MOST_BYTES = 64  # of a frame of CAN FD
 MOST_BITS = 64  # of a number
-MOST_SIGNALS = 10_000  # of one message
+LONGEST = 1785  # bytes of a message that J1939 sends in several frames
 COMPARED = 10_000  # names that a misspelt one is compared with
-
-_COMMENT = re.compile(r'^[ \t]*CM_\s[^"\n]*"(?:[^"\\]|\\.)*"\s*;', re.MULTILINE | re.DOTALL)
-_MESSAGE = re.compile(r"[ \t]*BO_[ \t]+(\d{1,10})[ \t]+(\w{1,200})[ \t]*:[ \t]*(\d{1,10})\b")
-_SIGNAL = re.compile(
-    r"[ \t]*SG_[ \t]+(?P<name>\w{1,200})[ \t]*(?P<multiplex>M|m\d{1,9}M?)?[ \t]*:"
-    r"[ \t]*(?P<start>\d{1,5})\|(?P<length>\d{1,5})@(?P<order>[01])(?P<sign>[+-])"
-    r"[ \t]*\([ \t]*(?P<scale>[-+.\deE]{1,40})[ \t]*,[ \t]*(?P<offset>[-+.\deE]{1,40})[ \t]*\)"
-    r'[ \t]*\[[^\]\n]{0,100}\][ \t]*"(?P<unit>[^"\n]{0,100})"'
-)
-_NAME = re.compile(r"[ \t]*SG_[ \t]+(\w{1,200})")
-_FLOAT = re.compile(r"[ \t]*SIG_VALTYPE_[ \t]+(\d{1,10})[ \t]+(\w{1,200})[ \t]*:?[ \t]*([0-3])[ \t]*;")
-_MULTIPLEXED = re.compile(r"[ \t]*SG_MUL_VAL_[ \t]+(\d{1,10})[ \t]+(\w{1,200})[ \t]+(\w{1,200})[ \t]+([\d \t,-]{1,2000});")
-
-
-@dataclass
-class Block:
-    """A message as the text declares it.
-
-    Args:
-        number: its identifier, bit 31 set where it is an extended one.
-        name: of the message.
-        length: of its frames [bytes].
-        signals: name -> its line.
-    """
-
-    number: int
-    name: str
-    length: int
-    signals: dict[str, str] = field(default_factory=dict)
+UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
+_LENGTHS = re.compile(r"\b(?:BO_\s+\d+\s+\w+|SG_\s+\w+(?:\s+[mM]\w*)?)\s*:\s*(\d+)(?:\s*\|\s*(\d+))?")
 
 
 @dataclass(frozen=True)
@@ -118,8 +87,33 @@ class Database:
     taken: frozenset[tuple[int, bool]]
 
 
+def read_dbc(file: Path) -> list[Any]:
+    """All messages of a DBC, as cantools holds them.
+
+    Raises:
+        MissingError: there is no such file, or cantools is not installed.
+        DataError: it is too long or damaged, or declares a message or signal of impossible length.
+    """
+    size = regular_file(file).stat().st_size
+    check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
+    require_package("cantools", "bus", "reading CAN")
+    from cantools.database import load_string
+
+    text = file.read_bytes().decode("cp1252", errors="replace")
+    for found in _LENGTHS.finditer(text):
+        if any(len(number or "") > 5 or int(number or 0) > 8 * LONGEST for number in found.groups()):
+            raise DataError(f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}")
+    try:
+        messages = [message for message in load_string(text, "dbc", strict=False).messages if message.name != UNASSIGNED]
+    except Exception as error:  # of cantools and its parser, of any kind
+        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error)[:160])})") from None
+    if not messages:
+        raise DataError(f"'{file}' declares no message; is it a DBC file?")
+    return messages
+
+
 def read_database(file: Path, wanted: Sequence[str]) -> Database:
-    """Read what a DBC says of signals.
+    """What a DBC says of wanted signals.
 
     Args:
         file: the DBC.
@@ -129,166 +123,68 @@ def read_database(file: Path, wanted: Sequence[str]) -> Database:
         MissingError: there is no such file, or cantools is not installed.
         DataError: it is too long, damaged, or a signal is not there, ambiguous, or longer than a frame.
     """
-    text = read_dbc(file)
-    blocks = blocks_of(text, file)
-    found = {name: _locate(blocks, name, file) for name in wanted}
-    multiplexers = _multiplexers(text)
+    described = read_dbc(file)
+    found = {name: _locate(described, name, file) for name in wanted}
     messages: dict[tuple[int, bool], Message] = {}
-    of_block: dict[int, Message] = {}
-    for block in {id(block): block for block, _ in found.values()}.values():
-        names = list(dict.fromkeys(signal for other, signal in found.values() if other is block))
-        message = _message(block, names, text, multiplexers.get(block.number, {}), file)
-        if (message.frame_id, message.extended) in messages:
+    for message in {id(message): message for message, _ in found.values()}.values():
+        names = list(dict.fromkeys(signal for other, signal in found.values() if other is message))
+        key = (message.frame_id, message.is_extended_frame)
+        if key in messages:
             raise DataError(f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one")
-        messages[message.frame_id, message.extended] = of_block[id(block)] = message
-    places = {name: (of_block[id(block)], signal) for name, (block, signal) in found.items()}
-    taken = frozenset((block.number & ID_BITS, bool(block.number & EXTENDED)) for block in blocks)
-    return Database(file, messages, places, taken)
+        messages[key] = _message(message, names, file)
+    places = {name: (messages[message.frame_id, message.is_extended_frame], signal) for name, (message, signal) in found.items()}
+    return Database(file, messages, places, frozenset((message.frame_id, message.is_extended_frame) for message in described))
 
 
-def read_dbc(file: Path) -> str:
-    """The text of a DBC without its comments.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is no file, or too long.
-    """
-    size = regular_file(file).stat().st_size
-    check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
-    try:
-        text = file.read_bytes().decode("cp1252", errors="replace")
-    except OSError as error:
-        raise DataError(f"cannot read '{file}': {error.strerror}") from None
-    return _COMMENT.sub("", text.replace("\r\n", "\n").replace("\r", "\n"))
-
-
-def blocks_of(text: str, file: Path) -> list[Block]:
-    """All messages of a DBC that has no comments, with the lines of their signals.
-
-    Raises:
-        DataError: there are none, or a line cannot be read.
-    """
-    blocks: list[Block] = []
-    for number, line in enumerate(text.split("\n"), start=1):
-        word = line.lstrip(" \t")[:4]
-        if word == "BO_ ":
-            head = _MESSAGE.match(line)
-            if head is None:
-                raise DataError(f"'{file}': line {number} begins a message and cannot be read ({_shown(line)})")
-            blocks.append(Block(int(head[1]), head[2], int(head[3])))
-        elif word == "SG_ " and blocks:
-            name = _NAME.match(line)
-            if name is None:
-                raise DataError(f"'{file}': line {number} declares a signal and cannot be read ({_shown(line)})")
-            blocks[-1].signals[name[1]] = line
-            if len(blocks[-1].signals) > MOST_SIGNALS:
-                raise DataError(f"'{file}': message '{blocks[-1].name}' has more than {MOST_SIGNALS} signals")
-    blocks = [block for block in blocks if block.name != UNASSIGNED]
-    if not blocks:
-        raise DataError(f"'{file}' declares no message; is it a DBC file?")
-    return blocks
-
-
-def _multiplexers(text: str) -> dict[int, dict[str, tuple[str, str]]]:
-    """Message -> signal -> its multiplexer and the ranges of that one's values, where the file says so."""
-    found: dict[int, dict[str, tuple[str, str]]] = {}
-    for line in text.split("\n"):
-        if line.startswith("SG_MUL_VAL_") and (entry := _MULTIPLEXED.match(line)):
-            found.setdefault(int(entry[1]), {})[entry[2]] = (entry[3], entry[4].strip())
-    return found
-
-
-def _locate(blocks: Sequence[Block], wanted: str, file: Path) -> tuple[Block, str]:
+def _locate(messages: Sequence[Any], wanted: str, file: Path) -> tuple[Any, str]:
     """The message and the signal that a name stands for."""
-    message, _, signal = wanted.rpartition(".")
-    found = [block for block in blocks if signal in block.signals and message in ("", block.name)]
+    name, _, signal = wanted.rpartition(".")
+    found = [message for message in messages if name in ("", message.name) and any(known.name == signal for known in message.signals)]
     if len(found) > 1:
-        names = ", ".join(f"{block.name}.{signal}" for block in found[:8])
+        names = ", ".join(f"{message.name}.{signal}" for message in found[:8])
         raise DataError(f"'{file}': signal '{wanted}' stands in several messages; write one of {names}")
     if not found:
-        known = [f"{block.name}.{name}" for block in blocks for name in block.signals][:COMPARED]
-        lower = {name.lower(): name for name in known if len(name) < 200}
-        bare = {name.rpartition(".")[2]: lower[name] for name in lower}
-        close = difflib.get_close_matches(wanted.lower(), list(lower if message else bare), n=3, cutoff=0.6)
-        near = ", ".join((lower if message else bare)[name] for name in close)
+        known = [f"{message.name}.{one.name}" for message in messages for one in message.signals][:COMPARED]
+        lower = {(full if name else full.rpartition(".")[2]).lower(): full for full in known}
+        near = ", ".join(lower[close] for close in difflib.get_close_matches(wanted.lower(), lower, n=3))
         raise DataError(f"'{file}' has no signal '{wanted}' ({'near it: ' + near if near else f'it has {len(known)} signals'})")
     return found[0], signal
 
 
-def _message(block: Block, wanted: Sequence[str], text: str, multiplexers: Mapping[str, tuple[str, str]], file: Path) -> Message:
-    """A message with its wanted signals and their multiplexers, as cantools understands it."""
-    where = f"'{file}': message '{block.name}'"
-    if not 0 < block.length <= MOST_BYTES:
-        raise DataError(f"{where} is {block.length} bytes long; frames of CAN hold 1 to {MOST_BYTES}")
-    if block.number & ~(EXTENDED | ID_BITS) or (not block.number & EXTENDED and block.number > 0x7FF):
-        raise DataError(f"{where} has the identifier {block.number}, which no frame can have")
-    parsed: dict[str, dict[str, str]] = {}
-    for name in wanted:
-        for needed in _chain(block, name, multiplexers, where):
-            parsed[needed] = _parsed(block, needed, where)
-    floats = {entry[2]: entry[3] for entry in _FLOAT.finditer(text) if int(entry[1]) == block.number and entry[3] != "0"}
-    plain = [name for name in wanted if not (parsed[name]["multiplex"] or "").startswith("m")]
-    groups = ([plain] if plain else []) + [_chain(block, name, multiplexers, where) for name in wanted if name not in plain]
+def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
+    """A message with its wanted signals and their multiplexers alone."""
+    from cantools.database.can import Message as Coder
+
+    where = f"'{file}': message '{message.name}'"
+    if not 0 < message.length <= MOST_BYTES:
+        raise DataError(f"{where} is {message.length} bytes long; frames of CAN hold 1 to {MOST_BYTES}")
+    signals = {signal.name: signal for signal in message.signals}
+    chains = {name: _chain(signals, name, where) for name in wanted}
+    plain = [name for name in wanted if len(chains[name]) == 1]
     coders = []
-    for names in groups:
-        lines = ['VERSION ""', "NS_ :", "BS_:", "BU_: Car", f"BO_ {block.number} {block.name}: {block.length} Car"]
-        lines += [_line(name, parsed[name], multiplexed=names is not plain) for name in names]
-        lines += [f"SIG_VALTYPE_ {block.number} {name} : {floats[name]};" for name in names if name in floats]
-        ranges = [(name, *multiplexers[name]) for name in names if name in multiplexers and names is not plain]
-        lines += [f"SG_MUL_VAL_ {block.number} {name} {multiplexer} {values};" for name, multiplexer, values in ranges]
-        coders.append(_coder("\n".join(lines) + "\n", where))
-    units = {name: parsed[name]["unit"] for name in wanted}
-    return Message(block.number & ID_BITS, bool(block.number & EXTENDED), block.name, block.length, units, coders)
-
-
-def _line(name: str, entry: Mapping[str, str], *, multiplexed: bool) -> str:
-    mark = (entry["multiplex"] or "") if multiplexed else ""
-    place = f"{entry['start']}|{entry['length']}@{entry['order']}{entry['sign']}"
-    return f' SG_ {name} {mark} : {place} ({entry["scale"]},{entry["offset"]}) [0|0] "" Car'
-
-
-def _chain(block: Block, wanted: str, multiplexers: Mapping[str, tuple[str, str]], where: str) -> list[str]:
-    """A signal and the multiplexers that say whether a frame carries it, the outermost first."""
-    marks = {name: (entry["multiplex"] or "") for name, line in block.signals.items() if (entry := _SIGNAL.match(line))}
-    switches = [name for name, mark in marks.items() if mark == "M"]
-    chain, name = [wanted], wanted
-    while marks.get(name, "").startswith("m"):
-        above = multiplexers[name][0] if name in multiplexers else switches[0] if len(switches) == 1 else ""
-        if above not in marks or above in chain:
-            raise DataError(f"{where}: nothing says when frames carry the multiplexed signal '{name}'")
-        chain, name = [above, *chain], above
-    return chain
-
-
-def _parsed(block: Block, name: str, where: str) -> dict[str, str]:
-    """What the line of a signal says, within what a frame can hold."""
-    where, line = f"{where}: signal '{name}'", block.signals[name]
-    entry = _SIGNAL.match(line)
-    if entry is None:
-        raise DataError(f"{where} cannot be read ({_shown(line)})")
-    found = entry.groupdict()
-    if int(found["start"]) >= 8 * block.length or not 0 < int(found["length"]) <= min(8 * block.length, MOST_BITS):
-        raise DataError(f"{where} of {found['length']} bits from bit {found['start']} on is no number in {block.length} bytes")
-    for key in ("scale", "offset"):
+    for names in ([plain] if plain else []) + [chains[name] for name in wanted if name not in plain]:
+        for one in (signals[name] for name in names):
+            if one.length > MOST_BITS:
+                raise DataError(f"{where}: signal '{one.name}' of {one.length} bits is no number")
+            if not 0.0 < abs(one.scale) < 1e30 or not abs(one.offset) < 1e30:
+                raise DataError(
+                    f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; finite numbers are needed"
+                )
+        parts = [signals[name] for name in names]
         try:
-            value = float(found[key])
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value) or (key == "scale" and value == 0.0) or len(found[key]) > 30 or abs(value) > 1e30:
-            raise DataError(f"{where} has the {key} '{found[key]}'; a finite number other than 0 is needed")
-    return found
+            coders.append(Coder(message.frame_id, message.name, message.length, parts, is_extended_frame=message.is_extended_frame))
+        except Exception as error:  # of cantools
+            raise DataError(f"{where} cannot be decoded ({printable(first_line(error)[:160])})") from None
+    units = {name: signals[name].unit or "" for name in wanted}
+    return Message(message.frame_id, message.is_extended_frame, message.name, message.length, units, coders)
 
 
-def _coder(text: str, where: str) -> Any:
-    try:
-        from cantools.database import load_string
-    except ImportError:
-        raise MissingError("reading CAN needs the packages python-can and cantools; pip install 'vehest[bus]'") from None
-    try:
-        return load_string(text, database_format="dbc").messages[0]
-    except Exception as error:  # whatever a parser meets in what comes from a file
-        raise DataError(f"{where} cannot be decoded ({first_line(error)[:160]})") from None
-
-
-def _shown(line: str) -> str:
-    return printable(line.strip()[:60])
+def _chain(signals: Mapping[str, Any], wanted: str, where: str) -> list[str]:
+    """A signal and the multiplexers that decide whether a frame carries it, the outermost first."""
+    chain = [wanted]
+    while signals[chain[0]].multiplexer_ids is not None:
+        above = signals[chain[0]].multiplexer_signal
+        if above not in signals or above in chain:
+            raise DataError(f"{where}: nothing says when frames carry the multiplexed signal '{chain[0]}'")
+        chain.insert(0, above)
+    return chain

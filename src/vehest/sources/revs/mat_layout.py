@@ -11,17 +11,16 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
+from vehest.data.files import regular_file
 from vehest.data.limits import check_limit
 from vehest.sources.clocks import ClockPolicy, uniform_clock
 from vehest.sources.columns import Column
-from vehest.sources.revs.mat_files import MatArray, read_mat_file
+from vehest.sources.limited import read_limited
 
 _VALUE = "value"
 _SLACK = 1e-2  # of an interval: as far as stamps may jitter
 
 _LATEST_TICK = 1e15
-
-_Structs = dict[str, dict[str, MatArray | None]]
 
 
 @dataclass(frozen=True)
@@ -66,8 +65,13 @@ def read_mat_columns(
         DataError: the file or a column cannot be used as it is.
     """
     columns = list(columns)
-    structs = _structs(file, columns)
-    signals = {column: _signal(file, structs, column, time, policy, column in set(gappy)) for column in columns}
+    reader = "vehest.sources.readers.mat_files:read_channels"
+    reading = read_limited(reader, regular_file(file), columns=columns, value=_VALUE, time=time.column)
+    signals = {}
+    for column in columns:
+        values, stamps = reading.arrays[f"{column}.{_VALUE}"], reading.arrays[f"{column}.{time.column}"]
+        where = f"'{file}': '{reading.summary['names'][column]}'"
+        signals[column] = _signal(where, reading.summary["names"][column], values, time.to_si(stamps, "s"), policy, column in set(gappy))
     slowest = min(signals.values(), key=lambda signal: signal.rate_hz)
     rate = slowest.rate_hz if rate_hz is None else rate_hz
     origin = slowest.stamps[0]
@@ -109,51 +113,16 @@ class _Signal:
         return self.values[np.searchsorted(self.stamps, ticks + _SLACK / self.rate_hz, side="right") - 1]
 
 
-def _structs(file: Path, columns: Iterable[str]) -> _Structs:
-    """Names of all that stands in structs, with those arrays that may be wanted; what nothing is wanted of is not kept in memory."""
-    wanted = {part for column in columns for part in (column, column.rsplit(".", 1)[-1], column.split(".", 1)[-1])}
-    structs: _Structs = {}
-    for name, array in read_mat_file(file).items():
-        structs[name] = {inner: field if inner in wanted else None for inner, field in array.some_fields(wanted).items()}
-    return structs
-
-
-def _signal(file: Path, structs: _Structs, column: str, time: Column, policy: ClockPolicy, gappy: bool) -> _Signal:
-    name, fields = _found(file, structs, column, time.column)
-    arrays = {}
-    for field in (_VALUE, time.column):
-        if field not in fields:
-            have = ", ".join(fields) or "none: it is no struct"
-            raise DataError(f"'{file}': '{name}' has no field '{field}' (it has {have}); correct the map in conf/dataset")
-        numbers = fields[field].numbers()
-        if numbers is None:
-            raise DataError(f"'{file}': '{name}.{field}' is no row or column of real numbers")
-        arrays[field] = numbers
-    values, stamps = arrays[_VALUE], time.to_si(arrays[time.column], "s")
-    if len(values) != len(stamps):
-        raise DataError(f"'{file}': '{name}' holds {len(values)} values and {len(stamps)} time stamps; fetch the file again")
-    clock = uniform_clock(stamps, f"'{file}', '{name}'", policy)
+def _signal(where: str, name: str, values: FloatArray, stamps: FloatArray, policy: ClockPolicy, gappy: bool) -> _Signal:
+    clock = uniform_clock(stamps, where, policy)
     measured = np.flatnonzero(~np.isnan(values))
     if not len(measured):
-        raise DataError(f"'{file}': '{name}' holds no number; leave its channel out of the map in conf/dataset")
+        raise DataError(f"{where} holds no number; leave its channel out of the map in conf/dataset")
     if not gappy and len(measured) < len(values) - measured[0]:
         missing = measured[0] + int(np.argmax(np.isnan(values[measured[0] :])))
         raise DataError(
-            f"'{file}': '{name}' holds NaN at {stamps[missing]:.12g} s; cut the range out, or declare its channel in 'gappy' "
+            f"{where} holds NaN at {stamps[missing]:.12g} s; cut the range out, or declare its channel in 'gappy' "
             f"if that means 'not measured'"
         )
     first = 0 if gappy else measured[0]
     return _Signal(name, stamps[first:], values[first:], clock.rate_hz)
-
-
-def _found(file: Path, structs: _Structs, column: str, time: str) -> tuple[str, dict[str, MatArray]]:
-    """A column's name with its struct, and its fields; parameters of the same name, which have no time, do not count."""
-    inside = {f"{outer}.{inner}": array for outer, fields in structs.items() for inner, array in fields.items()}
-    found = {name: array.fields() for name, array in inside.items() if array is not None and column in (name, name.split(".", 1)[1])}
-    timed = {name: fields for name, fields in found.items() if time in fields} or found
-    if len(timed) > 1:
-        raise DataError(f"'{file}' has '{column}' more than once ({', '.join(timed)}); name its struct too, as in '{next(iter(timed))}'")
-    if not timed:
-        have = ", ".join(list(inside)[:12]) + (", …" if len(inside) > 12 else "") if inside else "no structs"
-        raise DataError(f"'{file}' has no channel '{column}' (it has {have}); correct the map in conf/dataset")
-    return next(iter(timed.items()))

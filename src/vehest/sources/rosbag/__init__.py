@@ -1,6 +1,6 @@
 """ROS 2 bags: topics of several rates brought to one clock, and a reference made of a motion capture system's poses.
 
-What stands in the bag, and in which units, signs and zeros, is declared in conf/dataset; so is whose time stamps count.
+bag -> messages of the declared topics -> times of each topic's samples -> ticks common to all -> recording
 """
 
 from __future__ import annotations
@@ -14,62 +14,28 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.archive import MOST_BYTES
 from vehest.sources.base import Source, existing_folder
 from vehest.sources.clocks import SampleTimes, at_ticks, common_ticks, stamped_times, uniform_times
 from vehest.sources.pose import ground_plane, planar_motion
-from vehest.sources.rosbag.declarations import Pose, Topic, channels_from_config, mapping, number, pose_from_config, topics_from_config
+from vehest.sources.rosbag.declarations import BagChannel, Pose, RosbagOptions, Topic
 from vehest.sources.rosbag.topics import STORAGES, Bag, TopicData, Wanted, bag_files, read_bag
 
 POSE_FIELDS = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 MOST_WANDERING = 0.4  # of the grid's interval
 
 
-@dataclass(frozen=True)
-class RosbagOptions:
-    """Options of the source, by type; what is None is not said."""
-
-    path: str | None = None
-    files: str | tuple[str, ...] = "*.zip"
-    rate_hz: float = 100.0
-    start: float | None = None
-    stop: float | None = None
-    messages: dict[str, str] | None = None
-    topics: dict[str, Any] | None = None
-    channels: dict[str, Any] | None = None
-    pose: dict[str, Any] | None = None
-    unpacked_limit: float = 8.0
-
-
 class RosbagSource(Source):
-    """Bags, a recording each.
-
-    Options: ``path`` and ``files`` (glob, or a list of names), ``rate_hz``, ``start`` and ``stop`` [s after the bag's first message],
-    ``messages`` (layouts of message types, as text), ``topics``, ``channels``, ``pose`` and ``unpacked_limit`` [GB].
-    """
+    """Bags, a recording each; its options are those of `RosbagOptions`."""
 
     options_type = RosbagOptions
-    keys = frozenset({"path", "files", "rate_hz", "start", "stop", "messages", "topics", "channels", "pose", "unpacked_limit"})
+    options: RosbagOptions
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        where = f"data set '{self.name}'"
-        self.rate_hz = number(dataset.get("rate_hz", 100.0), f"{where}: rate_hz", above=0.0)
-        start, stop = dataset.get("start"), dataset.get("stop")
-        self.start = -math.inf if start is None else number(start, f"{where}: start", above=-math.inf)
-        self.stop = math.inf if stop is None else number(stop, f"{where}: stop", above=self.start)
-        self.most_bytes = int(1e9 * number(dataset.get("unpacked_limit", MOST_BYTES / 1e9), f"{where}: unpacked_limit", above=0.0))
-        self.layouts = {str(name): str(text) for name, text in mapping(dataset.get("messages") or {}, f"{where}: messages").items()}
-        self.topics = topics_from_config(dataset.get("topics") or {}, where)
-        self.channels = channels_from_config(dataset.get("channels") or {}, self.topics, where)
-        self.pose = None if dataset.get("pose") is None else pose_from_config(dataset["pose"], self.topics, f"{where}: pose")
-        doubled = sorted(set(self.channels) & set(self.pose.channels if self.pose else ()))
-        if doubled:
-            raise ConfigurationError(f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out")
-        if not self.channels and self.pose is None:
-            raise ConfigurationError(f"{where}: neither channels nor a pose is declared")
+        self.topics, self.channels = self.options.topics or {}, self.options.channels or {}
 
     def ids(self) -> list[str]:
         """Names of the bags, in alphabetical order where a pattern names them; nothing is read."""
@@ -101,29 +67,34 @@ class RosbagSource(Source):
         return self._read(file.stem, file)
 
     def _read(self, recording_id: str, path: Path) -> Recording:
-        bag = read_bag(path, self._wanted(), self.layouts, self.most_bytes)
+        bag = read_bag(path, self._wanted(), self.options.messages or {}, int(1e9 * self.options.unpacked_limit))
         series = {name: self._series(topic, bag, path) for name, topic in self.topics.items() if topic.topic in bag.topics}
         grid = self._grid(series, path)
-        channels = {name: series[source.topic].at(source.field, grid, source.to_si) for name, source in self.channels.items()}
-        if self.pose is not None:
-            channels |= self._reference(self.pose, series[self.pose.topic], grid, path)
+        channels = {name: series[source.topic].channel(name, source, grid) for name, source in self.channels.items()}
+        if self.options.pose is not None:
+            channels |= self._reference(self.options.pose, series[self.options.pose.topic], grid, path)
         try:
             return Recording(
                 id=recording_id,
                 vehicle=str(self.dataset.get("vehicle", "unknown")),
-                rate_hz=self.rate_hz,
+                rate_hz=self.options.rate_hz,
                 start_time=float(grid[0]),
                 channels=channels,
                 kind=self.kind,
-                provenance=self._provenance(path, bag, series),
+                provenance={
+                    "dataset": self.name,
+                    "source": "rosbag",
+                    "file": path.name,
+                    "bag_start_ns": bag.start,
+                    "topics": {one.topic.topic: one.description() for one in series.values()},
+                },
             )
         except DataError as error:
             raise DataError(f"'{path}': {error}") from None
 
     def _bags(self) -> dict[str, Path]:
         """Bags by name."""
-        folder = existing_folder(self.dataset.get("path"), self.name)
-        files = self.dataset.get("files", "*.zip")
+        folder, files = existing_folder(self.options.path, self.name), self.options.files
         if isinstance(files, str):
             if not files or Path(files).is_absolute():
                 raise ConfigurationError(f"data set '{self.name}': files must be a pattern inside path, such as '*.zip', not '{files}'")
@@ -147,8 +118,8 @@ class RosbagSource(Source):
         fields: dict[str, list[str]] = {name: [] for name in self.topics}
         for source in self.channels.values():
             fields[source.topic].append(source.field)
-        if self.pose is not None:
-            fields[self.pose.topic] += [f"{self.pose.field}.{part}" for part in POSE_FIELDS]
+        if pose := self.options.pose:
+            fields[pose.topic] += [f"{pose.field}.{part}" for part in POSE_FIELDS]
         return [
             Wanted(self.topics[name].topic, self.topics[name].type, tuple(dict.fromkeys(paths))) for name, paths in fields.items() if paths
         ]
@@ -161,11 +132,11 @@ class RosbagSource(Source):
             raise ConfigurationError(f"{where}: messages of type '{topic.type}' have no header; set stamps: received")
         nanoseconds = data.received if data.stamped is None or topic.stamps == "received" else data.stamped
         stamps: FloatArray = np.asarray((nanoseconds - bag.start) * 1e-9, dtype=np.float64)
-        kept = (stamps >= self.start) & (stamps < self.stop)
+        start = -math.inf if self.options.start is None else self.options.start
+        stop = math.inf if self.options.stop is None else self.options.stop
+        kept = (stamps >= start) & (stamps < stop)
         if kept.sum() < 2:
-            raise DataError(
-                f"{where}: fewer than two messages between start {self.start:g} s and stop {self.stop:g} s after the bag's first message"
-            )
+            raise DataError(f"{where}: fewer than two messages between start {start:g} s and stop {stop:g} s after the bag's first message")
         stamps = stamps[kept]
         fields = {name: values[kept] for name, values in data.fields.items()}
         for name, values in fields.items():
@@ -183,7 +154,7 @@ class RosbagSource(Source):
                 f"cut the range out with start and stop, or raise max_gap ({topic.max_gap:g} s)"
             )
         if topic.clock == "uniform":
-            times = uniform_times(stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.rate_hz)
+            times = uniform_times(stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.options.rate_hz)
         else:
             times = stamped_times(stamps, where)
         return Series(topic, times, fields, _latency(data)).averaged()
@@ -193,7 +164,7 @@ class RosbagSource(Source):
         begins = {one.times[0]: one.topic.topic for one in series.values()}
         ends = {one.times[-1]: one.topic.topic for one in series.values()}
         begin, end = max(begins), min(ends)
-        grid = common_ticks(begin, end, self.rate_hz, f"'{path}'")
+        grid = common_ticks(begin, end, self.options.rate_hz, f"'{path}'")
         if len(grid) < 2:
             raise DataError(
                 f"'{path}': topic '{begins[begin]}' begins at {begin:.6g} s, when '{ends[end]}' has ended at {end:.6g} s; "
@@ -206,7 +177,7 @@ class RosbagSource(Source):
         where = f"'{path}': topic '{series.topic.topic}'"
         values = [series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS]
         plane, yaw = ground_plane(np.stack(values[:3], axis=1), np.stack(values[3:], axis=1), pose.up, where)
-        times, interval = series.times, 1.0 / self.rate_hz
+        times, interval = series.times, 1.0 / self.options.rate_hz
         if series.rate_hz is None:
             times = grid
             plane = np.stack([np.interp(grid, series.times, plane[:, axis]) for axis in (0, 1)], axis=1)
@@ -219,15 +190,6 @@ class RosbagSource(Source):
             plane, yaw, interval, window=pose.window, order=pose.order, mounting_yaw=pose.yaw, lever=(pose.lever_x, pose.lever_y)
         )
         return motion.at(times, grid).channels(pose.channels)
-
-    def _provenance(self, path: Path, bag: Bag, series: Mapping[str, Series]) -> dict[str, Any]:
-        return {
-            "dataset": self.name,
-            "source": "rosbag",
-            "file": path.name,
-            "bag_start_ns": bag.start,
-            "topics": {one.topic.topic: one.description() for one in series.values()},
-        }
 
 
 @dataclass(frozen=True)
@@ -256,9 +218,10 @@ class Series:
         """Rate of an even clock [Hz]."""
         return self.sampled.rate_hz
 
-    def at(self, field: str, grid: FloatArray, change: Any) -> FloatArray:
-        """A field on another clock."""
-        return at_ticks(change(self.fields[field]), self.times, grid, hold=self.topic.interpolation == "hold", slack=1e-9)
+    def channel(self, name: str, source: BagChannel, grid: FloatArray) -> FloatArray:
+        """A channel on another clock."""
+        values = source.to_si(self.fields[source.field], channel(name).unit)
+        return at_ticks(values, self.times, grid, hold=self.topic.interpolation == "hold", slack=1e-9)
 
     def averaged(self) -> Series:
         """The same with the declared moving average; half its width is lost at either end."""

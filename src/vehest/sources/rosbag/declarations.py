@@ -1,18 +1,20 @@
-"""What a data set declares about a ROS 2 bag: topics and their clocks, fields and their units, poses."""
+"""What a data set declares of ROS 2 bags: topics and their clocks, fields and their units, poses."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import VehestError
 from vehest.data.units import factor_to_si
-from vehest.sources.columns import Column, column_from_config
+from vehest.sources.columns import Column
 from vehest.sources.pose import POSE_CHANNELS, UpAxis, require_filter, require_pose_channels
+
+Positive = Annotated[float, Field(gt=0.0)]
 
 
 @dataclass(frozen=True)
@@ -33,36 +35,45 @@ class Topic:
 
     topic: str
     type: str
-    stamps: str = "header"
-    clock: str = "stamps"
-    rate_hz: float | None = None
-    max_gap: float = 0.05
+    stamps: Literal["header", "received"] = "header"
+    clock: Literal["stamps", "uniform"] = "stamps"
+    rate_hz: Positive | None = None
+    max_gap: Positive = 0.05
     delay: float = 0.0
-    interpolation: str = "linear"
-    average: float = 0.0
+    interpolation: Literal["linear", "hold"] = "linear"
+    average: Annotated[float, Field(ge=0.0)] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.clock == "uniform" and self.rate_hz is None:
+            raise ValueError("a uniform clock needs the sensor's nominal rate_hz")
+        if self.average and (self.clock != "uniform" or self.average * (self.rate_hz or 0.0) < 1.5):
+            raise ValueError("a moving average needs clock: uniform and a width of two samples or more")
 
 
 @dataclass(frozen=True)
-class Field:
-    """Where a channel comes from.
+class BagChannel:
+    """Where a channel comes from: sign · factor · (field - offset).
 
     Args:
         topic: the topic's name in the data set.
         field: path of the field in the message.
-        offset: what the field says where the channel is zero.
-        column: unit, sign and factor.
-        si_unit: unit of the channel.
+        unit: of the result.
+        sign: 1 or -1.
+        factor: other than 0.
+        offset: the field's value where the channel is zero.
     """
 
     topic: str
     field: str
-    offset: float
-    column: Column
-    si_unit: str
+    unit: str
+    sign: Literal[1, -1] = 1
+    factor: float = 1.0
+    offset: float = 0.0
 
-    def to_si(self, values: FloatArray) -> FloatArray:
+    def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
         """Values in SI units and ISO 8855 signs."""
-        return self.column.to_si(values - self.offset if self.offset else values, self.si_unit)
+        column = Column(self.field, self.unit, self.sign, self.factor)
+        return column.to_si(values - self.offset if self.offset else values, si_unit)
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,7 @@ class Pose:
     Args:
         topic: the topic's name in the data set.
         field: path of a geometry_msgs/Pose in the message.
-        up: upward axis of the world and of the rigid body, ``z`` or ``y``.
+        up: upward axis of the world and of the rigid body.
         window: samples of the Savitzky-Golay filter.
         order: of its polynomial.
         yaw: from the rigid body's x axis to the car's forward axis [rad].
@@ -91,131 +102,46 @@ class Pose:
     lever_y: float = 0.0
     channels: tuple[str, ...] = POSE_CHANNELS
 
-
-def topics_from_config(entries: Any, where: str) -> dict[str, Topic]:
-    """Topics by the names that the data set gives them.
-
-    Raises:
-        ConfigurationError: an unknown key or value, or one bag's topic under two names.
-    """
-    topics = {str(name): _topic(entry, f"{where}: topic '{name}'") for name, entry in mapping(entries, f"{where}: topics").items()}
-    names = [topic.topic for topic in topics.values()]
-    doubled = sorted({name for name in names if names.count(name) > 1})
-    if doubled:
-        raise ConfigurationError(f"{where}: topics lists '{doubled[0]}' twice; name its channels under one")
-    return topics
+    def __post_init__(self) -> None:
+        require_filter(self.window, self.order, "pose")
+        require_pose_channels(self.channels, "pose")
 
 
-def channels_from_config(entries: Any, topics: Mapping[str, Topic], where: str) -> dict[str, Field]:
-    """Where each channel comes from.
+@dataclass(frozen=True)
+class RosbagOptions:
+    """Options of the source; see docs/sources/rosbag.md."""
 
-    Raises:
-        ConfigurationError: an unknown channel, topic, unit or key.
-    """
-    channels = {}
-    for name, entry in mapping(entries, f"{where}: channels").items():
-        place = f"{where}: channel '{name}'"
-        _require_keys(entry, place, {"topic", "field", "unit"}, {"topic", "field", "unit", "sign", "factor", "offset"})
-        _require_topic(entry, topics, place)
-        column = column_from_config(
-            {"column": entry["field"], "unit": entry["unit"]} | {key: entry[key] for key in ("sign", "factor") if key in entry}, place
-        )
-        try:
-            si_unit = channel(str(name)).unit
-            factor_to_si(column.unit, si_unit)
-        except DataError as error:
-            raise ConfigurationError(f"{place}: {error}") from None
-        offset = number(entry.get("offset", 0.0), f"{place}: offset", above=-math.inf)
-        channels[str(name)] = Field(str(entry["topic"]), column.column, offset, column, si_unit)
-    return channels
+    path: str | None = None
+    files: str | tuple[str, ...] = "*.zip"
+    rate_hz: Positive = 100.0
+    start: float | None = None
+    stop: float | None = None
+    messages: dict[str, str] | None = None
+    topics: dict[str, Topic] | None = None
+    channels: dict[str, BagChannel] | None = None
+    pose: Pose | None = None
+    unpacked_limit: Positive = 8.0
 
-
-def pose_from_config(entry: Any, topics: Mapping[str, Topic], where: str) -> Pose:
-    """How the reference is made of poses.
-
-    Raises:
-        ConfigurationError: an unknown topic, channel, key or value.
-    """
-    _require_keys(entry, where, {"topic"}, set(Pose.__dataclass_fields__))
-    _require_topic(entry, topics, where)
-    _require_choice(entry, "up", ("z", "y"), where)
-    if topics[str(entry["topic"])].average:
-        raise ConfigurationError(f"{where}: orientations cannot be averaged; leave average out of topic '{entry['topic']}'")
-    window, order = require_filter(entry.get("window", Pose.window), entry.get("order", Pose.order), where)
-    channels = require_pose_channels(entry.get("channels", POSE_CHANNELS), where)
-    lengths = {key: number(entry.get(key, 0.0), f"{where}: {key}", above=-math.inf) for key in ("yaw", "lever_x", "lever_y")}
-    return Pose(
-        str(entry["topic"]),
-        str(entry.get("field", Pose.field)),
-        "y" if entry.get("up") == "y" else "z",
-        window,
-        order,
-        lengths["yaw"],
-        lengths["lever_x"],
-        lengths["lever_y"],
-        channels,
-    )
-
-
-def mapping(entries: Any, where: str) -> Mapping[str, Any]:
-    """A declaration that must map names to something.
-
-    Raises:
-        ConfigurationError: it does not.
-    """
-    if not isinstance(entries, Mapping):
-        raise ConfigurationError(f"{where} must map names to declarations, not {entries}")
-    return entries
-
-
-def number(value: Any, where: str, *, above: float, or_equal: bool = False) -> float:
-    """A declared number.
-
-    Raises:
-        ConfigurationError: it is none, or out of range.
-    """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigurationError(f"{where} must be a number, not {value}")
-    if not (value > above or (or_equal and value == above)):
-        raise ConfigurationError(f"{where} must be above {above:g}, not {value}")
-    return float(value)
-
-
-def _topic(entry: Any, where: str) -> Topic:
-    _require_keys(entry, where, {"topic", "type"}, set(Topic.__dataclass_fields__))
-    for key, known in (("stamps", ("header", "received")), ("clock", ("stamps", "uniform")), ("interpolation", ("linear", "hold"))):
-        _require_choice(entry, key, known, where)
-    rate = entry.get("rate_hz")
-    clock = str(entry.get("clock", "stamps"))
-    if clock == "uniform" and rate is None:
-        raise ConfigurationError(f"{where}: a uniform clock needs the sensor's nominal rate_hz")
-    average = number(entry.get("average", 0.0), f"{where}: average", above=0.0, or_equal=True)
-    if average and (clock != "uniform" or average * float(rate or 0.0) < 1.5):
-        raise ConfigurationError(f"{where}: a moving average needs clock: uniform and a width of two samples or more")
-    return Topic(
-        topic=str(entry["topic"]),
-        type=str(entry["type"]),
-        stamps=str(entry.get("stamps", "header")),
-        clock=clock,
-        rate_hz=None if rate is None else number(rate, f"{where}: rate_hz", above=0.0),
-        max_gap=number(entry.get("max_gap", Topic.max_gap), f"{where}: max_gap", above=0.0),
-        delay=number(entry.get("delay", 0.0), f"{where}: delay", above=-math.inf),
-        interpolation=str(entry.get("interpolation", "linear")),
-        average=average,
-    )
-
-
-def _require_keys(entry: Any, where: str, needed: set[str], known: set[str]) -> None:
-    if not isinstance(entry, Mapping) or not needed <= set(entry) or set(entry) - known:
-        optional = ", ".join(sorted(known - needed))
-        raise ConfigurationError(f"{where} must say {', '.join(sorted(needed))} and may say {optional}, not {entry}")
-
-
-def _require_topic(entry: Mapping[str, Any], topics: Mapping[str, Topic], where: str) -> None:
-    if str(entry["topic"]) not in topics:
-        raise ConfigurationError(f"{where}: topic '{entry['topic']}' is not one of topics: {', '.join(topics) or 'none'}")
-
-
-def _require_choice(entry: Mapping[str, Any], key: str, known: tuple[str, ...], where: str) -> None:
-    if key in entry and entry[key] not in known:
-        raise ConfigurationError(f"{where}: {key} '{entry[key]}' is not one of: {', '.join(known)}")
+    def __post_init__(self) -> None:
+        topics, channels = self.topics or {}, self.channels or {}
+        names = [topic.topic for topic in topics.values()]
+        if doubled := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"topics lists '{doubled[0]}' twice; name its channels under one")
+        if self.start is not None and self.stop is not None and not self.stop > self.start:
+            raise ValueError(f"stop must be above start, {self.start:g}, not {self.stop}")
+        for topic in [*(declared.topic for declared in channels.values()), *([self.pose.topic] if self.pose else [])]:
+            if topic not in topics:
+                raise ValueError(f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}")
+        for name, declared in channels.items():
+            try:
+                factor_to_si(declared.unit, channel(name).unit)
+            except VehestError as error:
+                raise ValueError(f"channel '{name}': {error}") from None
+            if declared.factor == 0:
+                raise ValueError(f"channel '{name}': factor must be a number other than 0")
+        if self.pose and topics[self.pose.topic].average:
+            raise ValueError(f"orientations cannot be averaged; leave average out of topic '{self.pose.topic}'")
+        if doubled := sorted(set(channels) & set(self.pose.channels if self.pose else ())):
+            raise ValueError(f"channel '{doubled[0]}' comes both from channels and from pose; leave one out")
+        if not channels and not self.pose:
+            raise ValueError("neither channels nor a pose is declared")

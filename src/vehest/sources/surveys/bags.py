@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from vehest.data.errors import DataError, printable
-from vehest.sources.rosbag.topics import TopicData, Wanted, numeric_fields, read_bag, topics_in
+from vehest.data.errors import DataError
+from vehest.sources.rosbag import topics
 from vehest.sources.surveys.log import Log, RawColumn
 
-UNREAD = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")
+IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")
 MOST_FIELDS = 60  # of a message
 UNITS = {  # of ROS's own types, REP 103
     "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
@@ -29,20 +29,8 @@ def survey_bag(path: Path) -> Log:
         MissingError: rosbags is not installed, or the bag is not there.
         DataError: it is damaged, or none of its topics can be read.
     """
-    columns, skipped = [], []
-    for topic, kind in topics_in(path).items():
-        if topic.strip("/").split("/")[-1] in UNREAD:
-            continue
-        fields = [field for field in numeric_fields(kind) if not field.startswith("header.") and "covariance" not in field]
-        if not fields or len(fields) > MOST_FIELDS:
-            skipped.append(f"topic '{printable(topic)}' of type '{printable(kind)}' is none of ROS's own of plain numbers")
-            continue
-        try:
-            data = read_bag(path, [Wanted(topic, kind, tuple(fields))], {}).topics[topic]
-        except DataError as error:
-            skipped.append(str(error).removeprefix(f"'{path}': "))
-            continue
-        columns += _columns(topic, kind, data)
+    found, skipped = topics.survey_bag(path, IGNORED, MOST_FIELDS)
+    columns = [column for wanted, data in found for column in _columns(wanted.topic, wanted.type, data)]
     if not columns:
         raise DataError(f"'{path}' holds no topic of plain numbers ({'; '.join(skipped[:3]) or 'it is empty'})")
     start = min(float(column.stamps[0]) for column in columns if column.stamps is not None)
@@ -50,7 +38,7 @@ def survey_bag(path: Path) -> Log:
     return Log(path, "rosbag", tuple(shifted), skipped=tuple(skipped))
 
 
-def _columns(topic: str, kind: str, data: TopicData) -> list[RawColumn]:
+def _columns(topic: str, kind: str, data: topics.TopicData) -> list[RawColumn]:
     header = data.stamped is not None
     stamps = np.asarray(data.stamped if data.stamped is not None else data.received, dtype=np.float64) * 1e-9
     if len(stamps) < 2:

@@ -1,0 +1,241 @@
+"""Topics of a ROS 2 bag as arrays, by rosbags.
+
+bag -> connections of the wanted topics -> messages, deserialised as declared -> times and fields
+"""
+
+from __future__ import annotations
+
+import os
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import apsw
+import numpy as np
+from rosbags.interfaces import Connection, MessageDefinitionFormat, Nodetype
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+
+from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.limits import check_limit
+from vehest.sources.limited import Arrays
+
+apsw.connection_hooks.append(lambda connection: connection.pragma("temp_store", "memory"))  # SQLite may write no file
+
+TEXTS = frozenset({"string", "wstring", "byte", "char"})
+ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
+LATEST = 2**62  # ns of unix time: 146 years
+
+Topic = Sequence[Any]  # name, message type, paths of fields
+
+
+def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) -> tuple[Arrays, dict[str, Any]]:
+    """All messages of topics, in the order in which the bag received them.
+
+    Args:
+        bag: a bag's folder, or one of its files.
+        topics: name, message type and paths of numeric fields of each.
+        layouts: definitions of message types that ROS 2 Humble does not ship, by type.
+
+    Returns:
+        ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, ``TOPIC.FIELD`` and the start of the bag.
+
+    Raises:
+        ConfigurationError: a layout cannot be read, or a type or field that does not exist.
+        DataError: the bag does not hold the topics, types and layouts that are wanted, or fewer messages than it says.
+    """
+    types = _types(layouts)
+    with _opened(bag) as reader:
+        return _read(bag, reader, types, topics), {"start": _start(bag, reader)}
+
+
+def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[Arrays, dict[str, Any]]:
+    """All topics whose messages are of ROS's own types, with their plain numbers.
+
+    Args:
+        bag: a bag's folder, or one of its files.
+        ignored: last parts of names of topics that are passed by.
+        most_fields: of a message.
+
+    Returns:
+        arrays as `read_topics`, the topics, and a sentence for each that cannot be read.
+    """
+    types, arrays, found, skipped = _types({}), Arrays(), [], []
+    with _opened(bag) as reader:
+        topics = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
+        for name, kind in topics.items():
+            if name.strip("/").split("/")[-1] in ignored:
+                continue
+            fields = [field for field in _numbers(types, kind) if not field.startswith("header.") and "covariance" not in field]
+            if not 0 < len(fields) <= most_fields:
+                skipped.append(f"topic '{printable(name)}' of type '{printable(kind)}' is none of ROS's own of plain numbers")
+                continue
+            try:
+                arrays |= _read(bag, reader, types, [(name, kind, fields)])
+                found.append([name, kind, fields])
+            except DataError as error:
+                skipped.append(str(error).removeprefix(f"'{bag}': "))
+    return arrays, {"topics": found, "skipped": skipped}
+
+
+class _UriPath(type(Path())):  # type: ignore[misc]
+    """A path that rosbags can write into the URI of a SQLite database."""
+
+    def __format__(self, _: str) -> str:
+        return quote(os.fsencode(self), safe="/:\\")
+
+
+def _opened(bag: Path) -> Reader:
+    """A bag, unless a SQLite file of it ends within a page: SQLite would fill that up with zeros.
+
+    Source:
+        SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
+    """
+    for file in [bag] if bag.is_file() else bag.iterdir():
+        if file.is_file():
+            with open(file, "rb") as stream:
+                head = stream.read(18)
+            page = int.from_bytes(head[16:], "big")
+            if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page):
+                raise DataError(f"'{bag}': '{file.name}' is truncated; fetch it again")
+    return Reader(_UriPath(bag))
+
+
+def _start(bag: Path, reader: Reader) -> int:
+    """When the first message was received [ns of unix time]."""
+    if not 0 <= reader.start_time < LATEST:
+        raise DataError(f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again")
+    return reader.start_time
+
+
+def _types(layouts: Mapping[str, str]) -> Any:
+    """Standard message types and the declared ones: rosbags makes code of these, never of a bag's own definitions."""
+    types, declared = get_typestore(Stores.ROS2_HUMBLE), {}
+    for name, text in layouts.items():
+        try:
+            declared.update(get_types_from_msg(text, name))
+        except Exception as error:  # of rosbags' parser, of any kind
+            raise ConfigurationError(f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}") from None
+    for name, (_, fields) in declared.items():
+        for field, kind in fields:
+            inner = kind[1][0] if kind[0] in ARRAYS else kind
+            if inner[0] == Nodetype.NAME and inner[1] not in declared and inner[1] not in types.fielddefs:
+                raise ConfigurationError(f"the layout of message type '{name}': type '{inner[1]}' of field '{field}' is not declared")
+    try:
+        types.register(declared)
+    except TypesysError as error:
+        raise ConfigurationError(f"layouts of message types: {error}") from None
+    return types
+
+
+def _numbers(types: Any, kind: str, prefix: str = "") -> list[str]:
+    """Paths of the plain numbers in a message type; none of an unknown one."""
+    paths: list[str] = []
+    for field, (node, detail) in types.fielddefs.get(kind, ((), ()))[1]:
+        if node == Nodetype.NAME:
+            paths += _numbers(types, detail, f"{prefix}{field}.")
+        elif node == Nodetype.BASE and detail[0] not in TEXTS | {"bool"}:
+            paths.append(f"{prefix}{field}")
+    return paths
+
+
+def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
+    """What takes a number out of a message."""
+    node: Nodetype = Nodetype.NAME
+    detail: Any = kind
+    for part in path.split("."):
+        if node in ARRAYS and part.isdigit():
+            node, detail = detail[0]
+            continue
+        if node != Nodetype.NAME:
+            node = Nodetype.ARRAY
+            break
+        if detail not in types.fielddefs:
+            raise ConfigurationError(f"message type '{detail}' is neither a standard one nor declared; give its layout in messages")
+        fields = dict(types.fielddefs[detail][1])
+        if part not in fields:
+            raise ConfigurationError(f"topic '{topic}': message type '{detail}' has no field '{part}' (it has {', '.join(fields)})")
+        node, detail = fields[part]
+    if node != Nodetype.BASE or detail[0] in TEXTS:
+        raise ConfigurationError(f"topic '{topic}': field '{path}' of '{kind}' is not a number; name one inside it")
+    return (lambda message: _item(message, path)) if any(map(str.isdigit, path.split("."))) else attrgetter(path)
+
+
+def _item(message: Any, path: str) -> Any:
+    for part in path.split("."):
+        message = message[int(part)] if part.isdigit() else getattr(message, part)
+    return message
+
+
+def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arrays:
+    columns: dict[str, tuple[array[int], array[int] | None, list[tuple[array[float], Callable[[Any], Any]]]]] = {}
+    counts, wanted = {}, []
+    for name, kind, paths in topics:
+        getters = [_getter(types, name, kind, path) for path in paths]
+        header = dict(types.fielddefs[kind][1]).get("header")
+        stamped = array("q") if header == (Nodetype.NAME, "std_msgs/msg/Header") else None
+        columns[name] = (array("q"), stamped, [(array("d"), getter) for getter in getters])
+        held = _connections(bag, reader, types, name, kind)
+        counts[name] = sum(connection.msgcount for connection in held)
+        check_limit("samples", counts[name], f"'{bag}': topic '{name}' holds {counts[name]} messages")
+        wanted += held
+    for connection, time, raw in reader.messages(wanted):
+        message: Any = types.deserialize_cdr(raw, connection.msgtype)
+        received, stamped, fields = columns[connection.topic]
+        received.append(time)
+        if stamped is not None:
+            stamped.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+        for values, getter in fields:
+            values.append(getter(message))
+    arrays: Arrays = {}
+    for name, _, paths in topics:
+        received, stamped, fields = columns[name]
+        if len(received) != counts[name]:
+            raise DataError(f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {counts[name]}; it is truncated")
+        times = np.array(received, np.int64)
+        if times.min() < 0 or times.max() >= LATEST:
+            raise DataError(f"'{bag}': topic '{name}': a message was received at no time there is; the bag is damaged")
+        order = np.argsort(times, kind="stable")
+        arrays[f"{name}@received"] = times[order]
+        if stamped is not None:
+            arrays[f"{name}@stamped"] = np.array(stamped, np.int64)[order]
+        arrays |= {f"{name}.{path}": np.array(values)[order] for path, (values, _) in zip(paths, fields, strict=True)}
+    return arrays
+
+
+def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
+    """What the bag holds of a topic; its type and layout are those that are declared."""
+    held = [connection for connection in reader.connections if connection.topic == name]
+    if not held:
+        names = sorted({connection.topic for connection in reader.connections})
+        topics = printable(", ".join(names[:30])) + (", …" if len(names) > 30 else "")
+        raise DataError(f"'{bag}' has no topic '{name}' (it has {topics or 'none'}); correct topics in the data set's configuration")
+    for connection in held:
+        if connection.msgtype != kind:
+            raise DataError(f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared")
+        for found, (_, fields) in _definitions(connection).items():
+            declared = types.fielddefs.get(found)
+            if declared is not None and _lower(declared[1]) != _lower(fields):
+                raise DataError(f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages")
+    if not any(connection.msgcount for connection in held):
+        raise DataError(f"'{bag}': topic '{name}' holds no messages")
+    return held
+
+
+def _definitions(connection: Connection) -> Mapping[str, Any]:
+    """Types as the bag itself defines them, parsed only."""
+    form, text = connection.msgdef.format, connection.msgdef.data
+    if form == MessageDefinitionFormat.NONE:
+        return {}
+    if form == MessageDefinitionFormat.MSG:
+        return get_types_from_msg(text, connection.msgtype)
+    rule = "=" * 80 + "\n"
+    sections = [part.split("\n", 1)[1] for part in text.split(rule)[1:]] if text.startswith(f"{rule}IDL: ") else [text]
+    return {name: kind for section in sections for name, kind in get_types_from_idl(section).items()}
+
+
+def _lower(fields: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    return [(name.lower(), kind) for name, kind in fields]
