@@ -65,7 +65,7 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     """
     size = sum(part.stat().st_size for part in (file.rglob("*") if file.is_dir() else [file]) if part.is_file())
     seconds, memory = SECONDS + SECONDS_PER_BYTE * size, current_limits().memory + MEMORY_PER_BYTE * size
-    order = {"reader": reader, "file": str(file), "request": request, "limits": asdict(current_limits())}
+    order: dict[str, Any] = {"reader": reader, "file": str(file), "request": request, "limits": asdict(current_limits())}
     order |= {"seconds": seconds, "memory": memory}
     environment = {**os.environ, **_ONE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)

@@ -1,1 +1,1 @@
-"""Functions that read one file by a library; `vehest.sources.limited` calls them in a process with limits."""
+"""Readers of formats by their libraries; every function here runs in the limited process of `vehest.sources.limited`."""

@@ -1,0 +1,293 @@
+"""Signals of ASAM MDF 2, 3 and 4 by asammdf. A file that holds a formula is refused before any sample is read.
+
+file -> groups and channels -> conversions checked -> raw samples -> physical values and times
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import asammdf
+import numpy as np
+from asammdf.blocks import mdf_v3, mdf_v4, v2_v3_blocks, v4_blocks
+from asammdf.blocks import v2_v3_constants as v3
+from asammdf.blocks import v4_constants as v4
+
+from vehest.constants import FloatArray
+from vehest.data.errors import DataError, printable
+from vehest.data.limits import check_limit
+from vehest.sources.limited import Arrays
+
+FINISHED, UNFINISHED = b"MDF     ", b"UnFinMF "
+EVALUATED = {
+    v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_FORMULA, v3.CONVERSION_TYPE_EXPO, v3.CONVERSION_TYPE_LOGH},
+    v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_ALG},
+}
+"""Conversions that refuse a file: formulas, and those of version 3 that readers compute in contradicting ways."""
+RANGES = {
+    v2_v3_blocks.ChannelConversion: {v3.CONVERSION_TYPE_TABX, v3.CONVERSION_TYPE_RTABX},
+    v4_blocks.ChannelConversion: {v4.CONVERSION_TYPE_RTAB, v4.CONVERSION_TYPE_TABX, v4.CONVERSION_TYPE_RTABX},
+}
+"""Conversions for which whole numbers differ from real ones: they belong to both ends of a range."""
+OPTIONS: Any = {"process_bus_logging": False}  # which would read databases that are attached
+COMPARED = 10_000  # names that a misspelt one is compared with
+BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
+
+
+def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) -> tuple[Arrays, dict[str, Any]]:
+    """Signals with the times of their groups.
+
+    Args:
+        file: the measurement.
+        wanted: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal
+            of numbers whose group has times.
+
+    Returns:
+        Arrays ``KEY`` (physical values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; and a summary with
+        ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped`` (reasons).
+
+    Raises:
+        DataError: it is no MDF file, holds a formula or more than the limits, or a wanted signal cannot be read.
+    """
+    forbid_evaluation()
+    with open(file, "rb") as stream:
+        head = stream.read(64)
+        if not head.startswith((FINISHED, UNFINISHED)):
+            raise DataError(f"'{file}' is not an MDF file: it does not begin with 'MDF'; is it of another format, or compressed?")
+        stream.seek(0)
+        content = io.BytesIO(stream.read()) if head.startswith(UNFINISHED) else stream  # which asammdf completes in place
+        try:
+            measurement = asammdf.MDF(content, **OPTIONS)
+        except Exception as error:
+            reason = printable(" ".join(str(error).split())[:160]) or type(error).__name__
+            raise DataError(f"'{file}' cannot be read as MDF ({reason}); is it truncated or damaged?") from None
+        _refuse_formulas(measurement, file)
+        places = _located(measurement, wanted, file) if wanted is not None else _numbered(measurement, file)
+        arrays: Arrays = {}
+        signals: dict[str, Any] = {}
+        skipped: list[str] = []
+        for group in dict.fromkeys(group for group, _ in places.values()):
+            own = {key: index for key, (at, index) in places.items() if at == group}
+            try:
+                found = _group_of(measurement, group, own, file, None if wanted is not None else skipped)
+            except DataError as error:
+                if wanted is not None:
+                    raise
+                skipped.append(str(error).removeprefix(f"'{file}': "))
+                continue
+            arrays |= found
+            signals |= {
+                key: {
+                    "name": measurement.groups[group].channels[index].name,
+                    "group": group,
+                    "title": _title(measurement, group),
+                    "unit": _unit(measurement.groups[group].channels[index]),
+                }
+                for key, index in own.items()
+                if key in found
+            }
+        start = measurement.header.start_time
+        return arrays, {"version": measurement.version, "start": start.isoformat(), "signals": signals, "skipped": skipped}
+
+
+def forbid_evaluation() -> None:
+    """Replace the evaluators of formulas: rational conversions then take asammdf's plain arithmetic, formulas end in an error."""
+
+    def refuse_evaluation(*_: Any, **__: Any) -> NoReturn:
+        raise TypeError("formulas are not evaluated")
+
+    for module in (v2_v3_blocks, v4_blocks):
+        for name in ("evaluate", "lambdify", "symbols"):
+            setattr(module, name, refuse_evaluation)
+    for module in (mdf_v3, mdf_v4):
+        setattr(module, "NamedTemporaryFile", lambda **_: io.BytesIO())  # noqa: B010
+
+
+def _refuse_formulas(measurement: Any, file: Path) -> None:
+    for group in measurement.groups:
+        for channel in group.channels:
+            for conversion in _conversions(channel.conversion):
+                if conversion.conversion_type in EVALUATED[type(conversion)]:
+                    raise DataError(
+                        f"'{file}': signal '{_shown(channel.name)}' has a conversion by a formula, which is not evaluated; "
+                        f"export it as plain numbers, or with a linear conversion"
+                    )
+
+
+def _conversions(conversion: Any) -> Iterator[Any]:
+    """A conversion and those within it."""
+    waiting, seen = [conversion], set()
+    while waiting:
+        found = waiting.pop()
+        if type(found) in EVALUATED and id(found) not in seen:
+            seen.add(id(found))
+            yield found
+            waiting += (found.referenced_blocks or {}).values()
+
+
+def _numbered(measurement: Any, file: Path) -> dict[str, tuple[int, int]]:
+    """Key of every signal -> its group and place."""
+    places = [(channel.name, g, index) for g, index, channel in _channels(measurement)]
+    check_limit("columns", len(places), f"'{file}' has {len(places)} signals")
+    often = Counter(name for name, *_ in places)
+    return {(f"{name} (group {g})" if often[name] > 1 else name): (g, index) for name, g, index in places}
+
+
+def _channels(measurement: Any) -> Iterator[tuple[int, int, Any]]:
+    """Group, place and channel of every signal that is no clock."""
+    for g, group in enumerate(measurement.groups):
+        for index, channel in enumerate(group.channels):
+            if index != measurement.masters_db.get(g):
+                yield g, index, channel
+
+
+def _located(measurement: Any, wanted: Mapping[str, tuple[str, int | str | None]], file: Path) -> dict[str, tuple[int, int]]:
+    places: dict[str, list[tuple[int, int]]] = {}
+    for g, index, channel in _channels(measurement):
+        for name in dict.fromkeys((channel.name, *(channel.display_names if measurement.version < "4" else ()))):
+            places.setdefault(name, []).append((g, index))
+    return {key: _located_one(measurement, places, name, group, file) for key, (name, group) in wanted.items()}
+
+
+def _located_one(
+    measurement: Any, places: Mapping[str, list[tuple[int, int]]], name: str, group: int | str | None, file: Path
+) -> tuple[int, int]:
+    found = places.get(name, [])
+    if not found:
+        raise DataError(f"'{file}' has no signal '{name}' ({_near(places, name)}); correct the map in conf/dataset")
+    kept = [place for place in found if group is None or group in (place[0], _group_name(measurement, place[0]))]
+    titles = list(dict.fromkeys(_title(measurement, g) for g, _ in kept or found))
+    groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
+    if not kept:
+        raise DataError(f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group")
+    if len(titles) > 1:
+        raise DataError(f"'{file}': signal '{name}' stands in several groups: {groups}; say which by number or name with group: …")
+    if len(kept) > 1:
+        raise DataError(f"'{file}': signal '{name}' stands {len(kept)} times in group {groups}; rename all but one")
+    return kept[0]
+
+
+def _near(places: Mapping[str, object], name: str) -> str:
+    names = {known: known.lower() for known in list(places)[:COMPARED] if len(known) < 200}
+    close = difflib.get_close_matches(name.lower(), list(names.values()), n=3, cutoff=0.6)
+    if close:
+        return "near it: " + ", ".join(_shown(known) for known, lower in names.items() if lower in close)
+    if any(known.startswith(BUS_FRAMES) for known in names):
+        return "it holds undecoded frames of a bus: decode them with their description, for example by asammdf's extract_bus_logging"
+    return f"it has {len(places)} signals"
+
+
+def _group_of(measurement: Any, group: int, own: Mapping[str, int], file: Path, skipped: list[str] | None) -> Arrays:
+    """Times of a group and its signals; a signal that cannot be read is an error, or a line in ``skipped``."""
+    title = _title(measurement, group)
+    described = measurement.groups[group]
+    first = _shown(described.channels[next(iter(own.values()))].name)
+    clock = measurement.masters_db.get(group)
+    if clock is None or getattr(described.channels[clock], "sync_type", v4.SYNC_TYPE_TIME) != v4.SYNC_TYPE_TIME:
+        raise DataError(f"'{file}': signal '{first}' of group {title} has no time stamps: its group has no master channel of time")
+    count = described.channel_group.cycles_nr
+    check_limit("samples", count, f"'{file}': group {title} says that it holds {count} samples")
+    record = described.channel_group.samples_byte_nr + (0 if described.uses_ld else _invalidation_bytes(described))
+    present = sum(min(block.original_size, block.block_limit or block.original_size) for block in described.get_data_blocks())
+    if present < count * record:
+        held = f"holds {present // record} samples, its header says {count}"
+        raise DataError(f"'{file}': signal '{first}' of group {title} {held}; the file is truncated or damaged")
+    read: dict[str, int] = {}
+    for key, index in {"": clock, **own}.items():
+        try:
+            _require_number(measurement, group, index, f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}")
+            read[key] = index
+        except DataError as error:
+            if skipped is None or index == clock:
+                raise
+            skipped.append(str(error).removeprefix(f"'{file}': "))
+    arrays = {}
+    for key, raw in zip(read, _raw_of(measurement, group, list(read.values())), strict=True):
+        where = f"'{file}': signal '{_shown(described.channels[read[key]].name)}' of group {title}"
+        try:
+            arrays[key or f"stamps {group}"] = _physical(*raw, described.channels[read[key]].conversion, where)
+        except DataError as error:
+            if skipped is None or not key:
+                raise
+            skipped.append(str(error).removeprefix(f"'{file}': "))
+    return arrays
+
+
+def _raw_of(measurement: Any, group: int, indices: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """Raw samples of channels of a group, and which of them are marked invalid."""
+    signals = measurement.select([(None, group, index) for index in indices], raw=True, copy_master=False)
+    return [(signal.samples, signal.invalidation_bits) for signal in signals]
+
+
+def _require_number(measurement: Any, group: int, index: int, where: str) -> None:
+    described = measurement.groups[group]
+    channel, dependencies = described.channels[index], described.channel_dependencies[index]
+    if dependencies:
+        raise DataError(f"{where} holds an array or structure; numbers are needed: name another signal")
+    if measurement.version >= "4":
+        virtual = channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER)
+        end = 0 if virtual else 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
+    else:
+        end = 8 * getattr(channel, "additional_byte_offset", 0) + channel.start_offset + channel.bit_count
+    marked = getattr(channel, "flags", 0) & v4.FLAG_CN_INVALIDATION_PRESENT
+    outside = marked and channel.pos_invalidation_bit >= 8 * _invalidation_bytes(described)
+    if outside or end > 8 * described.channel_group.samples_byte_nr:
+        raise DataError(f"{where} stands outside of its group's records; the file is damaged")
+
+
+def _invalidation_bytes(group: Any) -> int:
+    return int(getattr(group.channel_group, "invalidation_bytes_nr", 0))
+
+
+def _physical(raw: np.ndarray, invalid: Any, conversion: Any, where: str) -> FloatArray:
+    """Physical values, float64; invalid samples become NaN and meet no conversion."""
+    if raw.dtype.kind not in "biuf" or raw.ndim != 1:
+        kind = "text" if raw.dtype.kind in "SU" else "an array or structure"
+        raise DataError(f"{where} holds {kind}; numbers are needed: name another signal")
+    valid = slice(None) if invalid is None else ~np.asarray(invalid, dtype=bool)
+    found = raw[valid]
+    if conversion is None or conversion.conversion_type not in RANGES[type(conversion)]:
+        found = found.astype(np.float64)
+    if conversion is not None and len(found):
+        with np.errstate(all="ignore"):
+            ranges = type(conversion) is v4_blocks.ChannelConversion and conversion.conversion_type == v4.CONVERSION_TYPE_RTAB
+            found = _of_ranges(found, conversion) if ranges else conversion.convert(found, as_object=True)
+    if found.dtype.kind in "SU" or (found.dtype.kind == "O" and any(isinstance(value, bytes | str) for value in found)):
+        raise DataError(f"{where} holds text; numbers are needed: name another signal, or one without a conversion to text")
+    values = np.full(len(raw), np.nan)
+    values[valid] = found
+    return values
+
+
+def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
+    """Values of ranges: whole numbers belong to both ends of one, which asammdf gets wrong, real numbers not to the upper."""
+    count = (conversion.val_param_nr - 1) // 3
+    rows = np.array(sorted((conversion[f"lower_{k}"], conversion[f"upper_{k}"], conversion[f"phys_{k}"]) for k in range(count)))
+    lower, upper, physical = rows.reshape(-1, 3).T
+    at = np.maximum(np.searchsorted(lower, raw, side="right") - 1, 0)
+    inside = (lower[at] <= raw) & ((raw < upper[at]) if raw.dtype.kind == "f" else (raw <= upper[at]))
+    return np.where(inside, physical[at], conversion.default)
+
+
+def _unit(channel: Any) -> str:
+    return str((channel.conversion and channel.conversion.unit) or channel.unit or "")
+
+
+def _group_name(measurement: Any, group: int) -> str:
+    described = measurement.groups[group].channel_group
+    return str(described.acq_name if measurement.version >= "4" else described.comment)
+
+
+def _title(measurement: Any, group: int) -> str:
+    """Number and name of a group, for messages."""
+    name = _group_name(measurement, group)
+    return f"{group} '{_shown(name)}'" if name else str(group)
+
+
+def _shown(name: str) -> str:
+    return printable(name if len(name) <= 120 else name[:120] + "…")
