@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vehest.alignment.delays import LONGEST_UNREPORTED
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import LONGEST_TIME_CONSTANT, CrossSpectra, Lag, Measured, lag_of
@@ -14,6 +13,7 @@ from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
+LONGEST_UNREPORTED = 0.015  # s, of a delay
 LEAST_FIT = 0.9  # share of the phase that a low-pass must explain
 SHORTEST_TIME_CONSTANT = 0.1  # s; a shorter one is a delay in the band where cars move
 LONGEST_YAW_RESPONSE = 0.3  # s; of the yaw rate to the steering angle
