@@ -13,9 +13,9 @@ import numpy as np
 
 from vehest.alignment.bandwidth import LONGEST_UNREPORTED, low_passed
 from vehest.alignment.findings import Finding
-from vehest.alignment.imu import TILT_LAG_GAIN
 from vehest.alignment.lateral import lateral_lateness
 from vehest.alignment.motion import WHEELS, Motion, motion_of
+from vehest.alignment.settings import TILT_LAG_GAIN
 from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
 from vehest.constants import FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX

@@ -14,7 +14,7 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from vehest.alignment.settings import AlignmentSettings
+from vehest.alignment.settings import TILT_LAG_GAIN, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
@@ -27,8 +27,6 @@ IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay"
 
 TILT_GAIN = 0.1
 """Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
-TILT_LAG_GAIN = 0.005
-"""The same for the derivative of the acceleration [s]: the body follows late, say 0.1 times 50 ms."""
 TILT_LIKENESS = 0.3
 """Assumed correlation of what else body and road tilt with the effect of a parameter."""
 

@@ -7,6 +7,12 @@ from dataclasses import dataclass
 
 from vehest.data.errors import ConfigurationError
 
+TILT_LAG_GAIN = 0.005
+"""Prior standard deviation of the part of an acceleration's derivative that gravity adds through roll or pitch [s].
+
+The body follows late, say 0.1 times 50 ms.
+"""
+
 QUANTITIES: dict[str, tuple[str, ...]] = {
     "lever_arm": ("lever_x", "lever_y"),
     "mounting": ("yaw",),
