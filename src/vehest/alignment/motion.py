@@ -118,3 +118,8 @@ def _whole(recording: Recording, name: str) -> FloatArray | None:
         samples = np.interp(places, places[~unknown], samples[~unknown])
     bound = LARGEST_EXCESS * max(abs(described.low), abs(described.high))
     return None if np.abs(samples).max() > bound else samples
+
+
+def rms(samples: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(samples))))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 
 from vehest.alignment.findings import Finding, Level, listed
-from vehest.alignment.motion import Motion
+from vehest.alignment.motion import Motion, rms
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import GRAVITY, FloatArray
 
@@ -158,7 +158,7 @@ def _related(
     **limits: float,
 ) -> Iterator[Relation]:
     """The relation of two signals, about nil, whose correlation is ``least`` at least."""
-    sizes = float(np.sqrt(np.mean(np.square(shown)))), float(np.sqrt(np.mean(np.square(expected))))
+    sizes = rms(shown), rms(expected)
     if 0.0 < min(sizes) <= max(sizes) < np.inf:
         correlation = float(np.mean(shown / sizes[0] * (expected / sizes[1])))
         if abs(correlation) >= least:

@@ -123,8 +123,3 @@ def correlation(left: FloatArray, right: FloatArray) -> float:
 def largest(samples: FloatArray) -> float:
     """99th percentile of the magnitude."""
     return float(np.quantile(np.abs(samples), 0.99))
-
-
-def rms(samples: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(samples))))

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, rms, slow_of
+from vehest.alignment.motion import Motion, rms
+from vehest.alignment.proposals.columns import Candidate, correlation, slow_of
 from vehest.alignment.proposals.names import is_reference
 from vehest.data.units import factor_to_si
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vehest.alignment.proposals.columns import Candidate, correlation, rms, si_factor
+from vehest.alignment.motion import rms
+from vehest.alignment.proposals.columns import Candidate, correlation, si_factor
 from vehest.alignment.proposals.fitting import Search
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal

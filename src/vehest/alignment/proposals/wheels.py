@@ -8,8 +8,8 @@ from itertools import product
 
 import numpy as np
 
-from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, largest, rms, si_factor, slow_of
+from vehest.alignment.motion import Motion, rms
+from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.names import WEAK
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import RANGES
