@@ -55,29 +55,20 @@ def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | Non
 
 def low_pass_findings(motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]) -> list[Finding]:
     """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held against."""
-    findings = [
-        Finding(
-            "warning",
-            "bandwidth",
-            channel,
+    findings = []
+    for channel, (text, lag) in slow.items():
+        message = (
             f"follows {text} as a first-order low-pass with a time constant of {_seconds(lag.time_constant)} would: "
-            f"transients are gone; an estimator must be trained with it as it is, or do without",
+            f"transients are gone; an estimator must be trained with it as it is, or do without"
         )
-        for channel, (text, lag) in slow.items()
-    ]
-    alone = "yaw_rate" in motion and not {"ay", "yaw_rate_ref"} & set(motion.channels)
-    if alone:
-        lag = lag_of(spectra, "steered", "yaw_rate", low_pass=True)
-        if lag is not None and lag.fit > LEAST_FIT and lag.together.low > LONGEST_YAW_RESPONSE:
-            findings.append(
-                Finding(
-                    "warning",
-                    "bandwidth",
-                    "yaw_rate",
-                    f"follows {motion.steering} by {_seconds(lag.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
-                    f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide",
-                )
-            )
+        findings.append(Finding("warning", "bandwidth", channel, message))
+    steered = lag_of(spectra, "steered", "yaw_rate", low_pass=True) if not {"ay", "yaw_rate_ref"} & set(motion.channels) else None
+    if steered is not None and steered.fit > LEAST_FIT and steered.together.low > LONGEST_YAW_RESPONSE:
+        message = (
+            f"follows {motion.steering} by {_seconds(steered.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
+            f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide"
+        )
+        findings.append(Finding("warning", "bandwidth", "yaw_rate", message))
     return findings
 
 
@@ -97,15 +88,11 @@ def held_findings(recording: Recording) -> list[Finding]:
     for rate_text, names in held.items():
         delay = 0.5 / float(rate_text)
         others = f", and so do {', '.join(names[1:])}" if len(names) > 1 else ""
-        findings.append(
-            Finding(
-                "warning" if delay > LONGEST_UNREPORTED else "note",
-                "held",
-                names[0],
-                f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
-                f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)",
-            )
+        message = (
+            f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
+            f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)"
         )
+        findings.append(Finding("warning" if delay > LONGEST_UNREPORTED else "note", "held", names[0], message))
     return findings
 
 

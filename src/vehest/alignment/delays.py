@@ -30,23 +30,16 @@ DELAYED = {"wheel speeds": WHEELS}
 
 @dataclass(frozen=True)
 class Delay:
-    """By how much a channel is late against another.
-
-    Args:
-        channel: the one that may be late.
-        against: the other.
-        signals: what was compared, for people.
-        delay: lateness of the channel with its 95 % interval, negative if the other is the late one [s].
-    """
+    """Delay of a channel against another."""
 
     channel: str
-    against: str
-    signals: str
-    delay: Measured
+    against: str  # the other
+    signals: str  # that were compared, for people
+    delay: Measured  # lateness of the channel, negative if the other is the late one [s]
 
     @property
     def established(self) -> bool:
-        """Whether the whole interval lies beyond what is not reported."""
+        """Whether the whole interval lies beyond `LONGEST_UNREPORTED`."""
         return abs(self.delay.value) - self.delay.half_width > LONGEST_UNREPORTED
 
     @property

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""Findings of checks."""
 
 from __future__ import annotations
 
@@ -11,19 +11,12 @@ Level = Literal["error", "warning", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found.
+    """Outcome of a check."""
 
-    Args:
-        level: ``error`` stops an ingest, ``warning`` needs a look, ``note`` is information.
-        check: name of the check.
-        channel: the channel concerned, empty if it is not about one or if the data do not decide which.
-        message: what was found, where, and what to do.
-    """
-
-    level: Level
-    check: str
-    channel: str
-    message: str
+    level: Level  # ``error`` stops an ingest, ``warning`` needs a look, ``note`` is information
+    check: str  # name of the check
+    channel: str  # empty if it is about none or if the data do not decide which
+    message: str  # fault, place and remedy
 
 
 def listed(names: Sequence[str]) -> str:

@@ -55,7 +55,7 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
         first, second = again[0] if again is not None else (math.nan, math.nan)
         return np.array([turning + first, sliding + second, turning + first - sliding - second])
 
-    first, second, difference = jackknife(spectra, lateness)
+    first, second, difference = jackknife(spectra.groups, lateness)
     return first, second, difference
 
 

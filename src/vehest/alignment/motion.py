@@ -18,21 +18,13 @@ WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr"
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Complete channels of a drive, and what of the motion is made of them.
+    """Complete channels of a drive, and motion that is made of them."""
 
-    Args:
-        rate_hz: sampling rate.
-        channels: name -> samples without gaps, (T,).
-        speed: the channel that gives the forward velocity: the reference's own before one that wheels slip; empty if there is none.
-        velocity: the channel that gives the lateral velocity; empty if there is none.
-        moving: where the car does not stand, (T,).
-    """
-
-    rate_hz: float
-    channels: dict[str, FloatArray]
-    speed: str
-    velocity: str
-    moving: BoolArray
+    rate_hz: float  # sampling rate
+    channels: dict[str, FloatArray]  # name -> samples without gaps, (T,)
+    speed: str  # channel of the forward velocity: the reference's own before one that wheels slip; empty if there is none
+    velocity: str  # channel of the lateral velocity; empty if there is none
+    moving: BoolArray  # where the car does not stand, (T,)
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
