@@ -11,12 +11,11 @@ import numpy as np
 from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.by_name import BY_NAME_ALONE, named_channels
 from vehest.alignment.proposals.columns import Candidate, candidates, correlation, largest, si_factor, slow_of
-from vehest.alignment.proposals.fitting import CLEAR, Search, fitting_channels, longitudinal, may_be_ax
+from vehest.alignment.proposals.fitting import CLEAR, Agreement, fitting_channels, longitudinal, may_be_ax
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.repeated import repeated_channels, with_reference_speed
-from vehest.alignment.proposals.turning import CLOSE, RARE, Turning, find_turning, turning_by_names
+from vehest.alignment.proposals.turning import CLOSE, RARE, Search, Turning, find_turning, reference_speed, repeated, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, speed_of_wheels, turning_left, wheel_proposals
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
@@ -30,9 +29,6 @@ NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 REFERENCES = {"vy_ref", "sideslip_ref"}
-
-Clue = tuple[str, float]
-"""Text with a place for the sign of the yaw rate, and a correlation that has the sign by which it counts to the left."""
 
 
 def propose(
@@ -103,21 +99,13 @@ def _stands(columns: Sequence[Candidate]) -> bool:
     return bool(speeds) and all(largest(one.slow) * si_factor(one.unit, "vx") < STANDING for one in speeds)
 
 
-# --- speed, yaw rate and lateral acceleration ---------------------------------------------------------------------------------------
-
-
 def _search(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float) -> Search | None:
     """The triple that agrees best with a longitudinal acceleration among the best ones; speed and yaw rate by name where there is none."""
     if not turning:
         named = turning_by_names(columns)
         return None if named is None else _of(columns, _speed_by_ax(columns, named, rate_hz), rate_hz)
     near = [_of(columns, one, rate_hz) for one in turning if one.score > turning[0].score - NEAR_SCORE]
-
-    def support(one: Search) -> float:
-        free = [column for column in one.free if may_be_ax(column)][:MOST_COMPARED]
-        return one.turning.score + 4.0 * max((longitudinal(one.known, column, ["m/s²"]).strength for column in free), default=0.0)
-
-    return max(near, key=support) if len(near) > 1 else near[0]
+    return max(near, key=lambda one: one.turning.score + 4.0 * max((by_ax.strength for by_ax in _by_ax(one)), default=0.0))
 
 
 def _of(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Search:
@@ -125,30 +113,31 @@ def _of(columns: Sequence[Candidate], turning: Turning, rate_hz: float) -> Searc
     return Search(turning, turning.motion(rate_hz), [one for one in columns if one not in used and not one.is_made])
 
 
+def _by_ax(search: Search, unit: str = "") -> list[Agreement]:
+    """Agreements of d(vx)/dt with columns that may be a longitudinal acceleration, in a unit where the header is silent, or the best."""
+    columns = [one for one in search.free if may_be_ax(one)][:MOST_COMPARED]
+    return [longitudinal(search.known, one, [one.unit or unit] if unit else ()) for one in columns]
+
+
 def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
-    """The same with the speed's unit by d(vx)/dt, where a column that is named as longitudinal acceleration decides it."""
-    ranked: list[tuple[float, str]] = []
+    """The same with the speed's unit by d(vx)/dt, where a column that may be a longitudinal acceleration decides it."""
+    best = math.inf
     for unit in named.columns["vx"].units("vx"):
-        search = _of(columns, replace(named, units={**named.units, "vx": unit}), rate_hz)
-        for column in search.free:
-            found = longitudinal(search.known, column) if "ax" in column.hints and may_be_ax(column) else None
-            if found and found.strength >= CLEAR:
-                ranked.append((found.mismatch + RARE.get(unit, 0.0), unit))
-    best = min(ranked, default=(math.inf, ""))
-    return replace(named, units={**named.units, "vx": best[1]}) if best[0] < CLOSE else named
+        turning = replace(named, units={**named.units, "vx": unit})
+        for one in _by_ax(_of(columns, turning, rate_hz)):
+            mismatch = one.mismatch + RARE.get(unit, 0.0)
+            if one.strength >= CLEAR and mismatch < min(best, CLOSE):
+                best, found = mismatch, turning
+    return named if math.isinf(best) else found
 
 
 def _rate_by_ax(search: Search) -> float | None:
     """The plain rate at which some column, in the unit of ay, is d(vx)/dt; None where none is."""
-    found = [longitudinal(search.known, one, [one.unit or search.turning.units["ay"]]) for one in search.free if may_be_ax(one)]
-    best = max(found, key=lambda one: one.strength, default=None)
+    best = max(_by_ax(search, search.turning.units["ay"]), key=lambda one: one.strength, default=None)
     if best is None or best.strength < CLEAR:
         return None
     exact = search.known.rate_hz * best.scale
     return min(RATES, key=lambda plain: abs(math.log(plain / exact)))
-
-
-# --- assignment ---------------------------------------------------------------------------------------------------------------------
 
 
 def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheels) -> Proposals:
@@ -158,14 +147,14 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
     notes: tuple[str, ...] = ()
     free = [one for one in columns if not one.is_made]
     if search is not None:
-        for own in (*_turning_proposals(search.turning), *repeated_channels(search)):
+        for own in (*_turning_proposals(search.turning), *repeated(search)):
             before = found.get(own.channel)
             if before is not None and before.column == own.column:
                 own = replace(own, evidence=(*before.evidence, *own.evidence), asked=own.asked or before.asked)
             found[own.channel] = own
         fitting, notes = fitting_channels(search)
         found |= fitting
-        found = _unconfirmed(search.turning, with_reference_speed(found) if wheels else found)
+        found = _unconfirmed(search.turning, reference_speed(found) if wheels else found)
         free = search.free
     if wheels:
         is_made = any(one.is_made for one in columns)
@@ -210,10 +199,9 @@ def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Prop
     return {name: replace(one, asked=one.asked or doubt) if one.column in three else one for name, one in found.items()}
 
 
-# --- left and right -----------------------------------------------------------------------------------------------------------------
-
-
-def _left_and_right(proposals: Proposals, columns: Sequence[Candidate], known: Motion | None, clues: Iterable[Clue]) -> Proposals:
+def _left_and_right(
+    proposals: Proposals, columns: Sequence[Candidate], known: Motion | None, clues: Iterable[tuple[str, float]]
+) -> Proposals:
     """Signs by the first clue that decides, else by a pose; else those of most columns, the yaw rate's own where they are even."""
     for text, agreeing in clues:
         if abs(agreeing) > DECIDING:
@@ -227,8 +215,11 @@ def _left_and_right(proposals: Proposals, columns: Sequence[Candidate], known: M
     return proposals.mirrored() if sum(counts) < 0 else proposals
 
 
-def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, compass: str, west_positive: bool) -> Iterator[Clue]:
-    """Of wheels, of a column that counts the heading clockwise, and of the course over latitude and longitude."""
+def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, compass: str, west_positive: bool) -> Iterator[tuple[str, float]]:
+    """Of wheels, of a column that counts the heading clockwise, and of the course over latitude and longitude.
+
+    Each is a text with a place for the sign of the yaw rate, and a correlation that has the sign by which it counts to the left.
+    """
     yield "right wheels are faster where yaw_rate, sign {}, counts up", turning_left(wheels, known)
     for column in columns:
         if column.name == compass:

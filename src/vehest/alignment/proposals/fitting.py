@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
-from vehest.alignment.proposals.turning import Turning
+from vehest.alignment.proposals.turning import Search
 from vehest.alignment.signs import relations_of
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
@@ -36,15 +36,6 @@ USUAL_LENGTH = {"steer": 2.7, "handwheel": 43.0}  # m
 SMALL = 0.08  # m, wheelbase of the smallest model
 FASTEST_MODEL = 20.0  # m/s
 FEWEST_CALM = 100  # samples
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """A motion, and the columns that are left beside it."""
-
-    turning: Turning  # speed, yaw rate and lateral acceleration
-    known: Motion  # by these, ay = +vx·yaw_rate
-    free: list[Candidate]  # columns without a channel that repeat none; those that get one are removed
 
 
 class Offer(NamedTuple):
@@ -153,12 +144,10 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     score = _score(best.strength, CLEAR, hint)
     if score <= 0.0:
         return None
-    slope, straight = slope_of_steering(search.known, column)
+    slope, straight = _regressed(search.known, column, _driven(search.known))
     sign = best.sign if best.strength else (-1 if slope < 0.0 else 1)
-    evidence = (
-        best.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}",
-        *_name_evidence(column, "steer", "handwheel"),
-    )
+    text = best.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}"
+    evidence = (text, *_name_evidence(column, "steer", "handwheel"))
     found = angles(search.known, column)
     if "handwheel" in column.hints:
         found = [one for one in found if one.channel == "handwheel"] or found
@@ -269,17 +258,12 @@ def angles(known: Motion, column: Candidate) -> list[Angle]:
     return found
 
 
-def slope_of_steering(known: Motion, column: Candidate) -> tuple[float, float]:
-    """Change of a column by yaw_rate/vx [column's unit · m], and its value straight ahead [column's unit]."""
-    return _regressed(known, column, _driven(known))
-
-
 def _driven(known: Motion) -> BoolArray:
     return known.moving & (known.vx > 0.2 * float(np.quantile(known.vx, 0.99)))
 
 
 def _regressed(known: Motion, column: Candidate, used: BoolArray, *more: FloatArray) -> tuple[float, float]:
-    """Slope by yaw_rate/vx, and offset; further regressors are fitted beside them."""
+    """Change of a column by yaw_rate/vx [its unit · m], and its value straight ahead; further regressors are fitted beside them."""
     rows = [known["yaw_rate"][used] / known.vx[used], *(samples[used] for samples in more), np.ones(int(used.sum()))]
     slope, *_, offset = np.linalg.lstsq(np.stack(rows, axis=1), column.values[used], rcond=None)[0].tolist()
     return slope, offset

@@ -17,15 +17,15 @@ _STRONG = {  # over the name without blanks
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
     "yaw_rate": r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    "ay": r"latacc|latac|latera?lac|acclat|acc(el|eleration)?y|querb|querac|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
+    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
     r"linearaccelerationy|yacc|glat|^gy$|quera|accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|"
     r"ayvehicle",
-    "ax": r"longacc|longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
+    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
     r"along$|^along|algt|linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|"
     r"longg$|lonacc|acclon|gforcelon|axvehicle",
-    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|steerwheel|handwheel|handlenk|sas(ang)|stwhl|"
+    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
     r"volant",
-    "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenkw|lenkung|lenk|whlang|servo",
+    "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
@@ -36,7 +36,7 @@ _STRONG = {  # over the name without blanks
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
     r"velx|vlaengs|longitudinalvel|lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
-    "roll_rate": r"rollrate|rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
+    "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
