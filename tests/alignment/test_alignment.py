@@ -299,7 +299,7 @@ def test_effects_that_a_drive_cannot_tell_apart_are_refused() -> None:
 def test_straight_driving_says_nothing_about_the_lever_arm(motion: Motion) -> None:
     still = replace(motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion)))
     straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
-    with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of what this drive says about it is noise"):
+    with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
 
 

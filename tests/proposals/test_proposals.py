@@ -315,7 +315,7 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees(tmp_path) ->
 def test_a_motion_that_contradicts_a_clear_name_is_asked(tmp_path) -> None:
     table = usual(drive()).drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"})
     found = proposed(write(tmp_path / "lap.csv", table))
-    assert (found["ay"].column, "name says otherwise" in found["ay"].asked) == ("LongAcc", True)
+    assert (found["ay"].column, "contradicts its name" in found["ay"].asked) == ("LongAcc", True)
 
 
 @pytest.mark.parametrize(

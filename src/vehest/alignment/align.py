@@ -8,7 +8,7 @@ the reference point, turned by ψ, late by τ and with the offset b reads
     a(t) = exp(-iψ)·(v' + i·r·v + (i·r' - r²)·l + gravity by tilt) + b,    velocities and yaw rate r taken at t - τ,
 
 and the yaw rate sensor r(t - τ) + b_r. Both sides go through the same low-pass filter, which therefore cancels. ``docs/alignment.md``
-derives it and says what it cannot do.
+derives it and lists its limits.
 """
 
 from __future__ import annotations
@@ -156,14 +156,14 @@ def in_words(name: str, value: float) -> str:
 
 
 def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
-    """Estimate what is asked for; the recording stays as it is.
+    """Estimate the quantities that are asked for; the recording stays as it is.
 
     The steering ratio is estimated last, on the drive as the other transforms would correct it.
 
     Args:
         recording: with ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``) for all but the steering ratio, with
             ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for that.
-        settings: what to estimate, and how.
+        settings: quantities, and how to estimate them.
 
     Raises:
         DataError: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
@@ -246,7 +246,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
     if fit.suspects:
         found = listed([f"{name} {in_words(name, value)} ± {in_words(name, sigma)}" for name, (value, sigma) in fit.suspects.items()])
         notes.append(
-            f"What is left over speaks for what was not asked for, each taken alone: {found}. With it the other figures may change."
+            f"The residuals suggest quantities that were not asked for, each taken alone: {found}. With them the other figures may change."
         )
     unproven = [parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high]
     if unproven:
@@ -262,7 +262,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
         angles = (math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0))) for name in ("offset_ax", "offset_ay"))
         notes.append(
             "An accelerometer that is mounted with a pitch or roll angle shows a constant part of gravity: the offsets of ax and ay may as "
-            "well be {:.2f}° and {:.2f}° of it, and no drive tells the two apart.".format(*angles)
+            "well be {:.2f}° and {:.2f}° of it, and no drive separates the two.".format(*angles)
         )
     if signals.gravity is not None:
         notes.append("Gravity is taken off the accelerations by the measured roll and pitch for this estimate.")
@@ -270,7 +270,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
         notes.append(
             f"Beyond the acceleration of the reference the sensor shows {_percent(values['tilt_gain_x'])} of it in ax and "
             f"{_percent(values['tilt_gain_y'])} in ay: gravity through pitch and roll of the body (1 % is 0.57° at 1 g), or a scale "
-            f"error. This is fitted beside what was asked for, and no transform takes it off."
+            f"error. It is fitted beside the others, and no transform takes it off."
         )
     return notes
 

@@ -23,7 +23,7 @@ SINGLE_STEPS = 0.5  # share of changes by one quantum from which on a channel is
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
-    """Channels that follow what they must agree with as a first-order low-pass does: name -> what it was compared with, lag.
+    """Channels that follow others as a first-order low-pass does: name -> signal that it was compared with, lag.
 
     Where ay and yaw rate are held against each other, one that is low-passed makes the other lead; the one whose phase is explained better
     is named.
@@ -48,7 +48,7 @@ def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | Non
     lag = lag_of(spectra, source, follower, low_pass=True)
     if lag is None or lag.fit < LEAST_FIT or lag.time_constant.value >= LONGEST_TIME_CONSTANT:
         return None
-    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor knows what comes
+    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor leads the motion
     slow = min(lag.time_constant.low, lag.together.low) > SHORTEST_TIME_CONSTANT
     return lag if slow and not advanced else None
 
@@ -77,7 +77,7 @@ def _seconds(measured: Measured) -> str:
 
 
 def held_findings(recording: Recording) -> list[Finding]:
-    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate are told of together."""
+    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate make one finding."""
     moving = ~standstill(recording)
     held: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():

@@ -1,4 +1,4 @@
-"""What may be wrong with a recording: each check looks for one thing and says where it found it.
+"""Checks of a recording: each looks for one kind of fault and names where it is.
 
 ``checks_of_clock`` looks at the raw time stamps of a file, ``checks_of_recording`` at the samples.
 """
@@ -14,8 +14,8 @@ from scipy import ndimage
 from vehest.alignment.bandwidth import held_findings, low_pass_findings, low_passed
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
 from vehest.alignment.findings import Finding
+from vehest.alignment.lateral_offset import offset_findings
 from vehest.alignment.motion import WHEELS, Motion, motion_of
-from vehest.alignment.offsets import offset_findings
 from vehest.alignment.signs import (
     FEWEST_SAMPLES,
     KINEMATIC_BAND_HZ,
@@ -276,7 +276,7 @@ def _reverse(recording: Recording) -> Iterator[Finding]:
         lowest = min(float(recording[speed][begin:end].min()) for begin, end in runs.tolist())
         message = (
             f"goes backwards {len(runs)} times (below -{REVERSE_SPEED:g} m/s for {REVERSE_SECONDS:g} s or more), the longest "
-            f"{_longest(runs, recording)}, lowest {lowest:.3g} m/s; what estimators say there does not count if they take the car to go "
+            f"{_longest(runs, recording)}, lowest {lowest:.3g} m/s; estimates there do not count if estimators take the car to go "
             "forwards: leave the range out (start and stop of a split), or set sign: -1 for the speed if the drive goes forwards"
         )
         yield Finding("note", "reverse", speed, message)

@@ -102,7 +102,7 @@ def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = froz
     Args:
         motion: the drive.
         spectra: of its signals.
-        slow: channels that are low-passed; a delay says nothing of those.
+        slow: channels that are low-passed; their delays are unknown.
     """
     found: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:

@@ -34,7 +34,7 @@ IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay"
 TILT_GAIN = 0.1
 """Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
 TILT_LIKENESS = 0.3
-"""Assumed correlation of what else body and road tilt with the effect of a parameter."""
+"""Assumed correlation of the remaining tilt of body and road with the effect of a parameter."""
 
 ROAD_CUTOFF = 0.2
 """Bank and grade of the road change more slowly than that [Hz]."""
@@ -311,7 +311,7 @@ def _turned_by(predicted: FloatArray, measured: FloatArray, *, with_offsets: boo
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
-    """Yaw rates if the reference has one, else what remains of the accelerations without vx·yaw rate, which has no delay of its own."""
+    """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no delay of its own."""
     v, gyro = signals.velocity, signals.gyro
 
     def low(samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
@@ -460,8 +460,8 @@ def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise:
         share = fit.error.shape[1] * float(fit.weights @ np.square(noise[name][: len(fit.weights)])) / unique[index]
         if share > LARGEST_NOISE_SHARE:
             raise DataError(
-                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of what this drive says "
-                f"about it is noise (at most {100 * LARGEST_NOISE_SHARE:g} %); lower the cut-off, or use a drive with {MORE_MOTION}"
+                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of its effect in this "
+                f"drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %); lower the cut-off, or use a drive with {MORE_MOTION}"
             )
 
 
@@ -492,8 +492,8 @@ def n_blocks(seconds: float) -> int:
 def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     """Covariance of the parameters (P, P), from leaving out one block of time after another.
 
-    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. What a prior
-    holds in place varies as the prior says.
+    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. Parameters
+    with a prior vary as the prior does.
 
     Source:
         Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
@@ -514,8 +514,8 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
 def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> tuple[FloatArray, FloatArray]:
     """Standard uncertainties of the parameters by scatter and by tilt, (P,) each.
 
-    Tilt is what roll and pitch that the fit does not know would change: of the body, constant, moving, or following the accelerations where
-    that is not fitted, and of the road. How much the road tilts shows in the slow part of what the fit leaves; that it looks like the
+    Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving, or following the accelerations where
+    that is not fitted, and of the road. The slow part of the residuals shows how much the road tilts; that it looks like the
     effect of a parameter is assumed.
     """
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))

@@ -37,7 +37,7 @@ class Motion:
 
     @property
     def steering(self) -> str:
-        """The channel that tells where the driver steers; empty if there is none."""
+        """The channel of the steering angle; empty if there is none."""
         return next((name for name in ("steer", "handwheel") if name in self), "")
 
     @property
@@ -64,7 +64,7 @@ class Motion:
 
     @property
     def forward(self) -> FloatArray:
-        """What ``ax`` must be: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
+        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
         gained = self.derivative(self.vx)
         return gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
 
@@ -92,7 +92,7 @@ class Motion:
 
 
 def motion_of(recording: Recording) -> Motion:
-    """What can be compared: channels that are complete, or nearly, and that no wrong unit alone would bring where they are."""
+    """Channels that are complete, or nearly, and not larger than a wrong unit explains."""
     channels = {name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None}
     speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
     velocity = next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""

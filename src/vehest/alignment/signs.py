@@ -19,7 +19,7 @@ FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a record
 FEWEST_SAMPLES = 100
 LEAST_SECONDS = 10.0  # of filtered samples
 STEADY_CORRELATION = 0.7
-SIGN_CORRELATION = 0.3  # of what hangs on derivatives
+SIGN_CORRELATION = 0.3  # of relations with derivatives
 SCALE_CORRELATION = 0.8
 SAME_CORRELATION = 0.95  # of one quantity measured twice; a driven wheel that spins is no wrong unit
 LEAST_ACCELERATION = 0.2  # m/s², standard deviation
@@ -71,7 +71,7 @@ class Relation:
         return abs(self.correlation) < self.least_correlation or 1.0 / self.tolerance < abs(scale) < self.tolerance
 
     def without(self, channel: str, factor: float) -> float:
-        """What left over right would be were a channel not that factor too large."""
+        """Left over right, were a channel not that factor too large."""
         power = dict(zip(self.channels, self.powers, strict=True)).get(channel, 0)
         return float(self.scale / factor**power)
 
@@ -83,7 +83,7 @@ def relations_of(motion: Motion) -> list[Relation]:
 
 
 def _lateral(motion: Motion) -> Iterator[Relation]:
-    """ay against vx·yaw_rate as it is, and d(vy)/dt against what remains of both without vx·yaw_rate and its derivative.
+    """ay against vx·yaw_rate as it is, and d(vy)/dt against ay - vx·yaw_rate, both without vx·yaw_rate and its derivative.
 
     The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass for one of the other sign.
     """
@@ -206,7 +206,7 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
     for number in range(1, MOST_TURNED + 1):
         for turned in itertools.combinations(suspects, number):
             if all((len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0) for relation in relations):
-                explaining.append((number - ({"vy_ref", "sideslip_ref"} <= set(turned)), turned))
+                explaining.append((_number(turned), turned))
     explaining.sort()
     return [turned for cost, turned in explaining if cost <= explaining[0][0] + 1]
 
@@ -227,7 +227,7 @@ def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: S
     evidence = figures + (f"; {listed(agreeing)} agree" if agreeing else "")
     if not explanations:
         return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
-    if (motion.speed,) in explanations:  # only suspected where it is negative, and the check reverse tells of it
+    if (motion.speed,) in explanations:  # only suspected where it is negative, where the check reverse warns
         return []
     best, others = explanations[0], explanations[1:]
     if _decided(relations, explanations):
@@ -240,12 +240,15 @@ def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: S
 
 
 def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
-    """One explanation is the smallest, and the next needs two more channels, or steering or heading was asked."""
-    sizes = [len(names) - ({"vy_ref", "sideslip_ref"} <= set(names)) for names in explanations]
-    if len(sizes) == 1:
-        return True
+    """One explanation is the smallest, or the only one, and steering or heading was asked."""
+    smallest, *others = (_number(names) for names in explanations)
     heading = any(set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations)
-    return sizes[1] > sizes[0] and heading
+    return not others or (others[0] > smallest and heading)
+
+
+def _number(names: Sequence[str]) -> int:
+    """Number of channels, those of one sensor counted once."""
+    return len(names) - ({"vy_ref", "sideslip_ref"} <= set(names))
 
 
 # --- units -------------------------------------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ def standstill(recording: Recording) -> BoolArray:
 
 
 def _spreads(samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> FloatArray:
-    """Standard deviation of what is known of the samples, for each of the stretches that they consist of; 0 where nothing is."""
+    """Standard deviation of the known samples of each run; 0 where none is known."""
     known = np.isfinite(samples)
     number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
     mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number

@@ -61,7 +61,7 @@ def propose(
         if len(named) == 3 and not proposals.pose:
             notes.append(f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate")
     if stands:
-        notes.append("the car stands all the time, by its speed; names alone tell its columns")
+        notes.append("the car stands all the time, by its speed; names alone suggest channels")
     clues = () if known is None else _clues(found, wheels, known, compass, west_positive)
     proposals = _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
     proposals = possible(proposals, {column.name: column.values for column in found})
@@ -181,7 +181,7 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
         if not column.is_made:
             doubt = "" if column.unit and "ay" in turning.columns and turning.is_close else asked
             if column.hint(channel) <= -STRONG:
-                doubt = doubt or "the motion says so, its name says otherwise"
+                doubt = doubt or "the motion contradicts its name"
             yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)
 
 

@@ -21,12 +21,12 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
 CLEAR = 0.6  # correlation that decides where nothing else comes near
-CLEAR_LATERAL = 0.45  # of what hangs on derivatives of noisy channels
+CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
-HARDLY = "the motion hardly says"
+HARDLY = "the motion hardly decides it"
 SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
 LATERAL = ("vy_ref", "sideslip_ref")
 LARGEST = {"steer": 0.8, "handwheel": 16.0}  # rad

@@ -1,4 +1,4 @@
-"""Proposals of channels for the columns of a log, and what is left to be asked."""
+"""Proposals of channels for the columns of a log, with open questions."""
 
 from __future__ import annotations
 

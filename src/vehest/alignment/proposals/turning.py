@@ -17,7 +17,7 @@ from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
 
 LEAST_CORRELATION = 0.75
-RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with what is added to their mismatch
+RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
 CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
 APART = 0.2  # by which the next best units must be worse
 RANGES = {"vx": (0.5, 110.0), "yaw_rate": (0.02, 8.0), "ay": (0.3, 60.0)}  # of the 99th percentile, SI
@@ -175,7 +175,7 @@ def repeated(search: Search) -> Iterator[Proposal]:
             search.free.remove(one.column)
         family = [*(() if first.column.is_made else (first,)), *same]
         if same:
-            yield from _told_apart(family, channel)
+            yield from _separated(family, channel)
         elif scaled and family:
             search.free.remove(scaled[0])
             yield from _scaled_speed(scaled[0], first)
@@ -234,7 +234,7 @@ def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
     yield Proposal(name, "vx_ref", first.unit, first.sign, (f"'{column.name}' follows it",), asked)
 
 
-def _told_apart(family: Sequence[Repeat], channel: str) -> list[Proposal]:
+def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     """The car's own and the reference's of columns that measure the same; more than these two are left out."""
     plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
     own = [one for one in plain if not is_reference(one.column.name)]
@@ -252,7 +252,7 @@ def _told_apart(family: Sequence[Repeat], channel: str) -> list[Proposal]:
         return [first, proposal(references[0], reference, "named as a reference")]
     if len(plain) < 2:
         return [Proposal(one.column.name, channel, one.unit, one.sign) for one in plain]
-    asked = f"which is the car's own {channel}, and which the reference's: no name tells"
+    asked = f"which is the car's own {channel}, and which the reference's: no name decides"
     rough, smooth = sorted(plain, key=lambda one: _roughness(one.column), reverse=True)[:2]
     return [
         proposal(rough, channel, "the rougher of the two", asked=asked, others=(reference,)),

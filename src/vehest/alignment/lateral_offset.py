@@ -22,7 +22,7 @@ FEWEST_BLOCKS = 6
 def lateral_offset(motion: Motion) -> Measured | None:
     """The constant c of ay - d(vy)/dt = c + g·vx·yaw_rate over the drive [m/s²], with its interval from blocks of time.
 
-    The gain g takes what roll lets in of gravity, which is no offset in a drive of left turns only. Without a lateral velocity its
+    The gain g holds the gravity that roll lets in, which is no offset in a drive of left turns only. Without a lateral velocity its
     derivative counts as nil, which its mean is in any drive that is not short.
     """
     settled = settled_samples(motion)
