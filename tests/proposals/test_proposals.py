@@ -107,16 +107,10 @@ def test_wheels_alone_give_a_speed_and_their_radius(tmp_path) -> None:
     assert {"vx", "vy_ref"} <= made.contents[0].channels
 
 
-@pytest.mark.parametrize("unit", ["", "rad", "mph"])
-def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(tmp_path, unit: str) -> None:
+@pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
+def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(tmp_path, wheel: str, other: str) -> None:
     d = drive()
-    columns = {
-        "t": d["t"],
-        "gier": d["r"],
-        f"n_VL [{unit}]": d["wheel_fl"],
-        f"yaw [{unit}]": np.cumsum(d["r"]) / 50.0,
-        "n_VR": d["wheel_fr"],
-    }
+    columns = {"t": d["t"], wheel: d["wheel_fl"], "n_VR": d["wheel_fr"], other: np.cumsum(d["r"]) / 50.0}
     file = write(tmp_path / "lap.csv", pd.DataFrame(columns))
     assert {one.column for one in inspect("my_car", [file]).proposals.channels} <= set(columns)
     assert "wheel_speed_fr" in proposed(file)
