@@ -169,8 +169,14 @@ def repeated(search: Search) -> Iterator[Proposal]:
     """Proposals for speeds and yaw rates that are measured twice, those of the motion among them."""
     for channel in SAME_NAMED:
         first = Repeat(search.turning.columns[channel], search.turning.units[channel], search.turning.signs[channel])
-        scaled = [one for one in search.free if channel == "vx" and _is_scaled(one, first.column)]
-        same = [Repeat(one, unit, _sign(one, first)) for one in search.free if (unit := _unit(one, first, channel))]
+        same, scaled = [], []
+        for column in search.free:
+            agreeing = correlation(column.slow, first.column.slow)
+            unit = _unit(column, first, channel, agreeing)
+            if unit:
+                same.append(Repeat(column, unit, -first.sign if agreeing < 0.0 else first.sign))
+            elif channel == "vx" and column.hints.get("vx") == STRONG and not column.unit and abs(agreeing) > SAME_NAMED["vx"]:
+                scaled.append(column)  # named as a speed, and one but for its scale, as a motor's speed is
         for one in same:
             search.free.remove(one.column)
         family = [*(() if first.column.is_made else (first,)), *same]
@@ -200,25 +206,14 @@ def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
     return {name: one for name, one in found.items() if name != "vx"} | {"vx_ref": reference}
 
 
-def _sign(column: Candidate, first: Repeat) -> int:
-    return -first.sign if correlation(column.slow, first.column.slow) < 0.0 else first.sign
-
-
-def _unit(column: Candidate, first: Repeat, channel: str) -> str:
+def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
     least = SAME_NAMED[channel] if channel in column.hints else SAME
-    is_same = abs(correlation(column.slow, first.column.slow)) >= least and column.hint(channel) >= 0.0
-    if not is_same or column.is_wheel or not column.measures(channel):
+    if abs(agreeing) < least or column.hint(channel) < 0.0 or column.is_wheel or not column.measures(channel):
         return ""
     size = rms(first.column.slow) * si_factor(first.unit, channel)
     ranked = [(abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit) for unit in column.units(channel)[:LIKELY]]
     return min(ranked)[1] if min(ranked)[0] < SAME_SCALE else ""
-
-
-def _is_scaled(column: Candidate, first: Candidate) -> bool:
-    """Whether a column that is named as a speed, without a unit, is one but for its scale, as a motor's speed is."""
-    is_named = column.hints.get("vx") == STRONG and not column.unit
-    return is_named and abs(correlation(column.slow, first.slow)) > SAME_NAMED["vx"]
 
 
 def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
@@ -253,13 +248,9 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     if len(plain) < 2:
         return [Proposal(one.column.name, channel, one.unit, one.sign) for one in plain]
     asked = f"which is the car's own {channel}, and which the reference's: no name decides"
-    rough, smooth = sorted(plain, key=lambda one: _roughness(one.column), reverse=True)[:2]
+    roughness = {id(one): float(np.std(np.diff(one.column.values, 2))) / max(float(np.std(one.column.values)), 1e-12) for one in plain}
+    rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]
     return [
         proposal(rough, channel, "the rougher of the two", asked=asked, others=(reference,)),
         proposal(smooth, reference, "the smoother", asked=asked, others=(channel,)),
     ]
-
-
-def _roughness(column: Candidate) -> float:
-    """Size of the second difference."""
-    return float(np.std(np.diff(column.values, 2))) / max(float(np.std(column.values)), 1e-12)
