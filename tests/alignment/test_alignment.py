@@ -196,12 +196,12 @@ def test_each_comes_back_alone_and_brings_no_other_transform(motion: Motion, qua
     names = {"lever_arm": "mounting_correction", "mounting": "mounting_correction", "delay": "delay_correction"}
     assert transform["name"] == names.get(quantity, "offset_correction")
     assert "yaw" not in transform or quantity == "mounting"
-    assert not any("left over" in note for note in found.notes)
+    assert not any("residuals suggest" in note for note in found.notes)
 
 
 def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion: Motion) -> None:
     found = align(recorded(motion, PLANTED, reference_rate=True), AlignmentSettings(("lever_arm", "offsets")))
-    (note,) = [note for note in found.notes if "left over" in note]
+    (note,) = [note for note in found.notes if "residuals suggest" in note]
     assert re.search(r"yaw (2\.9|3\.0|3)\d* deg ±", note)
     assert re.search(r"delay (3[89]|40)[.\d]* ms ±", note)
     assert {parameter.name for parameter in found.parameters} == {*QUANTITIES["lever_arm"], *QUANTITIES["offsets"]}
@@ -299,7 +299,7 @@ def test_effects_that_a_drive_cannot_tell_apart_are_refused() -> None:
 def test_straight_driving_says_nothing_about_the_lever_arm(motion: Motion) -> None:
     still = replace(motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion)))
     straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
-    with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of what this drive says about it is noise"):
+    with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
 
 

@@ -107,6 +107,15 @@ def test_wheels_alone_give_a_speed_and_their_radius(tmp_path) -> None:
     assert {"vx", "vy_ref"} <= made.contents[0].channels
 
 
+@pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
+def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(tmp_path, wheel: str, other: str) -> None:
+    d = drive()
+    columns = {"t": d["t"], wheel: d["wheel_fl"], "n_VR": d["wheel_fr"], other: np.cumsum(d["r"]) / 50.0}
+    file = write(tmp_path / "lap.csv", pd.DataFrame(columns))
+    assert {one.column for one in inspect("my_car", [file]).proposals.channels} <= set(columns)
+    assert "wheel_speed_fr" in proposed(file)
+
+
 def test_road_wheel_and_steering_wheel_are_told_apart_by_range_and_slow_corners(tmp_path) -> None:
     d = drive()
     table = usual(d)
@@ -267,8 +276,8 @@ def test_mirroring_turns_lateral_channels_alone() -> None:
         ("Querbeschleunigung", "ay"),
         ("Gierrate", "yaw_rate"),
         ("Lenkradwinkel", "handwheel"),
-        ("Schwimmwinkel", "sideslip"),
-        ("v_Fzg", "speed"),
+        ("Schwimmwinkel", "sideslip_ref"),
+        ("v_Fzg", "vx"),
         ("WheelSpeedFL", "wheel_speed_fl"),
         ("n_HR", "wheel_speed_rr"),
         ("FLwhlspd", "wheel_speed_fl"),
@@ -315,7 +324,7 @@ def test_steering_is_no_lateral_acceleration_however_well_it_agrees(tmp_path) ->
 def test_a_motion_that_contradicts_a_clear_name_is_asked(tmp_path) -> None:
     table = usual(drive()).drop(columns="LongAcc").rename(columns={"LatAcc": "LongAcc"})
     found = proposed(write(tmp_path / "lap.csv", table))
-    assert (found["ay"].column, "name says otherwise" in found["ay"].asked) == ("LongAcc", True)
+    assert (found["ay"].column, "contradicts its name" in found["ay"].asked) == ("LongAcc", True)
 
 
 @pytest.mark.parametrize(

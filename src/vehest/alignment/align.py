@@ -1,6 +1,6 @@
-"""How a measuring set-up is aligned with its reference: lever arm, mounting rotation, delay and offsets of the sensors, steering ratio.
+"""Aligns a measuring set-up with its reference: lever arm, mounting rotation, delay and offsets of the sensors, steering ratio.
 
-Only what is asked for is estimated, the rest is taken as zero. Nothing is applied: the outcome names the transforms that would do it.
+Only quantities that are asked for are estimated, the others count as zero. Nothing is applied: the outcome names the transforms that would.
 
 In the plane, with velocities v = vx + i·vy and accelerations a = ax + i·ay as complex numbers, an accelerometer at the lever l from
 the reference point, turned by ψ, late by τ and with the offset b reads
@@ -8,7 +8,7 @@ the reference point, turned by ψ, late by τ and with the offset b reads
     a(t) = exp(-iψ)·(v' + i·r·v + (i·r' - r²)·l + gravity by tilt) + b,    velocities and yaw rate r taken at t - τ,
 
 and the yaw rate sensor r(t - τ) + b_r. Both sides go through the same low-pass filter, which therefore cancels. ``docs/alignment.md``
-derives it and says what it cannot do.
+derives it and lists its limits.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from vehest.alignment.findings import listed
 from vehest.alignment.imu import (
     FEWEST_BLOCKS,
     IMU_CHANNELS,
@@ -32,16 +33,15 @@ from vehest.alignment.imu import (
     ImuModel,
     Signals,
     fit_imu,
-    listed,
     n_blocks,
     require_complete,
     require_condition,
     require_length,
-    rms,
     scatter_of,
     signals_of,
     smoothing_of,
 )
+from vehest.alignment.motion import rms
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import DataError
@@ -70,25 +70,15 @@ STEERING_CUTOFF = 0.25
 
 @dataclass(frozen=True)
 class Parameter:
-    """One estimated number.
+    """One estimated number."""
 
-    Args:
-        name: as in `UNITS`.
-        value: in SI units.
-        uncertainty: standard uncertainty, both contributions together.
-        low: lower end of the 95 % interval.
-        high: its upper end.
-        scatter: the contribution of the residuals' scatter.
-        tilt: the contribution of roll and pitch of body and road that nobody measured.
-    """
-
-    name: str
-    value: float
-    uncertainty: float
-    low: float
-    high: float
-    scatter: float
-    tilt: float
+    name: str  # in `UNITS`
+    value: float  # in SI units
+    uncertainty: float  # standard uncertainty, both contributions together
+    low: float  # lower end of the 95 % interval
+    high: float  # its upper end
+    scatter: float  # contribution of the residuals' scatter
+    tilt: float  # contribution of roll and pitch of body and road that are not measured
 
     @property
     def unit(self) -> str:
@@ -98,23 +88,15 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Low-passed difference between a sensor and what the reference says it should read.
-
-    Args:
-        channel: name of the channel.
-        unit: its unit.
-        time_before, before: as recorded, (T,) each.
-        time_after, after: once the transforms have been applied, (U,) each.
-        rest: ``after`` without the part that follows the accelerations, as a body's roll and pitch do; None where that is not fitted, (U,).
-    """
+    """Low-passed difference between a sensor and its expected signal by the reference."""
 
     channel: str
     unit: str
-    time_before: FloatArray
-    before: FloatArray
-    time_after: FloatArray
-    after: FloatArray
-    rest: FloatArray | None = None
+    time_before: FloatArray  # (T,)
+    before: FloatArray  # as recorded, (T,)
+    time_after: FloatArray  # (U,)
+    after: FloatArray  # once the transforms have been applied, (U,)
+    rest: FloatArray | None = None  # without the part that follows the accelerations, as roll and pitch do; None where not fitted, (U,)
 
     @property
     def rms_before(self) -> float:
@@ -134,48 +116,28 @@ class Residual:
 
 @dataclass(frozen=True, eq=False)
 class Steering:
-    """What the steering ratio was fitted to: slow samples of calm driving.
-
-    Args:
-        channel: what was measured.
-        expected: road-wheel angle by the curvature of the path, lateral acceleration and lead included [rad], (T,).
-        measured: the channel [rad], (T,).
-    """
+    """Slow samples of calm driving that the steering ratio was fitted to."""
 
     channel: str
-    expected: FloatArray
-    measured: FloatArray
+    expected: FloatArray  # road-wheel angle by the curvature of the path, lateral acceleration and lead included [rad], (T,)
+    measured: FloatArray  # channel [rad], (T,)
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """What a drive says about its measuring set-up.
-
-    Args:
-        recording_id: name of the recording.
-        kind: ``real`` or ``simulated``.
-        rate_hz: its sampling rate [Hz].
-        duration: its length [s].
-        settings: what was asked for.
-        parameters: what was found, in the order of `UNITS`.
-        transforms: configurations of the transforms that would correct it, in the order of their application.
-        residuals: of the channels that were compared.
-        correlation: where there is a reference.
-        steering: where the steering ratio was asked for.
-        notes: what a reader must know, a sentence or two each.
-    """
+    """Alignment of a measuring set-up by a drive."""
 
     recording_id: str
-    kind: str
+    kind: str  # ``real`` or ``simulated``
     rate_hz: float
-    duration: float
+    duration: float  # [s]
     settings: AlignmentSettings
-    parameters: tuple[Parameter, ...]
-    transforms: tuple[Mapping[str, Any], ...]
-    residuals: tuple[Residual, ...] = ()
-    correlation: Correlation | None = None
-    steering: Steering | None = None
-    notes: tuple[str, ...] = ()
+    parameters: tuple[Parameter, ...]  # in the order of `UNITS`
+    transforms: tuple[Mapping[str, Any], ...]  # configurations of the transforms that would correct it, in the order of their application
+    residuals: tuple[Residual, ...] = ()  # of the channels that were compared
+    correlation: Correlation | None = None  # where there is a reference
+    steering: Steering | None = None  # where the steering ratio was asked for
+    notes: tuple[str, ...] = ()  # a sentence or two each
 
     def __getitem__(self, name: str) -> Parameter:
         """A parameter by its name.
@@ -194,14 +156,14 @@ def in_words(name: str, value: float) -> str:
 
 
 def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
-    """Estimate what is asked for; the recording stays as it is.
+    """Estimate the quantities that are asked for; the recording stays as it is.
 
     The steering ratio is estimated last, on the drive as the other transforms would correct it.
 
     Args:
         recording: with ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``) for all but the steering ratio, with
             ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for that.
-        settings: what to estimate, and how.
+        settings: quantities, and how to estimate them.
 
     Raises:
         DataError: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
@@ -215,7 +177,8 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     corrected, correlation, steering = recording, None, None
     if settings.kinematic:
         fit = fit_imu(recording, settings, [name for quantity in settings.kinematic for name in QUANTITIES[quantity]])
-        parameters = _imu_parameters(fit)
+        uncertainties = zip(fit.names, fit.scatter.tolist(), fit.tilt.tolist(), strict=True)
+        parameters = [_parameter(name, fit.values[name], scatter, tilt, fit.blocks - 1) for name, scatter, tilt in uncertainties]
         transforms = _imu_transforms(parameters)
         for transform in transforms:
             corrected = transform_from_config(transform)(corrected)
@@ -225,25 +188,18 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         found, transform, steering, note = _align_steering(corrected, settings)
         parameters, transforms, notes = [*parameters, *found], [*transforms, transform], [*notes, note]
     return Alignment(
-        recording_id=recording.id,
-        kind=recording.kind,
-        rate_hz=recording.rate_hz,
-        duration=recording.duration,
-        settings=settings,
-        parameters=tuple(parameters),
-        transforms=tuple(transforms),
-        residuals=residuals,
-        correlation=correlation,
-        steering=steering,
-        notes=tuple(notes),
+        recording.id,
+        recording.kind,
+        recording.rate_hz,
+        recording.duration,
+        settings,
+        tuple(parameters),
+        tuple(transforms),
+        residuals,
+        correlation,
+        steering,
+        tuple(notes),
     )
-
-
-def _imu_parameters(fit: ImuFit) -> list[Parameter]:
-    return [
-        _parameter(name, fit.values[name], scatter, tilt, fit.blocks - 1)
-        for name, scatter, tilt in zip(fit.names, fit.scatter.tolist(), fit.tilt.tolist(), strict=True)
-    ]
 
 
 def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
@@ -274,18 +230,12 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     tilt = {name: value for name, value in fit.values.items() if name.startswith("tilt")}
     error_before, error_after = (model.measured - model(NOTHING)[0] for model in (before, after))
     rest = after.measured - after({**NOTHING, **tilt})[0]
-    return tuple(
-        Residual(
-            channel=channel,
-            unit=UNITS[f"offset_{channel}"],
-            time_before=fit.signals.time,
-            before=error_before[row],
-            time_after=corrected.time,
-            after=error_after[row],
-            rest=rest[row] if any(tilt.values()) and channel != "yaw_rate" else None,
-        )
-        for row, channel in enumerate(fit.signals.channels)
-    )
+    found = []
+    for row, channel in enumerate(fit.signals.channels):
+        own = rest[row] if any(tilt.values()) and channel != "yaw_rate" else None
+        unit = UNITS[f"offset_{channel}"]
+        found.append(Residual(channel, unit, fit.signals.time, error_before[row], corrected.time, error_after[row], own))
+    return tuple(found)
 
 
 def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: AlignmentSettings) -> list[str]:
@@ -296,7 +246,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
     if fit.suspects:
         found = listed([f"{name} {in_words(name, value)} ± {in_words(name, sigma)}" for name, (value, sigma) in fit.suspects.items()])
         notes.append(
-            f"What is left over speaks for what was not asked for, each taken alone: {found}. With it the other figures may change."
+            f"The residuals suggest quantities that were not asked for, each taken alone: {found}. With them the other figures may change."
         )
     unproven = [parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high]
     if unproven:
@@ -312,7 +262,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
         angles = (math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0))) for name in ("offset_ax", "offset_ay"))
         notes.append(
             "An accelerometer that is mounted with a pitch or roll angle shows a constant part of gravity: the offsets of ax and ay may as "
-            "well be {:.2f}° and {:.2f}° of it, and no drive tells the two apart.".format(*angles)
+            "well be {:.2f}° and {:.2f}° of it, and no drive separates the two.".format(*angles)
         )
     if signals.gravity is not None:
         notes.append("Gravity is taken off the accelerations by the measured roll and pitch for this estimate.")
@@ -320,7 +270,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
         notes.append(
             f"Beyond the acceleration of the reference the sensor shows {_percent(values['tilt_gain_x'])} of it in ax and "
             f"{_percent(values['tilt_gain_y'])} in ay: gravity through pitch and roll of the body (1 % is 0.57° at 1 g), or a scale "
-            f"error. This is fitted beside what was asked for, and no transform takes it off."
+            f"error. It is fitted beside the others, and no transform takes it off."
         )
     return notes
 
@@ -336,9 +286,9 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     assert settings.wheelbase is not None
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
     if source not in recording:
+        held = ", ".join(recording.channels)
         raise DataError(
-            f"recording '{recording.id}' has no channel '{source}' (it has {', '.join(recording.channels)}): "
-            f"the steering ratio needs handwheel or steer"
+            f"recording '{recording.id}' has no channel '{source}' (it has {held}): the steering ratio needs handwheel or steer"
         )
     yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
     require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")
@@ -352,11 +302,11 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     speed = np.maximum(recording["vx"], 0.1 * settings.min_speed)
     angle = np.arctan(settings.wheelbase * recording[yaw_rate] / speed)
     calm = (low(recording["vx"]) >= settings.min_speed) & (np.abs(low(recording["ay"])) <= settings.max_ay)
-    seconds = float(calm.sum()) * smoothing.step / recording.rate_hz
-    if seconds < FEWEST_BLOCKS * SHORTEST_BLOCK:
+    seconds, least = float(calm.sum()) * smoothing.step / recording.rate_hz, FEWEST_BLOCKS * SHORTEST_BLOCK
+    if seconds < least:
         raise DataError(
             f"recording '{recording.id}': only {seconds:.3g} s are above {settings.min_speed:g} m/s and below {settings.max_ay:g} m/s² "
-            f"of lateral acceleration; the steering ratio needs at least {FEWEST_BLOCKS * SHORTEST_BLOCK:g} s"
+            f"of lateral acceleration; the steering ratio needs at least {least:g} s"
         )
     columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[:, calm]
     measured = low(recording[source])[calm]
@@ -370,10 +320,8 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     to_gradient = np.diag([1.0, 1.0, 1.0 / ratio, 1.0])  # understeer gradient = slope / ratio
     to_gradient[2, 0] = -slope / ratio**2
     scatter = np.sqrt(np.diag(to_gradient @ scatter_of(fit, blocks) @ to_gradient.T))
-    found = [
-        _parameter(name, value, float(size), 0.0, blocks - 1)
-        for name, value, size in zip(names[:3], (ratio, offset, slope / ratio), scatter[:3], strict=True)
-    ]
+    values = zip(names[:3], (ratio, offset, slope / ratio), scatter[:3].tolist(), strict=True)
+    found = [_parameter(name, value, size, 0.0, blocks - 1) for name, value, size in values]
     if found[0].low <= 0.0 <= found[0].high:
         raise DataError(
             f"recording '{recording.id}': '{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g}); "

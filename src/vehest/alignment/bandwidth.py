@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vehest.alignment.delays import LONGEST_UNREPORTED
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import LONGEST_TIME_CONSTANT, CrossSpectra, Lag, Measured, lag_of
@@ -14,6 +13,7 @@ from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
+LONGEST_UNREPORTED = 0.015  # s, of a delay
 LEAST_FIT = 0.9  # share of the phase that a low-pass must explain
 SHORTEST_TIME_CONSTANT = 0.1  # s; a shorter one is a delay in the band where cars move
 LONGEST_YAW_RESPONSE = 0.3  # s; of the yaw rate to the steering angle
@@ -23,7 +23,7 @@ SINGLE_STEPS = 0.5  # share of changes by one quantum from which on a channel is
 
 
 def low_passed(motion: Motion, spectra: CrossSpectra) -> dict[str, tuple[str, Lag]]:
-    """Channels that follow what they must agree with as a first-order low-pass does: name -> what it was compared with, lag.
+    """Channels that follow others as a first-order low-pass does: name -> signal that it was compared with, lag.
 
     Where ay and yaw rate are held against each other, one that is low-passed makes the other lead; the one whose phase is explained better
     is named.
@@ -48,36 +48,27 @@ def _established(spectra: CrossSpectra, source: str, follower: str) -> Lag | Non
     lag = lag_of(spectra, source, follower, low_pass=True)
     if lag is None or lag.fit < LEAST_FIT or lag.time_constant.value >= LONGEST_TIME_CONSTANT:
         return None
-    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor knows what comes
+    advanced = lag.delay.high < -LONGEST_UNREPORTED  # no sensor leads the motion
     slow = min(lag.time_constant.low, lag.together.low) > SHORTEST_TIME_CONSTANT
     return lag if slow and not advanced else None
 
 
 def low_pass_findings(motion: Motion, spectra: CrossSpectra, slow: Mapping[str, tuple[str, Lag]]) -> list[Finding]:
     """Warnings of low-passed channels, and of a yaw rate that only the steering angle can be held against."""
-    findings = [
-        Finding(
-            "warning",
-            "bandwidth",
-            channel,
+    findings = []
+    for channel, (text, lag) in slow.items():
+        message = (
             f"follows {text} as a first-order low-pass with a time constant of {_seconds(lag.time_constant)} would: "
-            f"transients are gone; an estimator must be trained with it as it is, or do without",
+            f"transients are gone; an estimator must be trained with it as it is, or do without"
         )
-        for channel, (text, lag) in slow.items()
-    ]
-    alone = "yaw_rate" in motion and not {"ay", "yaw_rate_ref"} & set(motion.channels)
-    if alone:
-        lag = lag_of(spectra, "steered", "yaw_rate", low_pass=True)
-        if lag is not None and lag.fit > LEAST_FIT and lag.together.low > LONGEST_YAW_RESPONSE:
-            findings.append(
-                Finding(
-                    "warning",
-                    "bandwidth",
-                    "yaw_rate",
-                    f"follows {motion.steering} by {_seconds(lag.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
-                    f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide",
-                )
-            )
+        findings.append(Finding("warning", "bandwidth", channel, message))
+    steered = lag_of(spectra, "steered", "yaw_rate", low_pass=True) if not {"ay", "yaw_rate_ref"} & set(motion.channels) else None
+    if steered is not None and steered.fit > LEAST_FIT and steered.together.low > LONGEST_YAW_RESPONSE:
+        message = (
+            f"follows {motion.steering} by {_seconds(steered.together)}, more than the {LONGEST_YAW_RESPONSE:g} s that cars take: "
+            f"it is low-passed or late, or {motion.steering} is a command; ay or yaw_rate_ref would decide"
+        )
+        findings.append(Finding("warning", "bandwidth", "yaw_rate", message))
     return findings
 
 
@@ -86,7 +77,7 @@ def _seconds(measured: Measured) -> str:
 
 
 def held_findings(recording: Recording) -> list[Finding]:
-    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate are told of together."""
+    """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate make one finding."""
     moving = ~standstill(recording)
     held: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
@@ -97,15 +88,11 @@ def held_findings(recording: Recording) -> list[Finding]:
     for rate_text, names in held.items():
         delay = 0.5 / float(rate_text)
         others = f", and so do {', '.join(names[1:])}" if len(names) > 1 else ""
-        findings.append(
-            Finding(
-                "warning" if delay > LONGEST_UNREPORTED else "note",
-                "held",
-                names[0],
-                f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
-                f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)",
-            )
+        message = (
+            f"changes about {rate_text} times a second at {recording.rate_hz:.4g} Hz and is held in between, which delays it by "
+            f"{1e3 * delay:.3g} ms on average{others}; downsample to that rate, or keep only samples that are new (gappy)"
         )
+        findings.append(Finding("warning" if delay > LONGEST_UNREPORTED else "note", "held", names[0], message))
     return findings
 
 

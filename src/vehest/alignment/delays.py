@@ -11,15 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vehest.alignment.bandwidth import LONGEST_UNREPORTED, low_passed
 from vehest.alignment.findings import Finding
-from vehest.alignment.imu import TILT_LAG_GAIN
 from vehest.alignment.lateral import lateral_lateness
-from vehest.alignment.motion import WHEELS, Motion
+from vehest.alignment.motion import WHEELS, Motion, motion_of
+from vehest.alignment.settings import TILT_LAG_GAIN
 from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
 from vehest.constants import FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
+from vehest.data.recording import Recording
 
-LONGEST_UNREPORTED = 0.015  # s
 LEAST_FIT = 0.97  # share of the phase that a delay must explain
 SLIPPING = frozenset({"vx", "motor_speed", "wheel speeds"})
 """Speeds that may come from wheels: driving slip grows with the acceleration, which makes them lead and never lag."""
@@ -29,23 +30,16 @@ DELAYED = {"wheel speeds": WHEELS}
 
 @dataclass(frozen=True)
 class Delay:
-    """By how much a channel is late against another.
-
-    Args:
-        channel: the one that may be late.
-        against: the other.
-        signals: what was compared, for people.
-        delay: lateness of the channel with its 95 % interval, negative if the other is the late one [s].
-    """
+    """Delay of a channel against another."""
 
     channel: str
-    against: str
-    signals: str
-    delay: Measured
+    against: str  # the other
+    signals: str  # that were compared, for people
+    delay: Measured  # lateness of the channel, negative if the other is the late one [s]
 
     @property
     def established(self) -> bool:
-        """Whether the whole interval lies beyond what is not reported."""
+        """Whether the whole interval lies beyond `LONGEST_UNREPORTED`."""
         return abs(self.delay.value) - self.delay.half_width > LONGEST_UNREPORTED
 
     @property
@@ -57,6 +51,15 @@ class Delay:
     def turned(self) -> Delay:
         """The same seen from the other channel."""
         return Delay(self.against, self.channel, self.signals, Measured(-self.delay.value, self.delay.half_width))
+
+
+@dataclass(frozen=True)
+class Late:
+    """Channels that are late together."""
+
+    channels: tuple[str, ...]
+    delay: float  # to whole milliseconds [s]
+    evidence: str  # for people
 
 
 def signals_to_compare(motion: Motion) -> dict[str, FloatArray]:
@@ -99,7 +102,7 @@ def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = froz
     Args:
         motion: the drive.
         spectra: of its signals.
-        slow: channels that are low-passed; a delay says nothing of those.
+        slow: channels that are low-passed; their delays are unknown.
     """
     found: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
@@ -143,8 +146,27 @@ def _sound(delay: Measured) -> bool:
     return delay.half_width <= LARGEST_HALF_WIDTH and abs(delay.value) < LARGEST_LAG
 
 
+def late_channels(recording: Recording) -> dict[str, Late]:
+    """Channel -> its delay, as the checks of a recording find it."""
+    motion = motion_of(recording)
+    spectra = spectra_of(motion)
+    if spectra is None:
+        return {}
+    late = _late(delays_of(motion, spectra, frozenset(low_passed(motion, spectra))))
+    return {name: one for one in late for name in one.channels}
+
+
 def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
-    """A warning for every channel that is later than another; what lags is taken to be late, not the other early.
+    """A warning for every channel that is later than another."""
+    remedy = "{{name: delay_correction, delay: {:.3f}, channels: [{}]}} takes it off"
+    return [
+        Finding("warning", "delay", one.channels[0], f"{one.evidence}; {remedy.format(one.delay, ', '.join(one.channels))}")
+        for one in _late(delays)
+    ]
+
+
+def _late(delays: Sequence[Delay]) -> list[Late]:
+    """Channels that are later than another; what lags is taken to be late, not the other early.
 
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
     """
@@ -152,34 +174,16 @@ def delay_findings(delays: Sequence[Delay]) -> list[Finding]:
     late = [delay for delay in late if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")]
     punctual = {delay.channel for delay in delays if delay.on_time and delay.against.endswith(REFERENCE_SUFFIX)}
     late = [delay for delay in late if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))]
-    findings = []
+    found = []
     for channel in dict.fromkeys(delay.channel for delay in late):
         own = [delay for delay in late if delay.channel == channel]
-        signals = [text for text in dict.fromkeys(delay.signals for delay in own) if text != "both"]
+        signals = "; ".join(dict.fromkeys(delay.signals for delay in own if delay.signals != "both"))
         figures = " and ".join(f"{_milliseconds(delay.delay)} behind {delay.against}" for delay in own)
-        names = DELAYED.get(channel, (channel,))
-        longest = max(delay.delay.value for delay in own)
-        findings.append(
-            Finding(
-                "warning",
-                "delay",
-                names[0],
-                f"is late{' with the other wheels' if len(names) > 1 else ''}, {figures}{f', from {_listed(signals)}' if signals else ''}"
-                f"{_doubt(own)}; {{name: delay_correction, delay: {longest:.3f}, channels: [{', '.join(names)}]}} takes it off",
-            )
-        )
-    return findings
-
-
-def _doubt(own: Sequence[Delay]) -> str:
-    """What else could be meant."""
-    if [delay.against for delay in own] == ["vx"]:
-        return "; or vx comes from wheels, whose slip makes it lead"
-    return ""
-
-
-def _listed(texts: Sequence[str]) -> str:
-    return "; ".join(texts)
+        text = f"is late{' with the other wheels' if channel in DELAYED else ''}, {figures}" + (f", from {signals}" if signals else "")
+        if [delay.against for delay in own] == ["vx"]:
+            text += "; or vx comes from wheels, whose slip makes it lead"
+        found.append(Late(DELAYED.get(channel, (channel,)), round(max(delay.delay.value for delay in own), 3), text))
+    return found
 
 
 def _milliseconds(measured: Measured) -> str:

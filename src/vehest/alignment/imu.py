@@ -1,11 +1,15 @@
-"""What an inertial sensor should read where it sits, and the fit of where it sits to what it did read."""
+"""Estimates lever arm, mounting, delay and offsets of the inertial unit.
+
+recording -> Signals, low-passed -> ImuModel: prediction and derivatives -> most likely Fit -> uncertainties -> ImuFit
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +18,9 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from vehest.alignment.settings import AlignmentSettings
+from vehest.alignment.findings import listed
+from vehest.alignment.motion import rms
+from vehest.alignment.settings import TILT_LAG_GAIN, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import check_limit
@@ -27,10 +33,8 @@ IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay"
 
 TILT_GAIN = 0.1
 """Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
-TILT_LAG_GAIN = 0.005
-"""The same for the derivative of the acceleration [s]: the body follows late, say 0.1 times 50 ms."""
 TILT_LIKENESS = 0.3
-"""Assumed correlation of what else body and road tilt with the effect of a parameter."""
+"""Assumed correlation of the remaining tilt of body and road with the effect of a parameter."""
 
 ROAD_CUTOFF = 0.2
 """Bank and grade of the road change more slowly than that [Hz]."""
@@ -48,6 +52,7 @@ N_ITERATIONS = 60
 SETTLED = 1e-6  # parameters that move less than this (m, rad, s, m/s², rad/s) have settled
 SMALLEST_VARIANCE = 1e-24
 SUSPICIOUS = 3.0  # standard uncertainties
+MORE_MOTION = "more turning, braking and accelerating"
 
 TILT_PRIOR = {"tilt_gain_x": TILT_GAIN, "tilt_gain_y": TILT_GAIN, "tilt_lag_x": TILT_LAG_GAIN, "tilt_lag_y": TILT_LAG_GAIN}
 NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
@@ -56,19 +61,12 @@ NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Correlation:
-    """Cross-correlation between the sensor and what the reference says it should read.
+    """Cross-correlation between the sensor and its expected signal by the reference."""
 
-    Args:
-        signal: what was compared, for people.
-        lag: by how much the sensor is late [s], shape (L,).
-        value: between -1 and 1, shape (L,).
-        peak: lag of the largest value, between samples by a parabola [s].
-    """
-
-    signal: str
-    lag: FloatArray
-    value: FloatArray
-    peak: float
+    signal: str  # for people
+    lag: FloatArray  # by which the sensor is late [s], (L,)
+    value: FloatArray  # between -1 and 1, (L,)
+    peak: float  # lag of the largest value, between samples by a parabola [s]
 
     @property
     def highest(self) -> float:
@@ -78,27 +76,16 @@ class Correlation:
 
 @dataclass(frozen=True, eq=False)
 class ImuFit:
-    """What was found.
+    """Parameters of the sensor by a drive."""
 
-    Args:
-        names: the parameters that were asked for, N of them.
-        values: of all parameters, those that were not asked for zero.
-        scatter: standard uncertainty of each by the scatter of the residuals, (N,).
-        tilt: standard uncertainty of each by roll and pitch that are not modelled, (N,).
-        blocks: number of blocks that ``scatter`` comes from.
-        suspects: parameters that were not asked for and that the residuals speak for: name -> value and standard uncertainty.
-        correlation: where the delay was looked for first.
-        signals: what was compared.
-    """
-
-    names: Sequence[str]
-    values: Mapping[str, float]
-    scatter: FloatArray
-    tilt: FloatArray
-    blocks: int
-    suspects: Mapping[str, tuple[float, float]]
-    correlation: Correlation
-    signals: Signals
+    names: Sequence[str]  # of the N parameters that were asked for
+    values: Mapping[str, float]  # of all parameters, those that were not asked for zero
+    scatter: FloatArray  # standard uncertainty of each by the scatter of the residuals, (N,)
+    tilt: FloatArray  # standard uncertainty of each by roll and pitch that are not modelled, (N,)
+    blocks: int  # number of blocks that ``scatter`` comes from
+    suspects: Mapping[str, tuple[float, float]]  # name -> value and standard uncertainty of others that the residuals suggest
+    correlation: Correlation  # by which the delay was looked for first
+    signals: Signals  # that were compared
 
 
 def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
@@ -126,47 +113,29 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     fit = _most_likely(model, start, [*names, *tilts], names)
     _require_identified(signals, fit, names, noise)
     if "delay" in names and abs(fit.values["delay"]) > settings.max_delay:
-        raise DataError(f"recording '{recording.id}': the delay left the {settings.max_delay:g} s that are searched; raise max_delay")
+        raise DataError(f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay")
     blocks = n_blocks(signals.duration)
-    columns, kept_rate = model(fit.values)[1], signals.rate_hz / signals.smoothing.step
-    scatter, tilt = _uncertainties(fit, columns, settings.tilt, blocks, kept_rate)
-    return ImuFit(
-        names=names,
-        values=fit.values,
-        scatter=scatter[: len(names)],
-        tilt=tilt[: len(names)],
-        blocks=blocks,
-        suspects=_suspects(fit, columns, settings.tilt, blocks, kept_rate),
-        correlation=correlation,
-        signals=signals,
+    columns = model(fit.values)[1]
+    uncertainties = partial(
+        _uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=signals.rate_hz / signals.smoothing.step
     )
+    scatter, tilt = (sizes[: len(names)] for sizes in uncertainties(fit))
+    return ImuFit(names, fit.values, scatter, tilt, blocks, _suspects(fit, columns, uncertainties), correlation, signals)
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """What is compared, unfiltered, and the filter.
-
-    Args:
-        recording: where it comes from.
-        speed: the channel that gives the reference's forward velocity.
-        measured: ax + i·ay of the sensor, (T,).
-        gyro: its yaw rate, (T,).
-        velocity: vx + i·vy of the reference, (T,).
-        reference_rate: yaw rate of the reference if there is one, (T,).
-        gravity: what measured roll and pitch let into the accelerometer; None where they are not measured or not used, (T,).
-        smoothing: the low-pass filter.
-        margin: samples at either end that serve filtering and shifting only.
-    """
+    """Signals that are compared, unfiltered, and the filter."""
 
     recording: Recording
-    speed: str
-    measured: ComplexArray
-    gyro: FloatArray
-    velocity: ComplexArray
-    reference_rate: FloatArray | None
-    gravity: ComplexArray | None
+    speed: str  # channel of the reference's forward velocity
+    measured: ComplexArray  # ax + i·ay of the sensor, (T,)
+    gyro: FloatArray  # its yaw rate, (T,)
+    velocity: ComplexArray  # vx + i·vy of the reference, (T,)
+    reference_rate: FloatArray | None  # yaw rate of the reference if there is one, (T,)
+    gravity: ComplexArray | None  # in the accelerometer by measured roll and pitch; None where they are not measured or not used, (T,)
     smoothing: Smoothing
-    margin: int
+    margin: int  # samples at either end that serve filtering and shifting only
 
     @property
     def rate_hz(self) -> float:
@@ -175,7 +144,7 @@ class Signals:
 
     @property
     def duration(self) -> float:
-        """What is compared, without the margins [s]."""
+        """Of the signals without the margins [s]."""
         return (len(self.measured) - 2 * self.margin) / self.rate_hz
 
     @property
@@ -201,7 +170,7 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Look that all is there and put it side by side.
+    """Signals of a recording.
 
     Raises:
         DataError: a channel is missing or has gaps, or the recording is too short.
@@ -209,13 +178,10 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     """
     asked = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
-        raise DataError(
-            f"recording '{recording.id}' has no reference channel 'vy_ref': {asked} can only be found against a reference velocity"
-        )
+        raise DataError(f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against")
     speed = "vx_ref" if "vx_ref" in recording else "vx"
-    require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref"], asked)
     optional = [name for name in ("yaw_rate_ref", "roll", "pitch") if name in recording]
-    require_complete(recording, optional, asked)
+    require_complete(recording, [*IMU_CHANNELS, speed, "vy_ref", *optional], asked)
     gravity = None
     if settings.tilt > 0 and ("roll" in recording or "pitch" in recording):
         level = np.zeros(len(recording))
@@ -225,10 +191,10 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     lags = settings.max_delay * recording.rate_hz
     what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
     check_limit("filter_samples", lags, what, ConfigurationError)
-    shift = math.ceil(settings.max_delay * recording.rate_hz) if "delay" in settings.estimate else 0
+    shift = math.ceil(lags) if "delay" in settings.estimate else 0
     signals = Signals(
-        recording=recording,
-        speed=speed,
+        recording,
+        speed,
         measured=recording["ax"] + 1j * recording["ay"],
         gyro=recording["yaw_rate"],
         velocity=recording[speed] + 1j * recording["vy_ref"],
@@ -242,7 +208,7 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
 
 
 class ImuModel:
-    """What the sensor should read, low-passed, and its derivatives by every parameter."""
+    """Expected signals of the sensor, low-passed, and their derivatives by every parameter."""
 
     def __init__(self, signals: Signals) -> None:
         self.signals = signals
@@ -305,23 +271,14 @@ def _axiswise(factors: complex, plane: ComplexArray) -> ComplexArray:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A fit of C channels over T samples by P parameters.
+    """A fit of C channels over T samples by P parameters."""
 
-    Args:
-        names: of the P parameters.
-        values: of all parameters, also of those that are not free.
-        error: measured less predicted, (C, T).
-        columns: derivatives of the prediction, (P, C, T).
-        weights: of the channels, (C,).
-        prior: precisions, (P, P); zero but for parameters that have a prior.
-    """
-
-    names: Sequence[str]
-    values: Mapping[str, float]
-    error: FloatArray
-    columns: FloatArray
-    weights: FloatArray
-    prior: FloatArray
+    names: Sequence[str]  # of the P parameters
+    values: Mapping[str, float]  # of all parameters, also of those that are not free
+    error: FloatArray  # measured less predicted, (C, T)
+    columns: FloatArray  # derivatives of the prediction, (P, C, T)
+    weights: FloatArray  # of the channels, (C,)
+    prior: FloatArray  # precisions, (P, P); zero but for parameters that have a prior
 
     @property
     def point(self) -> FloatArray:
@@ -333,6 +290,11 @@ class Fit:
         """Twice the negative logarithm of the likelihood, but for a constant."""
         own = self.point
         return float(-self.error.shape[1] * np.log(self.weights).sum() + own @ self.prior @ own)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """Half the decrease of the cost by each parameter, (P,)."""
+        return np.einsum("pct,ct,c->p", self.columns, self.error, self.weights) - self.prior @ self.point
 
     @property
     def information(self) -> FloatArray:
@@ -349,7 +311,7 @@ def _turned_by(predicted: FloatArray, measured: FloatArray, *, with_offsets: boo
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:
-    """Yaw rates if the reference has one, else what remains of the accelerations without vx·yaw rate, which has no delay of its own."""
+    """Yaw rates if the reference has one, else the accelerations without vx·yaw rate, which has no delay of its own."""
     v, gyro = signals.velocity, signals.gyro
 
     def low(samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
@@ -389,14 +351,11 @@ def _require_peak(recording: Recording, correlation: Correlation, settings: Alig
     """
     if correlation.highest < LEAST_CORRELATION:
         raise DataError(
-            f"recording '{recording.id}': {correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most for "
-            f"delays up to {settings.max_delay:g} s, too little to find one; check units, signs and channels (vehest data check)"
+            f"recording '{recording.id}': {correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most; "
+            f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
         )
     if np.argmax(correlation.value) in (0, len(correlation.value) - 1):
-        raise DataError(
-            f"recording '{recording.id}': sensor and reference correlate best at the end of the {settings.max_delay:g} s that are "
-            f"searched; raise max_delay"
-        )
+        raise DataError(f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay")
 
 
 def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[str], asked: Sequence[str]) -> Fit:
@@ -413,8 +372,7 @@ def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[st
     for _ in range(N_ITERATIONS):
         information = fit.information
         require_condition(model.signals.recording, information, names, asked)
-        gradient = np.einsum("pct,ct,c->p", fit.columns, fit.error, fit.weights) - prior @ fit.point
-        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), fit.gradient)
         moved = fit_at({**fit.values, **dict(zip(names, (fit.point + step).tolist(), strict=True))})
         settled = float(np.abs(step).max()) < SETTLED
         if moved.cost <= fit.cost:
@@ -424,8 +382,8 @@ def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[st
         if settled:
             return fit
     raise DataError(
-        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; ask for fewer quantities, "
-        f"lower the cut-off, or use a drive with more turning, braking and accelerating"
+        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; ask for fewer quantities, lower the "
+        f"cut-off, or use a drive with {MORE_MOTION}"
     )
 
 
@@ -443,20 +401,19 @@ def require_condition(recording: Recording, information: FloatArray, names: Sequ
     if condition <= LARGEST_CONDITION:
         return
     vectors = np.linalg.eigh(information / scale / scale[:, None])[1]
-    confused = [name for name, part in zip(names, np.abs(vectors[:, 0]), strict=True) if part > 0.3]
-    confused = [name for name in confused if name in asked] + sorted({"tilt of the body" for name in confused if name not in asked})
+    confused = [
+        name if name in asked else "tilt of the body" for name, part in zip(names, np.abs(vectors[:, 0]), strict=True) if part > 0.3
+    ]
     raise DataError(
-        f"recording '{recording.id}': this drive cannot tell {listed(confused)} apart (condition number {condition:.2g}, at most "
-        f"{LARGEST_CONDITION:g}); ask for fewer quantities, or use a drive with varying speed and turns both ways"
+        f"recording '{recording.id}': this drive cannot tell {listed(list(dict.fromkeys(confused)))} apart (condition number "
+        f"{condition:.2g}, at most {LARGEST_CONDITION:g}); ask for fewer quantities, or use a drive with varying speed and turns both ways"
     )
 
 
 def condition_of(information: FloatArray) -> float:
     """Condition number of a least-squares problem whose columns are scaled to length 1; infinite where one is zero."""
     scale = np.sqrt(np.diag(information))
-    if not scale.all():
-        return math.inf
-    values = np.linalg.eigvalsh(information / scale / scale[:, None])
+    values = np.linalg.eigvalsh(information / scale / scale[:, None]) if scale.all() else np.zeros(1)
     return math.sqrt(values[-1] / values[0]) if values[0] > 0 else math.inf
 
 
@@ -471,15 +428,13 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
     speed, turning = rms(np.abs(signals.velocity)), rms(signals.gyro)
     ahead, aside = slope * speed_noise, math.hypot(slope * side_noise, level * speed * rate_noise)
     arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
-    own_rate = signals.reference_rate is None
-    return {
+    by_offset = (level * side_noise, level * speed_noise, 0.0) if signals.reference_rate is None else (0.0, 0.0, 0.0)
+    return dict.fromkeys(IMU_PARAMETERS, (0.0, 0.0, 0.0)) | {
         "lever_x": (arm, arm, 0.0),
         "lever_y": (arm, arm, 0.0),
         "yaw": (aside, ahead, 0.0),
         "delay": (bend * speed_noise, bend * side_noise, slope * rate_noise),
-        "offset_ax": (0.0, 0.0, 0.0),
-        "offset_ay": (0.0, 0.0, 0.0),
-        "offset_yaw_rate": (level * side_noise, level * speed_noise, 0.0) if own_rate else (0.0, 0.0, 0.0),
+        "offset_yaw_rate": by_offset,
         "tilt_gain_x": (ahead, 0.0, 0.0),
         "tilt_gain_y": (0.0, aside, 0.0),
         "tilt_lag_x": (bend * speed_noise, 0.0, 0.0),
@@ -495,7 +450,7 @@ def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
 def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise: Mapping[str, tuple[float, float, float]]) -> None:
     """Refuse parameters that would be fitted to the noise of the yaw rate and of the reference rather than to motion.
 
-    What is left of a parameter's column once the other parameters have taken their share must stand well above the noise in it.
+    A parameter's column without the share of the other parameters must stand well above the noise in it.
 
     Raises:
         DataError: it does not.
@@ -505,9 +460,8 @@ def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise:
         share = fit.error.shape[1] * float(fit.weights @ np.square(noise[name][: len(fit.weights)])) / unique[index]
         if share > LARGEST_NOISE_SHARE:
             raise DataError(
-                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of what this drive says "
-                f"about it is noise, at most {100 * LARGEST_NOISE_SHARE:g} % may be; lower the cut-off, or use a drive with more turning, "
-                f"braking and accelerating"
+                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of its effect in this "
+                f"drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %); lower the cut-off, or use a drive with {MORE_MOTION}"
             )
 
 
@@ -525,8 +479,8 @@ def require_length(recording: Recording, usable: float, lost: float) -> None:
     least = FEWEST_BLOCKS * SHORTEST_BLOCK
     if usable < least:
         raise DataError(
-            f"recording '{recording.id}' lasts {recording.duration:.3g} s; an uncertainty needs at least {least + lost:.3g} s "
-            f"({FEWEST_BLOCKS} blocks of {SHORTEST_BLOCK:g} s, and {lost:.2g} s for filtering and shifting)"
+            f"recording '{recording.id}' lasts {recording.duration:.3g} s; an uncertainty needs at least {least + lost:.3g} s, "
+            f"of which {lost:.2g} s for filtering and shifting"
         )
 
 
@@ -538,8 +492,8 @@ def n_blocks(seconds: float) -> int:
 def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     """Covariance of the parameters (P, P), from leaving out one block of time after another.
 
-    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. What a prior
-    holds in place varies as the prior says.
+    Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. Parameters
+    with a prior vary as the prior does.
 
     Source:
         Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
@@ -560,8 +514,8 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
 def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> tuple[FloatArray, FloatArray]:
     """Standard uncertainties of the parameters by scatter and by tilt, (P,) each.
 
-    Tilt is what roll and pitch that the fit does not know would change: of the body, constant, moving, or following the accelerations where
-    that is not fitted, and of the road. How much the road tilts shows in the slow part of what the fit leaves; that it looks like the
+    Tilt is the change by roll and pitch that the fit does not know: of the body, constant, moving, or following the accelerations where
+    that is not fitted, and of the road. The slow part of the residuals shows how much the road tilts; that it looks like the
     effect of a parameter is assumed.
     """
     scatter = np.sqrt(np.diag(scatter_of(fit, blocks)))
@@ -580,19 +534,19 @@ def _uncertainties(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blo
     return scatter, np.sqrt(total)
 
 
-def _suspects(fit: Fit, columns: Mapping[str, FloatArray], tilt: float, blocks: int, rate_hz: float) -> dict[str, tuple[float, float]]:
+def _suspects(
+    fit: Fit, columns: Mapping[str, FloatArray], uncertainties: Callable[[Fit], tuple[FloatArray, FloatArray]]
+) -> dict[str, tuple[float, float]]:
     """Parameters that are no part of the fit and that one more step would move by more than three standard uncertainties."""
     suspects = {}
     for name in [name for name in IMU_PARAMETERS if name not in fit.names]:
         names = [*fit.names, name]
-        prior = np.pad(fit.prior, (0, 1))
-        wider = Fit(names, fit.values, fit.error, np.stack([columns[each] for each in names]), fit.weights, prior)
+        wider = replace(fit, names=names, columns=np.stack([columns[each] for each in names]), prior=np.pad(fit.prior, (0, 1)))
         if condition_of(wider.information) > LARGEST_CONDITION:
             continue
-        step = np.linalg.solve(wider.information, np.einsum("pct,ct,c->p", wider.columns, fit.error, fit.weights) - prior @ wider.point)
-        left = Fit(names, fit.values, fit.error - np.einsum("p,pct->ct", step, wider.columns), wider.columns, fit.weights, prior)
-        scatter, tilted = _uncertainties(left, columns, tilt, blocks, rate_hz)
-        uncertainty = math.hypot(float(scatter[-1]), float(tilted[-1]))
+        step = np.linalg.solve(wider.information, wider.gradient)
+        left = replace(wider, error=fit.error - np.einsum("p,pct->ct", step, wider.columns))
+        uncertainty = math.hypot(*(float(sizes[-1]) for sizes in uncertainties(left)))
         if abs(step[-1]) > SUSPICIOUS * uncertainty:
             suspects[name] = (float(step[-1]), uncertainty)
     return suspects
@@ -605,15 +559,10 @@ def _likened(pull: FloatArray, size: float | FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Smoothing:
-    """Low-passing by a Gaussian kernel, whose derivatives differentiate; of the output as many samples are kept as its band needs.
+    """Low-passing by a Gaussian kernel, whose derivatives differentiate; of the output as many samples are kept as its band needs."""
 
-    Args:
-        deviation: standard deviation of the kernel [samples].
-        rate_hz: sampling rate of the input.
-    """
-
-    deviation: float
-    rate_hz: float
+    deviation: float  # of the kernel [samples]
+    rate_hz: float  # of the input
 
     @property
     def reach(self) -> int:
@@ -681,20 +630,8 @@ def require_complete(recording: Recording, names: Sequence[str], asked: str) -> 
     """
     for name in names:
         if np.isnan(recording[name]).any():
-            raise DataError(
-                f"recording '{recording.id}': channel '{name}' has gaps; {asked} cannot be estimated across them, cut a range without out"
-            )
+            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps; cut a range without them to estimate {asked}")
 
 
 def _deviation(cutoff_hz: float, rate_hz: float) -> float:
     return math.sqrt(math.log(2.0)) / (2.0 * math.pi * cutoff_hz) * rate_hz
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names as in a sentence."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def rms(samples: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(np.square(samples))))

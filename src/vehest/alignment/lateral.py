@@ -13,7 +13,7 @@ from vehest.constants import FloatArray
 
 SIGNALS = ("ay", "turning", "sliding", "arm", "gaining")
 LARGEST_GAIN = 2.5  # of d(vy)/dt beside that of vx·yaw_rate; noise alone shrinks it to 0.6 in sound drives
-LEAST_SLIDING_SHARE = 0.1  # of what vx·yaw_rate leaves of ay, that d(vy)/dt must explain
+LEAST_SLIDING_SHARE = 0.1  # of ay without vx·yaw_rate, that d(vy)/dt must explain
 N_SHIFTS = 6
 SETTLED = 1e-3  # s
 FEWEST_SAMPLES = 10
@@ -34,7 +34,7 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
     next to nothing is left, since turning the phase of a segment does not shift its ends.
 
     Returns:
-        None where a channel is missing, the drive is too short, or d(vy)/dt does not explain what vx·yaw_rate leaves.
+        None where a channel is missing, the drive is too short, or d(vy)/dt does not explain ay without vx·yaw_rate.
     """
     if not motion.velocity or not {"ay", "yaw_rate"} <= set(motion.channels) or len(motion) < FEWEST_SAMPLES:
         return None
@@ -55,12 +55,12 @@ def lateral_lateness(motion: Motion) -> tuple[Measured, Measured, Measured] | No
         first, second = again[0] if again is not None else (math.nan, math.nan)
         return np.array([turning + first, sliding + second, turning + first - sliding - second])
 
-    first, second, difference = jackknife(spectra, lateness)
+    first, second, difference = jackknife(spectra.groups, lateness)
     return first, second, difference
 
 
 def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | None:
-    """Of what is fitted, once yaw rate and ay are shifted onto the clock of the lateral velocity."""
+    """Of the signals, once yaw rate and ay are shifted onto the clock of the lateral velocity."""
     clock = np.arange(len(motion)) / motion.rate_hz
     ay, yaw_rate = motion["ay"], motion["yaw_rate"]
     if turning or sliding:

@@ -18,21 +18,13 @@ WHEELS = ("wheel_speed_fl", "wheel_speed_fr", "wheel_speed_rl", "wheel_speed_rr"
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Complete channels of a drive, and what of the motion is made of them.
+    """Complete channels of a drive, and motion that is made of them."""
 
-    Args:
-        rate_hz: sampling rate.
-        channels: name -> samples without gaps, (T,).
-        speed: the channel that gives the forward velocity: the reference's own before one that wheels slip; empty if there is none.
-        velocity: the channel that gives the lateral velocity; empty if there is none.
-        moving: where the car does not stand, (T,).
-    """
-
-    rate_hz: float
-    channels: dict[str, FloatArray]
-    speed: str
-    velocity: str
-    moving: BoolArray
+    rate_hz: float  # sampling rate
+    channels: dict[str, FloatArray]  # name -> samples without gaps, (T,)
+    speed: str  # channel of the forward velocity: the reference's own before one that wheels slip; empty if there is none
+    velocity: str  # channel of the lateral velocity; empty if there is none
+    moving: BoolArray  # where the car does not stand, (T,)
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -45,7 +37,7 @@ class Motion:
 
     @property
     def steering(self) -> str:
-        """The channel that tells where the driver steers; empty if there is none."""
+        """The channel of the steering angle; empty if there is none."""
         return next((name for name in ("steer", "handwheel") if name in self), "")
 
     @property
@@ -72,7 +64,7 @@ class Motion:
 
     @property
     def forward(self) -> FloatArray:
-        """What ``ax`` must be: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
+        """Expected ``ax``: d(vx)/dt - vy·yaw_rate, the second part where it is known [m/s²], (T,)."""
         gained = self.derivative(self.vx)
         return gained - self.vy * self["yaw_rate"] if self.velocity and "yaw_rate" in self else gained
 
@@ -100,7 +92,7 @@ class Motion:
 
 
 def motion_of(recording: Recording) -> Motion:
-    """What can be compared: channels that are complete, or nearly, and that no wrong unit alone would bring where they are."""
+    """Channels that are complete, or nearly, and not larger than a wrong unit explains."""
     channels = {name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None}
     speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
     velocity = next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""
@@ -118,3 +110,8 @@ def _whole(recording: Recording, name: str) -> FloatArray | None:
         samples = np.interp(places, places[~unknown], samples[~unknown])
     bound = LARGEST_EXCESS * max(abs(described.low), abs(described.high))
     return None if np.abs(samples).max() > bound else samples
+
+
+def rms(samples: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(np.square(samples))))

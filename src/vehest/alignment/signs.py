@@ -1,16 +1,16 @@
-"""Signs and units: which products of channels contradict each other, and which channel that speaks against."""
+"""Signs and units: products of channels that contradict each other, and the channel that is wrong."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import signal
 
-from vehest.alignment.findings import Finding, Level
-from vehest.alignment.motion import Motion
+from vehest.alignment.findings import Finding, Level, listed
+from vehest.alignment.motion import Motion, rms
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import GRAVITY, FloatArray
 
@@ -19,7 +19,7 @@ FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a record
 FEWEST_SAMPLES = 100
 LEAST_SECONDS = 10.0  # of filtered samples
 STEADY_CORRELATION = 0.7
-SIGN_CORRELATION = 0.3  # of what hangs on derivatives
+SIGN_CORRELATION = 0.3  # of relations with derivatives
 SCALE_CORRELATION = 0.8
 SAME_CORRELATION = 0.95  # of one quantity measured twice; a driven wheel that spins is no wrong unit
 LEAST_ACCELERATION = 0.2  # m/s², standard deviation
@@ -33,43 +33,33 @@ DEGREES_PER_RADIAN = 180.0 / np.pi
 TOLERANCE = 1.7  # of a scale; the smallest wrong factor that is known is 3.6
 LONGITUDINAL_TOLERANCE = 3.0  # of ax, which pitch, grade and slip change; its wrong factor is 9.8
 EXACTNESS = 1.25  # within which a wrong factor must explain a scale
+_KILOMETRES = ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h"))
+_STANDARD_GRAVITY = ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g"))
+_DEGREES_A_SECOND = ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s"))
+_DEGREES = ((DEGREES_PER_RADIAN, "deg"), (1.0 / DEGREES_PER_RADIAN, "rad taken for deg"))
 WRONG_FACTORS = {
-    "vx": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
-    "vx_ref": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
-    "vy_ref": ((KILOMETRES_AN_HOUR, "km/h"), (1.0 / KILOMETRES_AN_HOUR, "m/s taken for km/h")),
-    "ax": ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g")),
-    "ay": ((1.0 / GRAVITY, "g"), (GRAVITY, "m/s² taken for g")),
-    "yaw_rate": ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s")),
-    "yaw_rate_ref": ((DEGREES_PER_RADIAN, "deg/s"), (1.0 / DEGREES_PER_RADIAN, "rad/s taken for deg/s")),
-    "sideslip_ref": ((DEGREES_PER_RADIAN, "deg"), (1.0 / DEGREES_PER_RADIAN, "rad taken for deg")),
+    **dict.fromkeys(("vx", "vx_ref", "vy_ref"), _KILOMETRES),
+    **dict.fromkeys(("ax", "ay"), _STANDARD_GRAVITY),
+    **dict.fromkeys(("yaw_rate", "yaw_rate_ref"), _DEGREES_A_SECOND),
+    "sideslip_ref": _DEGREES,
 }
+"""Channel -> factor and unit of each mistake."""
 UNSAFE = {"yaw_rate": "deg/s", "sideslip_ref": "deg"}
 """Units that stop an ingest: no estimator survives them."""
 
 
 @dataclass(frozen=True)
 class Relation:
-    """Two quantities that must be equal, or at least of one sign.
+    """Two quantities that must be equal, or at least of one sign."""
 
-    Args:
-        left: what is compared, as in a sentence.
-        right: what it must be.
-        channels: those of the two that a fault may sit in, the likeliest first.
-        powers: of each channel in left over right, 1 or -1.
-        scale: left over right.
-        correlation: between them.
-        tolerance: factor within which they must be equal; infinite where only the sign counts.
-        least_correlation: below which the scale says nothing.
-    """
-
-    left: str
-    right: str
-    channels: tuple[str, ...]
-    powers: tuple[int, ...]
-    scale: float
+    left: str  # quantity, as in a sentence
+    right: str  # quantity that it must be
+    channels: tuple[str, ...]  # in which a fault may be, the likeliest first
+    powers: tuple[int, ...]  # of each channel in left over right, 1 or -1
+    scale: float  # left over right
     correlation: float
-    tolerance: float = TOLERANCE
-    least_correlation: float = SCALE_CORRELATION
+    tolerance: float = TOLERANCE  # factor within which they must be equal; infinite where only the sign counts
+    least_correlation: float = SCALE_CORRELATION  # below which the scale is unknown
 
     @property
     def text(self) -> str:
@@ -81,130 +71,113 @@ class Relation:
         return abs(self.correlation) < self.least_correlation or 1.0 / self.tolerance < abs(scale) < self.tolerance
 
     def without(self, channel: str, factor: float) -> float:
-        """What left over right would be were a channel not that factor too large."""
+        """Left over right, were a channel not that factor too large."""
         power = dict(zip(self.channels, self.powers, strict=True)).get(channel, 0)
         return float(self.scale / factor**power)
 
 
 def relations_of(motion: Motion) -> list[Relation]:
     """All relations between the channels that the drive shows clearly."""
-    found: list[Relation] = []
-    band = _band(motion)
-    if motion.speed and "yaw_rate" in motion and "ay" in motion:
-        found += _lateral(motion, band)
-    if motion.speed and "yaw_rate" in motion and motion.steering:
-        found += _steered(motion)
-    if motion.speed and "ax" in motion and band is not None:
-        found += _longitudinal(motion, band)
-    for name in ("yaw_rate", "vx"):
-        reference = f"{name}_ref"
-        if name in motion and reference in motion:
-            found += _direct(motion.moving, motion[name], motion[reference], name, reference, (name, reference), (1, -1))
-    if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
-        expected = np.arctan2(motion.vy, motion.vx)
-        forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
-        if np.count_nonzero(forwards) >= FEWEST_SAMPLES and np.std(expected[forwards]) >= LEAST_SIDESLIP:
-            names = ("sideslip_ref", "vy_ref", motion.speed)
-            right = f"atan2(vy_ref, {motion.speed})"
-            found += _direct(forwards, motion["sideslip_ref"], expected, "sideslip_ref", right, names, (1, -1, 1))
-    return [relation for relation in found if np.isfinite(relation.scale) and np.isfinite(relation.correlation) and relation.scale != 0.0]
+    found = [one for of in (_lateral, _steered, _longitudinal, _repeated) for one in of(motion)]
+    return [one for one in found if np.isfinite(one.scale) and np.isfinite(one.correlation) and one.scale != 0.0]
 
 
-def _lateral(motion: Motion, band: _Band | None) -> list[Relation]:
-    """ay against vx·yaw_rate as it is, and d(vy)/dt against what remains of both without vx·yaw_rate and its derivative.
+def _lateral(motion: Motion) -> Iterator[Relation]:
+    """ay against vx·yaw_rate as it is, and d(vy)/dt against ay - vx·yaw_rate, both without vx·yaw_rate and its derivative.
 
     The derivative is there for a yaw rate that is late or low-passed, which would otherwise pass for one of the other sign.
     """
-    moving = motion.moving
-    measured, turning = motion["ay"], motion.turning
-    product = f"{motion.speed}·yaw_rate"
+    if not (motion.speed and "yaw_rate" in motion and "ay" in motion):
+        return
+    moving, measured, turning = motion.moving, motion["ay"], motion.turning
     if np.count_nonzero(moving) < FEWEST_SAMPLES or measured.std() < LEAST_ACCELERATION:
-        return []
-    found = []
-    steady = _compared(measured[moving] - measured[moving].mean(), turning[moving] - turning[moving].mean())
-    if steady is not None and abs(steady[1]) >= STEADY_CORRELATION:
-        found.append(Relation("ay", product, ("ay", "yaw_rate", motion.speed), (1, -1, -1), *steady))
+        return
+    product = f"{motion.speed}·yaw_rate"
+    steady = (samples[moving] - samples[moving].mean() for samples in (measured, turning))
+    yield from _related("ay", product, ("ay", "yaw_rate", motion.speed), (1, -1, -1), *steady)
+    band = kinematic_band(motion)
     if not motion.velocity or band is None:
-        return found
+        return
     a, p, d, steep = (band(samples) for samples in (measured, turning, motion.sliding, motion.derivative(turning)))
     if d.std() < LEAST_SLIDING or p.std() == 0.0:
-        return found
-    left, right = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
-    partial = _compared(right, left)
-    if partial is not None and abs(partial[1]) >= SIGN_CORRELATION:
-        powers = (1, -1, 1) if motion.velocity == "sideslip_ref" else (1, -1)
-        channels = (motion.velocity, "ay", motion.speed)[: len(powers)]
-        found.append(Relation(f"d({motion.velocity})/dt", f"ay - {product}", channels, powers, *partial))
-    return found
+        return
+    right, left = _without(np.stack([p, steep / motion.rate_hz], axis=1), a, d)
+    known = 2 if motion.velocity == "vy_ref" else 3  # a velocity does not hang on the speed
+    channels, powers = (motion.velocity, "ay", motion.speed)[:known], (1, -1, 1)[:known]
+    yield from _related(f"d({motion.velocity})/dt", f"ay - {product}", channels, powers, left, right, SIGN_CORRELATION)
 
 
-def _steered(motion: Motion) -> list[Relation]:
+def _steered(motion: Motion) -> Iterator[Relation]:
     """Steering against yaw rate: of one sign while the car does not drift."""
+    if not (motion.speed and "yaw_rate" in motion and motion.steering):
+        return
     rolling = motion.moving.copy()
     if motion.velocity:
         rolling &= np.abs(motion.vy) < DRIFTING * np.abs(motion.vx)
-    if np.count_nonzero(rolling) < max(STEERED_SECONDS * motion.rate_hz, FEWEST_SAMPLES):
-        return []
-    steering = motion.vx * motion[motion.steering]
-    left, right = steering[rolling], motion["yaw_rate"][rolling]
-    compared = _compared(left - left.mean(), right - right.mean())
-    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
-        return []
-    names = (motion.steering, "yaw_rate", motion.speed)
-    return [Relation(motion.steering, "yaw_rate", names, (1, -1, 1), *compared, tolerance=np.inf)]
+    if np.count_nonzero(rolling) >= max(STEERED_SECONDS * motion.rate_hz, FEWEST_SAMPLES):
+        names = (motion.steering, "yaw_rate", motion.speed)
+        steady = (samples[rolling] - samples[rolling].mean() for samples in (motion.vx * motion[motion.steering], motion["yaw_rate"]))
+        yield from _related(motion.steering, "yaw_rate", names, (1, -1, 1), *steady, tolerance=np.inf)
 
 
-def _longitudinal(motion: Motion, band: _Band) -> list[Relation]:
+def _longitudinal(motion: Motion) -> Iterator[Relation]:
     """ax against d(vx)/dt, both without vy·yaw_rate, whose sign and unit may be wrong as well."""
+    band = kinematic_band(motion) if motion.speed and "ax" in motion else None
+    if band is None:
+        return
     left, right = band(motion["ax"]), band(motion.derivative(motion.vx))
     if motion.velocity and "yaw_rate" in motion:
         left, right = _without(np.stack([band(motion.vy * motion["yaw_rate"])], axis=1), left, right)
-    compared = _compared(left, right)
-    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
-        return []
-    return [Relation("ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1), *compared, tolerance=LONGITUDINAL_TOLERANCE)]
+    yield from _related("ax", f"d({motion.speed})/dt", ("ax", motion.speed), (1, -1), left, right, tolerance=LONGITUDINAL_TOLERANCE)
+
+
+def _repeated(motion: Motion) -> Iterator[Relation]:
+    """Quantities that are measured twice."""
+    for name in ("yaw_rate", "vx"):
+        reference, moving = f"{name}_ref", motion.moving
+        if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
+            pair = (name, reference)
+            yield from _related(*pair, pair, (1, -1), motion[name][moving], motion[reference][moving], least_correlation=SAME_CORRELATION)
+    if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
+        forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
+        shown, expected = motion["sideslip_ref"][forwards], np.arctan2(motion.vy, motion.vx)[forwards]
+        if len(expected) >= FEWEST_SAMPLES and np.std(expected) >= LEAST_SIDESLIP:
+            names = ("sideslip_ref", "vy_ref", motion.speed)
+            right = f"atan2(vy_ref, {motion.speed})"
+            yield from _related("sideslip_ref", right, names, (1, -1, 1), shown, expected, least_correlation=SAME_CORRELATION)
+
+
+def _related(
+    left: str,
+    right: str,
+    channels: tuple[str, ...],
+    powers: tuple[int, ...],
+    shown: FloatArray,
+    expected: FloatArray,
+    least: float = STEADY_CORRELATION,
+    **limits: float,
+) -> Iterator[Relation]:
+    """The relation of two signals, about nil, whose correlation is ``least`` at least."""
+    sizes = rms(shown), rms(expected)
+    if 0.0 < min(sizes) <= max(sizes) < np.inf:
+        correlation = float(np.mean(shown / sizes[0] * (expected / sizes[1])))
+        if abs(correlation) >= least:
+            yield Relation(left, right, channels, powers, float(np.copysign(sizes[0] / sizes[1], correlation)), correlation, **limits)
 
 
 def _without(columns: FloatArray, *signals: FloatArray) -> list[FloatArray]:
-    """What columns (T, C) do not explain of signals (T,)."""
+    """Signals (T,) without the part that columns (T, C) explain."""
     basis, _ = np.linalg.qr(columns)
     return [samples - basis @ (basis.T @ samples) for samples in signals]
 
 
-def _direct(
-    used: BoolArray, left: FloatArray, right: FloatArray, name: str, other: str, channels: tuple[str, ...], powers: tuple[int, ...]
-) -> list[Relation]:
-    if np.count_nonzero(used) < FEWEST_SAMPLES:
-        return []
-    compared = _compared(left[used], right[used])
-    if compared is None or abs(compared[1]) < STEADY_CORRELATION:
-        return []
-    return [Relation(name, other, channels, powers, *compared, least_correlation=SAME_CORRELATION)]
-
-
-def _compared(left: FloatArray, right: FloatArray) -> tuple[float, float] | None:
-    """Ratio of the sizes of two signals with their sign, and their correlation about nil."""
-    sizes = float(np.sqrt(np.mean(np.square(left)))), float(np.sqrt(np.mean(np.square(right))))
-    if not 0.0 < min(sizes) <= max(sizes) < np.inf:
-        return None
-    correlation = float(np.mean(left / sizes[0] * (right / sizes[1])))
-    return float(np.copysign(sizes[0] / sizes[1], correlation)), correlation
-
-
-_Band = Callable[[FloatArray], FloatArray]
-
-
-def _band(motion: Motion) -> _Band | None:
+def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
     """The band-pass of all comparisons with a derivative, which keeps moving samples away from the ends; None for a short drive."""
     settled = settled_samples(motion)
     if settled is None:
         return None
     design = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=motion.rate_hz, output="sos")
-
-    def band(samples: FloatArray) -> FloatArray:
-        return np.asarray(signal.sosfiltfilt(design, samples)[settled], dtype=np.float64)
-
-    return band
+    return lambda samples: np.asarray(signal.sosfiltfilt(design, samples)[settled], dtype=np.float64)
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:
@@ -233,28 +206,33 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
     for number in range(1, MOST_TURNED + 1):
         for turned in itertools.combinations(suspects, number):
             if all((len(set(turned) & set(relation.channels)) % 2 == 1) == (relation.correlation < 0.0) for relation in relations):
-                explaining.append((number - ({"vy_ref", "sideslip_ref"} <= set(turned)), turned))
+                explaining.append((_number(turned), turned))
     explaining.sort()
     return [turned for cost, turned in explaining if cost <= explaining[0][0] + 1]
 
 
-def sign_findings(relations: Sequence[Relation], motion: Motion) -> list[Finding]:
-    """What contradicts what, and the channel that points the other way where steering or heading decides."""
+def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]) -> list[Finding]:
+    """Contradictions in sign, and the channel that points the other way where steering or heading decides.
+
+    Args:
+        relations: between the channels.
+        motion: of the drive.
+        explanations: `turned_channels` of both.
+    """
     against = [relation for relation in relations if relation.correlation < 0.0]
     if not against:
         return []
     agreeing = [relation.text for relation in relations if relation.correlation > 0.0]
     figures = ", ".join(f"{relation.text} disagree in sign (correlation {relation.correlation:.2f})" for relation in against)
-    evidence = figures + (f"; {_listed(agreeing)} agree" if agreeing else "")
-    explanations = turned_channels(relations, motion)
+    evidence = figures + (f"; {listed(agreeing)} agree" if agreeing else "")
     if not explanations:
         return [Finding("warning", "sign", "", f"{evidence}: no few channels explain it; check the signs of all")]
-    if (motion.speed,) in explanations:  # only suspected where it is negative, and the check reverse tells of it
+    if (motion.speed,) in explanations:  # only suspected where it is negative, where the check reverse warns
         return []
     best, others = explanations[0], explanations[1:]
     if _decided(relations, explanations):
         alternative = f", unless {' or '.join(_together(names) for names in others)} do" if others else ""
-        advice = f"{_listed(best)} {'points' if len(best) == 1 else 'point'} the other way{alternative}; set sign: -1 for it"
+        advice = f"{listed(best)} {'points' if len(best) == 1 else 'point'} the other way{alternative}; set sign: -1 for it"
         return [Finding("warning", "sign", name, f"{evidence}: {advice}") for name in best]
     either = " or ".join(_together(names) for names in explanations)
     advice = f"either {either} point the other way, which a steering angle or yaw_rate_ref would decide; set sign: -1 for it"
@@ -262,12 +240,15 @@ def sign_findings(relations: Sequence[Relation], motion: Motion) -> list[Finding
 
 
 def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ...]]) -> bool:
-    """One explanation is the smallest, and the next needs two more channels, or steering or heading was asked."""
-    sizes = [len(names) - ({"vy_ref", "sideslip_ref"} <= set(names)) for names in explanations]
-    if len(sizes) == 1:
-        return True
+    """One explanation is the smallest, or the only one, and steering or heading was asked."""
+    smallest, *others = (_number(names) for names in explanations)
     heading = any(set(relation.channels) & {"steer", "handwheel", "yaw_rate_ref"} for relation in relations)
-    return sizes[1] > sizes[0] and heading
+    return not others or (others[0] > smallest and heading)
+
+
+def _number(names: Sequence[str]) -> int:
+    """Number of channels, those of one sensor counted once."""
+    return len(names) - ({"vy_ref", "sideslip_ref"} <= set(names))
 
 
 # --- units -------------------------------------------------------------------------------------------------------------------------
@@ -275,24 +256,19 @@ def _decided(relations: Sequence[Relation], explanations: Sequence[tuple[str, ..
 
 @dataclass(frozen=True)
 class WrongUnit:
-    """A factor by which channels disagree.
+    """A factor by which channels disagree."""
 
-    Args:
-        relations: that are wrong by it.
-        explanations: channel, factor and unit that would explain it equally well; empty if nothing that is known does.
-    """
-
-    relations: tuple[Relation, ...]
-    explanations: tuple[tuple[str, float, str], ...]
+    relations: tuple[Relation, ...]  # that are wrong by it
+    explanations: tuple[tuple[str, float, str], ...]  # channel, factor and unit that explain it equally well; empty if none does
 
     @property
     def factors(self) -> dict[str, float]:
-        """What puts the first explanation right."""
+        """Factors that put the first explanation right."""
         return {name: 1.0 / factor for name, factor, _ in self.explanations[:1]}
 
     @property
     def finding(self) -> Finding:
-        """What to say of it."""
+        """For people."""
         figures = ", ".join(
             f"{relation.left} is {relation.scale:.3g} times as large as {relation.right} (correlation {relation.correlation:.2f})"
             for relation in self.relations
@@ -305,7 +281,7 @@ class WrongUnit:
             either = " or ".join(f"{name} is in {unit}" for name, _, unit in self.explanations)
             return Finding("warning", "unit", self.explanations[0][0], f"{figures}: either {either}; set the unit")
         names = list(dict.fromkeys(name for relation in self.relations for name in relation.channels))
-        return Finding("warning", "unit", names[0], f"{figures}, about 1 is expected: check the units of {_listed(names)}")
+        return Finding("warning", "unit", names[0], f"{figures}, about 1 is expected: check the units of {listed(names)}")
 
 
 def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
@@ -327,9 +303,5 @@ def wrong_unit(relations: Sequence[Relation]) -> WrongUnit | None:
     return WrongUnit(tuple(explained[best[0]]), best)
 
 
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
 def _together(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{_listed(names)} together"
+    return names[0] if len(names) == 1 else f"{listed(names)} together"

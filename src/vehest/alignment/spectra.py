@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ MOST_GROUPS = 12
 SMOOTHED_BINS = 5
 LARGEST_COHERENCE = 0.99
 LEAST_POWER = 1e-6  # of the strongest bin; below a window leaks more than that
-LEAST_COHERENCE = 0.25  # mean over the band; below nothing is said of a lag
+LEAST_COHERENCE = 0.25  # mean over the band; below, a lag is unknown
 LARGEST_LAG = 0.5  # s
 LONGEST_TIME_CONSTANT = 10.0  # s
 N_STEPS = 25
@@ -38,17 +39,11 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True, eq=False)
 class CrossSpectra:
-    """Cross-spectra of N signals in F bins of the band, in G groups of segments that follow one another.
+    """Cross-spectra of N signals in F bins of the band, in G groups of segments that follow one another."""
 
-    Args:
-        names: of the signals.
-        frequency: of the bins [Hz], (F,).
-        groups: sums of conj(X_i)·X_j over the segments of a group, (G, F, N, N).
-    """
-
-    names: tuple[str, ...]
-    frequency: FloatArray
-    groups: ComplexArray
+    names: tuple[str, ...]  # of the signals
+    frequency: FloatArray  # of the bins [Hz], (F,)
+    groups: ComplexArray  # sums of conj(X_i)·X_j over the segments of a group, (G, F, N, N)
 
     @property
     def omega(self) -> FloatArray:
@@ -139,20 +134,18 @@ class Measured:
         return Measured(self.value, math.hypot(self.half_width, student(math.inf) * deviation))
 
 
-def jackknife(spectra: CrossSpectra, fit: Callable[[ComplexArray], FloatArray]) -> list[Measured]:
-    """Values of a fit, with intervals from leaving out one group of segments after another (Student's).
+def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
+    """Values of a fit, with intervals from leaving out one group after another (Student's).
 
     Args:
-        spectra: of G groups.
-        fit: of cross-spectra (F, N, N) to P values.
+        groups: sums over G groups, (G, ...).
+        fit: of a sum of groups to P values.
     """
-    whole = spectra.whole
-    values = fit(whole)
-    number = len(spectra.groups)
-    left_out = np.stack([fit(whole - group) for group in spectra.groups])
+    whole, number = groups.sum(axis=0), len(groups)
+    left_out = np.stack([fit(whole - group) for group in groups])
     spread = np.sqrt((number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0))
     factor = student(number - 1)
-    return [Measured(value, factor * width) for value, width in zip(values.tolist(), spread.tolist(), strict=True)]
+    return [Measured(value, factor * width) for value, width in zip(fit(whole).tolist(), spread.tolist(), strict=True)]
 
 
 def student(freedom: float) -> float:
@@ -162,21 +155,12 @@ def student(freedom: float) -> float:
 
 @dataclass(frozen=True)
 class Lag:
-    """How one signal follows another: a delay and a first-order low-pass, of which either may be held at nil.
+    """How one signal follows another: a delay and a first-order low-pass, of which either may be held at zero."""
 
-    Args:
-        delay: [s].
-        time_constant: [s].
-        together: their sum, which is the delay of slow motion [s].
-        fit: how well the phase is explained, 1 if wholly.
-        coherence: mean over the band.
-    """
-
-    delay: Measured
-    time_constant: Measured
-    together: Measured
-    fit: float
-    coherence: float
+    delay: Measured  # [s]
+    time_constant: Measured  # [s]
+    together: Measured  # their sum, which is the delay of slow motion [s]
+    fit: float  # share of the phase that is explained
 
 
 def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool) -> Lag | None:
@@ -187,8 +171,8 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
 
     Args:
         spectra: of both signals.
-        source: what is followed.
-        follower: what may be late.
+        source: signal that is followed.
+        follower: signal that may be late.
         low_pass: whether T is fitted too.
 
     Returns:
@@ -214,10 +198,10 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
         delay, time_constant = _refined(weight * cross_spectra[:, x, y], omega, start, low_pass=low_pass)
         return np.array([delay, time_constant, delay + time_constant])
 
-    delay, time_constant, together = jackknife(spectra, fitted)
+    delay, time_constant, together = jackknife(spectra.groups, fitted)
     phase = omega * delay.value + np.arctan(omega * time_constant.value)
     explained = np.sum(weight * (whole[:, x, y] * np.exp(1j * phase)).real) / np.sum(weight * np.abs(whole[:, x, y]))
-    return Lag(delay, time_constant, together, float(explained), float(coherence.mean()))
+    return Lag(delay, time_constant, together, float(explained))
 
 
 def smoothed(values: FloatArray) -> FloatArray:

@@ -1,14 +1,13 @@
-"""Where the car stands, and where samples stay the same."""
+"""Where the car stands."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
+from vehest.data.runs import equal_runs
 
 BoolArray = NDArray[np.bool_]
 
@@ -23,7 +22,8 @@ def standstill(recording: Recording) -> BoolArray:
     if "vx" not in recording:
         return standing
     slow = np.abs(recording["vx"]) < STANDSTILL_SPEED
-    starts, lengths = long_runs(slow, at_least=1)
+    starts, ends = equal_runs(slow).T
+    lengths = ends - starts
     still = slow[starts]
     if "yaw_rate" in recording:
         still &= ~(np.fmax.reduceat(np.abs(recording["yaw_rate"]), starts) > STANDSTILL_YAW_RATE)
@@ -33,15 +33,8 @@ def standstill(recording: Recording) -> BoolArray:
     return np.repeat(still, lengths)
 
 
-def long_runs(samples: NDArray[Any], at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Starts and lengths of the runs of equal values that are long enough."""
-    edges = np.flatnonzero(np.concatenate([[True], samples[1:] != samples[:-1], [True]])) if len(samples) else np.zeros(1, dtype=np.int64)
-    lengths = np.diff(edges)
-    return edges[:-1][lengths >= at_least], lengths[lengths >= at_least]
-
-
 def _spreads(samples: FloatArray, starts: NDArray[np.int64], lengths: NDArray[np.int64]) -> FloatArray:
-    """Standard deviation of what is known of the samples, for each of the stretches that they consist of; 0 where nothing is."""
+    """Standard deviation of the known samples of each run; 0 where none is known."""
     known = np.isfinite(samples)
     number = np.maximum(np.add.reduceat(known.astype(np.int64), starts), 1)
     mean = np.add.reduceat(np.where(known, samples, 0.0), starts) / number

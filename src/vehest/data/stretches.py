@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vehest.data.recording import Recording
+from vehest.data.runs import true_runs
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,6 @@ def stretches_where(recording: Recording, condition: Condition, first: int = 0, 
     for channel, (low, high) in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])
         holds &= (size >= low) & (size <= high)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8))).reshape(-1, 2) + first
+    edges = true_runs(holds) + first
     shortest = max(math.ceil(condition.at_least_seconds * recording.rate_hz - 1e-9), 1)
     return [(begin, after) for begin, after in edges.tolist() if after - begin >= shortest]

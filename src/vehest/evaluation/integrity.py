@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from vehest.constants import FloatArray
+from vehest.data.runs import true_runs
 
 ALERT_LIMIT = 2.0  # deg of sideslip
 CONFIDENCE = 0.95
@@ -121,7 +122,7 @@ def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) 
 
     Source of the interval: Garwood, Fiducial limits for the Poisson distribution, Biometrika 28 (3/4), 1936.
     """
-    alarms = sum(int(np.count_nonzero(np.diff(np.concatenate([[0], np.asarray(drive, np.int8)])) == 1)) for drive in flagged)
+    alarms = sum(len(true_runs(drive)) for drive in flagged)
     hours = sum(len(drive) for drive in flagged) / rate_hz / 3600.0
     if hours == 0.0:
         return AlarmRate(0, 0.0, math.nan, 0.0, math.inf)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.runs import true_runs
 from vehest.report.style import Line, on_dark
 
 LEVELS = 65_534
@@ -164,8 +165,7 @@ def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: 
     """
     x, y = np.full(len(vx), np.nan), np.full(len(vx), np.nan)
     known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
-    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0))
-    for first, end in zip(edges[::2], edges[1::2], strict=True):
+    for first, end in true_runs(known).tolist():
         own = slice(first, end)
         heading = _integral(yaw_rate[own], step)
         x[own] = _integral(vx[own] * np.cos(heading) - vy[own] * np.sin(heading), step)

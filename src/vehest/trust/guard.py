@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
+from vehest.data.runs import true_runs
 from vehest.estimators.kernels.compiling import entry
 
 BRIDGED_SECONDS = 0.5  # gaps up to here are bridged
@@ -142,8 +143,7 @@ def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, f
 
 def longest_run(flags: NDArray[np.bool_]) -> int:
     """Longest run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
+    return int(np.diff(true_runs(flags)).max(initial=0))
 
 
 def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
+from vehest.data.runs import true_runs
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import (
@@ -212,8 +213,8 @@ def _of_the_poles(model: LpvModel) -> str:
 
 def _ranges(values: FloatArray, chosen: NDArray[np.bool_]) -> str:
     """Runs of chosen values in words."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8))).reshape(-1, 2)
-    return listed([f"{fixed(float(values[first]), 2)} to {fixed(float(values[after - 1]), 2)}" for first, after in edges.tolist()])
+    runs = true_runs(chosen).tolist()
+    return listed([f"{fixed(float(values[first]), 2)} to {fixed(float(values[after - 1]), 2)}" for first, after in runs])
 
 
 def steady_third(model: LpvModel, yaw_rate: float, speed: float) -> float:

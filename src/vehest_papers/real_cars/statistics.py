@@ -10,6 +10,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
+from vehest.data.runs import true_runs
 from vehest.data.splits import Span
 from vehest.data.transforms import Resample
 from vehest.evaluation.floors import INPUTS, Drive, cramer_rao_floor, drive_of, reference_floor
@@ -136,10 +137,9 @@ def _driven(recording: Recording) -> list[Recording]:
     moving = speed > DRIVEN * float(np.nanquantile(speed, 0.99)) if np.isfinite(speed).any() else np.zeros(len(slow), dtype=bool)
     for name in ("vx", "ay", "yaw_rate", "vy_ref"):
         moving &= np.isfinite(slow[name]) if name in slow else True
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], moving, [False]]).astype(np.int8))).reshape(-1, 2)
     return [
         slow.cut(slow.start_time + (first - 0.5) / slow.rate_hz, slow.start_time + (end - 0.5) / slow.rate_hz)
-        for first, end in edges.tolist()
+        for first, end in true_runs(moving).tolist()
         if end - first >= SHORTEST_PIECE * slow.rate_hz
     ]
 

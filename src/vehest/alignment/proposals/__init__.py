@@ -1,1 +1,1 @@
-"""Which column of a log is which channel, in which unit and sign: what is proposed, what speaks for it, and what has to be asked."""
+"""Proposals of channels, units and signs for the columns of a log, with evidence and open questions."""

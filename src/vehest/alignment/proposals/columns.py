@@ -1,16 +1,17 @@
-"""Columns of a log on one even clock, as slow as evidence needs them."""
+"""Columns of a log on one even clock, with low-passed copies for comparisons."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from vehest.alignment.proposals.names import LATITUDE, LONGITUDE, POSITION_X, POSITION_Y, hints, is_filtered, is_reference
+from vehest.alignment.proposals.names import hints
 from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
 from vehest.data.units import factor_to_si
 
@@ -23,58 +24,59 @@ MOST_STRAY = 0.002
 LONG = 1000  # samples
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
-_POSITIONS = {LATITUDE, LONGITUDE, POSITION_X, POSITION_Y}
+POSITIONS = {"latitude", "longitude", "position_x", "position_y"}
+UNITS = {  # where the header is silent, the likeliest first
+    "vx": ("m/s", "km/h", "mph", "knots"),
+    "yaw_rate": ("rad/s", "deg/s"),
+    "ay": ("m/s²", "g"),
+    "ax": ("m/s²", "g"),
+    "handwheel": ("deg", "rad"),
+    "steer": ("rad", "deg"),
+    "vy_ref": ("m/s", "km/h"),
+    "sideslip_ref": ("rad", "deg"),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A column that may be a channel.
+    """A column that may be a channel."""
 
-    Args:
-        name: in its log.
-        unit: by the header, as vehest spells it; empty where it does not say.
-        values: in the file's unit, without gaps, (T,).
-        slow: low-passed, at `KEPT_HZ` or less, (S,).
-        missing: share of the samples that were not there.
-        hints: role -> how strongly the name speaks for it.
-    """
-
-    name: str
-    unit: str
-    values: FloatArray
-    slow: FloatArray
-    missing: float = 0.0
-    hints: dict[str, float] = field(default_factory=dict)
+    name: str  # in its log
+    unit: str  # by the header, as vehest spells it; empty where unknown
+    values: FloatArray  # in the file's unit, without gaps, (T,)
+    slow: FloatArray  # low-passed, at `KEPT_HZ` or less, (S,)
+    hints: Mapping[str, float]  # role -> strength with which the name suggests it
+    gappy: bool = False  # whether samples were missing
+    is_made: bool = False  # whether it is the mean of wheels, and no column of the log
 
     @property
-    def is_reference(self) -> bool:
-        """Whether its name tells of a reference sensor."""
-        return is_reference(self.name)
-
-    @property
-    def is_filtered(self) -> bool:
-        """Whether its name tells of a filter."""
-        return is_filtered(self.name)
+    def is_wheel(self) -> bool:
+        """Whether its name suggests the speed of a wheel."""
+        return any(role.startswith("wheel_speed") for role in self.hints)
 
     def hint(self, role: str) -> float:
-        """How strongly the name speaks for a role; negative where it speaks strongly for others only."""
-        if role in self.hints:
-            return self.hints[role]
-        return -max(self.hints.values(), default=0.0)
+        """Strength with which the name suggests a role; negative where it suggests others only."""
+        return self.hints.get(role, -max(self.hints.values(), default=0.0))
 
-    def measures(self, si_unit: str) -> bool:
-        """Whether the header's unit, if there is one, is of a quantity."""
-        if not self.unit:
-            return True
+    def units(self, channel: str) -> Sequence[str]:
+        """The header's unit, or those to try for a channel."""
+        return [self.unit] if self.unit else UNITS[channel]
+
+    def measures(self, channel: str) -> bool:
+        """Whether the header's unit, if there is one, is of a channel's quantity."""
         try:
-            factor_to_si(self.unit, si_unit)
+            return not self.unit or si_factor(self.unit, channel) > 0.0
         except DataError:
             return False
-        return True
+
+
+def si_factor(unit: str, channel: str) -> float:
+    """Factor from a unit to that of a channel."""
+    return factor_to_si(unit, CHANNELS[channel].unit)
 
 
 def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -> list[Candidate]:
-    """Columns that change and are mostly there.
+    """Columns that change, are mostly there, and are neither clocks nor distances.
 
     Args:
         columns: name, unit as vehest spells it (empty where unknown), values on an even clock, (T,) each.
@@ -83,16 +85,15 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -
     found = []
     for name, unit, values in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)
-        missing = float(1.0 - known.mean())
-        if missing > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
+        if 1.0 - known.mean() > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
-        if (
-            len(values) > LONG and not _POSITIONS & set(hints(name)) and np.min(np.diff(values[known])) >= 0.0
-        ):  # a clock, a distance: it only grows
+        only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
+        if only_grows and not POSITIONS & set(hints(name)):
             continue
+        gappy = not known.all()
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), missing, dict(hints(name))))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), gappy))
     return found
 
 
@@ -117,3 +118,8 @@ def correlation(left: FloatArray, right: FloatArray) -> float:
     a, b = left - left.mean(), right - right.mean()
     size = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / size if size > 0.0 else 0.0
+
+
+def largest(samples: FloatArray) -> float:
+    """99th percentile of the magnitude."""
+    return float(np.quantile(np.abs(samples), 0.99))

@@ -1,4 +1,7 @@
-"""What a column's name says of it: English and German, in full and as loggers shorten them. A name is a hint and decides little alone."""
+"""Roles that a column's name suggests: English and German, in full and as loggers shorten them. A name is a hint and decides little alone.
+
+They are names of channels, and ``heading``, ``latitude``, ``longitude``, ``position_x``, ``position_y`` and ``other``.
+"""
 
 from __future__ import annotations
 
@@ -7,53 +10,47 @@ from functools import cache
 
 STRONG, WEAK = 4.0, 2.0
 
-SPEED, YAW_RATE, AY, AX, STEER, HANDWHEEL = "speed", "yaw_rate", "ay", "ax", "steer", "handwheel"
-LATERAL_VELOCITY, SIDESLIP, HEADING, LATITUDE, LONGITUDE, POSITION_X, POSITION_Y, OTHER = (
-    *("lateral_velocity", "sideslip", "heading", "latitude", "longitude", "position_x", "position_y"),
-    "other",
-)
-
 _STRONG = {  # over the name without blanks
-    OTHER: r"temp|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
+    "other": r"temp|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
     r"motordreh|^drehzahl|^rpm$|^nmot|wind|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
-    YAW_RATE: r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
+    "yaw_rate": r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    AY: r"latacc|latac|latera?lac|acclat|acc(el|eleration)?y|querb|querac|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
+    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
     r"linearaccelerationy|yacc|glat|^gy$|quera|accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|"
     r"ayvehicle",
-    AX: r"longacc|longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
+    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
     r"along$|^along|algt|linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|"
     r"longg$|lonacc|acclon|gforcelon|axvehicle",
-    HANDWHEEL: r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|steerwheel|handwheel|handlenk|sas(ang)|stwhl|"
+    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
     r"volant",
-    STEER: r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenkw|lenkung|lenk|whlang|servo",
-    LATERAL_VELOCITY: r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
+    "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
+    "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
-    SIDESLIP: r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
-    HEADING: r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
-    LATITUDE: r"latitude|gpslat$|^lat$|breitengrad",
-    LONGITUDE: r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
-    POSITION_X: r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
-    POSITION_Y: r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
-    SPEED: r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
+    "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
+    "heading": r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
+    "latitude": r"latitude|gpslat$|^lat$|breitengrad",
+    "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
+    "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
+    "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
+    "vx": r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
     r"velx|vlaengs|longitudinalvel|lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
-    "roll_rate": r"rollrate|rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
+    "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
     "pitch": r"^pitch|pitchang|nickwinkel|^nick",
     "motor_current": r"^iq$|motorcurr|strommotor|^current$|avgiq",
 }
 _WEAK = {
-    YAW_RATE: r"gyro|gier|^r$|^w$|^omega$|yaw|wimu",
-    AY: r"quer$|^quer|lateral|^lat",
-    AX: r"laengs|langs|^longitudinal",
-    STEER: r"^cmd$|^str$|steering",
-    SPEED: r"^v$|^u$|spd|^vel|v$|wheelv|vwheel|omegawheels|^gs$|^sog$",
-    LATERAL_VELOCITY: r"^v$|v$|quer",
-    SIDESLIP: r"slip",
-    HEADING: r"yaw|^phi$|head|^theta$",
+    "yaw_rate": r"gyro|gier|^r$|^w$|^omega$|yaw|wimu",
+    "ay": r"quer$|^quer|lateral|^lat",
+    "ax": r"laengs|langs|^longitudinal",
+    "steer": r"^cmd$|^str$|steering",
+    "vx": r"^v$|^u$|spd|^vel|v$|wheelv|vwheel|omegawheels|^gs$|^sog$",
+    "vy_ref": r"^v$|v$|quer",
+    "sideslip_ref": r"slip",
+    "heading": r"yaw|^phi$|head|^theta$",
 }
 _REFERENCE = re.compile(
     r"ref|mocap|motioncap|gps|gnss|\bins\b|oxts|\brt ?\d|adma|correvit|corrsys|optical|optic|vicon|optitrack|true|truth|\bgt\b|datron|s350|"
@@ -71,108 +68,82 @@ _CORNERS = {
 _NO_SPEED_OF_A_WHEEL = re.compile(
     r"tq|torq|moment|press|druck|slip|temp|susp|force|kraft|fx|fy|fz|brake|brems|lat|acc|angle|winkel|disp|damp|tyre|tire"
 )
+_AXLES = {"front": r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", "rear": r"rear|\br\b|hint|\bha\b"}
+_WHEEL_SPEED = re.compile(r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel")
+_EXPLAINED = {
+    "yaw_rate": ("heading", "vx", "vy_ref", "position_x", "position_y"),
+    "handwheel": ("steer",),
+    "vy_ref": ("vx", "ay", "pitch_rate", "position_y"),
+    "sideslip_ref": ("vx",),
+    "ay": ("latitude", "vx", "vy_ref", "pitch_rate", "position_y"),
+    "ax": ("longitude", "vx", "roll_rate", "position_x"),
+    "roll_rate": ("roll", "vx"),
+    "pitch_rate": ("pitch", "vx"),
+    "vx": ("ax", "vy_ref", "position_x", "position_y"),
+    "heading": ("yaw_rate",),
+}
+"""Role -> roles that a part of its names suggests: the yaw in a yaw rate is no heading."""
+_PLAIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ψ": "psi", "β": "beta", "δ": "delta"})
+_PAIRS = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
 
 
 def bare(name: str) -> str:
-    """A name in lower-case words without marks, umlauts and what stands in brackets."""
-    text = re.sub(r"[\[({<].*$", "", name) or name
-    for letter, plain in {
-        "ä": "ae",
-        "ö": "oe",
-        "ü": "ue",
-        "Ä": "Ae",
-        "Ö": "Oe",
-        "Ü": "Ue",
-        "ß": "ss",
-        "ψ": "psi",
-        "β": "beta",
-        "δ": "delta",
-    }.items():
-        text = text.replace(letter, plain)
+    """A name in lower-case words without marks, umlauts and brackets with their content."""
+    text = (re.sub(r"[\[({<].*$", "", name) or name).translate(_PLAIN)
     text = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", " ", text)
     return re.sub(r"[\W_]+", " ", text).strip().lower()
 
 
 @cache
 def hints(name: str) -> dict[str, float]:
-    """What a name speaks for: role -> `STRONG` or `WEAK`; a wheel's role is ``wheel_speed_fl`` and so on."""
+    """Role -> `STRONG` or `WEAK`, for each role that a name suggests."""
     words = _FILTERED.sub("", bare(name)).strip()
-    compact = re.sub(r"(ered)?$", "", words.replace(" ", "")) if is_filtered(name) else words.replace(" ", "")
-    corner = corner_of(words)
+    compact = words.replace(" ", "")
+    if is_filtered(name):
+        compact = compact.removesuffix("ered")
+    corner = _corner(words)
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
     if re.search(r"brake|brems", words) and re.search(r"press|druck|^p ?brake|bar$", words):
-        axle = (
-            "front"
-            if re.search(r"front|\bf\b|vorne|\bva\b|brakef|fr?t\b", words)
-            else "rear"
-            if re.search(r"rear|\br\b|hint|\bha\b", words)
-            else ""
-        )
-        return {f"brake_pressure_{axle}": STRONG} if axle else {OTHER: STRONG}
-    found: dict[str, float] = {}
-    for table, score in ((_WEAK, WEAK), (_STRONG, STRONG)):
-        for role, pattern in table.items():
-            if re.search(pattern, compact) or (score == WEAK and re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])):
-                found[role] = score
-    return _settled(found, compact)
+        axle = next((axle for axle, pattern in _AXLES.items() if re.search(pattern, words)), "")
+        return {f"brake_pressure_{axle}" if axle else "other": STRONG}
+    found = {
+        role: WEAK
+        for role, pattern in _WEAK.items()
+        if re.search(pattern, compact) or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
+    }
+    found |= {role: STRONG for role, pattern in _STRONG.items() if re.search(pattern, compact)}
+    strong = {role for role, strength in found.items() if strength == STRONG}
+    is_other = "other" in strong and not strong & {"yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref", "handwheel"}
+    if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):
+        return {"other": STRONG}
+    parts = {part for role in strong for part in _EXPLAINED.get(role, ()) if role != "vx" or part not in strong}
+    return {role: strength for role, strength in found.items() if role not in parts | {"other"}}
 
 
-def _settled(found: dict[str, float], compact: str) -> dict[str, float]:
-    """Without what a longer word explains: the yaw in a yaw rate is no heading, a lateral velocity no speed."""
-    strong = {role for role, score in found.items() if score == STRONG}
-    if OTHER in strong and not strong & {YAW_RATE, AY, AX, SIDESLIP, LATERAL_VELOCITY, HANDWHEEL}:
-        return {OTHER: STRONG}
-    found.pop(OTHER, None)
-    for role, others in {
-        YAW_RATE: (HEADING, SPEED, LATERAL_VELOCITY, POSITION_X, POSITION_Y),
-        HANDWHEEL: (STEER,),
-        LATERAL_VELOCITY: (SPEED, AY, "pitch_rate", POSITION_Y),
-        SIDESLIP: (SPEED,),
-        AY: (LATITUDE, SPEED, LATERAL_VELOCITY, "pitch_rate", POSITION_Y),
-        AX: (LONGITUDE, SPEED, "roll_rate", POSITION_X),
-        "roll_rate": ("roll", SPEED),
-        "pitch_rate": ("pitch", SPEED),
-        SPEED: (AX, LATERAL_VELOCITY, POSITION_X, POSITION_Y),
-        HEADING: (YAW_RATE,),
-    }.items():
-        if role in strong:
-            for other in others:
-                if found.get(other, 0.0) <= STRONG and not (role == SPEED and other in strong):
-                    found.pop(other, None)
-    if _STEERING_RATE.search(compact) and YAW_RATE not in strong:
-        return {OTHER: STRONG}
-    return found
-
-
-def corner_of(words: str) -> str:
-    """Which wheel's speed a name is; empty where it is none."""
+def _corner(words: str) -> str:
+    """The wheel whose speed a name suggests; empty for other names."""
     if _NO_SPEED_OF_A_WHEEL.search(words):
         return ""
     for corner, pattern in _CORNERS.items():
-        apart = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words)
-        joined = re.search(
-            rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$", words.replace(" ", "")
-        )
-        if joined or (apart and re.search(r"wh(ee)?l|rad|spd|speed|rpm|drehzahl|geschw|^[nvw]\b|\b[nvw]$|omega|\bws\b|vel", words)):
+        joined = rf"^(?:{pattern})(?:wh|rad|spd)|(?:wheel|whl|rad|spd|speed|vel|ws|drehzahl)(?:{pattern})$"
+        apart = re.search(rf"(?:^|\s)(?:{pattern})(?:$|\s)", words) and _WHEEL_SPEED.search(words)
+        if apart or re.search(joined, words.replace(" ", "")):
             return corner
     return ""
 
 
-def pair_of(longitudinal: str, lateral: str) -> bool:
-    """Whether two names are one but for x and y, u and v, or long and lat."""
-    words = bare(longitudinal), bare(lateral)
-    swapped = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
-    return any(
-        words[0] != words[1] and re.sub(rf"{one}(?![a-z]*{one})", other, words[0]) == words[1] for one, other in swapped if one in words[0]
-    )
+def is_pair(longitudinal: str, lateral: str) -> bool:
+    """Whether two names differ by x and y, u and v, or long and lat alone."""
+    ahead, aside = bare(longitudinal), bare(lateral)
+    return ahead != aside and any(re.sub(rf"{one}(?![a-z]*{one})", other, ahead) == aside for one, other in _PAIRS)
 
 
 def is_reference(name: str) -> bool:
-    """Whether a name tells of a reference sensor."""
-    return bool(_REFERENCE.search(bare(name))) or bool(re.search(r"gps|gnss|mocap|vicon", bare(name).replace(" ", "")))
+    """Whether a name suggests a reference sensor."""
+    return bool(_REFERENCE.search(bare(name)) or re.search(r"gps|gnss|mocap|vicon", bare(name).replace(" ", "")))
 
 
 def is_filtered(name: str) -> bool:
-    """Whether a name tells of a channel that somebody has filtered."""
+    """Whether a name suggests a filtered channel."""
     return bool(_FILTERED.search(bare(name)))

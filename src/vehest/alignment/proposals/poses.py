@@ -6,53 +6,52 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vehest.alignment.proposals import names as roles
-from vehest.alignment.proposals.agreement import Known
+from vehest.alignment.motion import Motion, rms
 from vehest.alignment.proposals.columns import Candidate, correlation, slow_of
+from vehest.alignment.proposals.names import is_reference
 from vehest.data.units import factor_to_si
 
-PARTS = {"x": roles.POSITION_X, "y": roles.POSITION_Y, "yaw": roles.HEADING}
+PARTS = {"x": "position_x", "y": "position_y", "yaw": "heading"}
+LENGTHS = ("m", "mm")
 AGREEING = 0.7  # of speed and yaw rate with the derivatives
 SCALE = 1.4  # within which the speeds must be equal
 LARGEST_RADIANS = 7.0  # of an angle that is wrapped
 STEPS = 7.0  # rad/s; beyond, an angle was wrapped
 
 
-def find_pose(columns: Sequence[Candidate], known: Known | None) -> tuple[tuple[str, str, str], ...]:
+def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
+    """Columns that are named as x, y and yaw; fewer than three where one is missing."""
+    found = []
+    for role in PARTS.values():
+        named = [one for one in columns if role in one.hints]
+        found += sorted(named, key=lambda one: (-one.hints[role], not is_reference(one.name)))[:1]
+    return found
+
+
+def find_pose(columns: Sequence[Candidate], known: Motion | None) -> tuple[tuple[str, str, str], ...]:
     """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty where there is none.
 
     Args:
         columns: of the log.
-        known: the motion; without one nothing says that positions are the car's.
+        known: the motion; without one nothing shows that positions are the car's.
     """
-    if known is None:
+    pose = named_pose(columns)
+    if known is None or len(pose) < len(PARTS) or pose[0].unit not in ("", *LENGTHS) or not pose[2].measures("sideslip_ref"):
         return ()
-    x, y, yaw = named_pose(columns)
-    if x is None or y is None or yaw is None:
-        return ()
-    for unit in [x.unit] if x.unit else ["m", "mm"]:
-        if not x.measures("m"):
-            return ()
+    x, y, yaw = pose
+    driven = np.abs(slow_of(known.vx, known.rate_hz))
+    for unit in [x.unit] if x.unit else LENGTHS:
         scale = factor_to_si(unit, "m") * known.rate_hz
-        smooth = [slow_of(np.gradient(one.values) * scale, known.rate_hz) for one in (x, y)]
-        speed, driven = np.hypot(*smooth), np.abs(slow_of(known.vx, known.rate_hz))
-        length = min(len(speed), len(driven))
-        size = [float(np.sqrt(np.mean(np.square(one[:length])))) for one in (speed, driven)]
-        if size[1] > 0.0 and 1.0 / SCALE < size[0] / size[1] < SCALE and correlation(speed[:length], driven[:length]) > AGREEING:
-            of_yaw = yaw.unit or ("rad" if float(np.abs(yaw.values).max()) < LARGEST_RADIANS else "deg")
-            turned = np.gradient(np.unwrap(yaw.values * factor_to_si(of_yaw, "rad"))) * known.rate_hz
-            usual = np.abs(turned) < STEPS
-            if abs(correlation(turned[usual], known.yaw_rate[usual])) > AGREEING:
-                return (("x", x.name, unit), ("y", y.name, unit), ("yaw", yaw.name, of_yaw))
+        speed = np.hypot(*(slow_of(np.gradient(one.values) * scale, known.rate_hz) for one in (x, y)))
+        if 1.0 / SCALE < rms(speed) / rms(driven) < SCALE and correlation(speed, driven) > AGREEING:
+            unit_of_yaw = yaw.unit or ("rad" if float(np.abs(yaw.values).max()) < LARGEST_RADIANS else "deg")
+            if abs(turning_of(yaw, unit_of_yaw, known)) > AGREEING:
+                return (("x", x.name, unit), ("y", y.name, unit), ("yaw", yaw.name, unit_of_yaw))
     return ()
 
 
-def named_pose(columns: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None, Candidate | None]:
-    """The columns that are named as positions and yaw."""
-    return _named(columns, PARTS["x"]), _named(columns, PARTS["y"]), _named(columns, PARTS["yaw"])
-
-
-def _named(columns: Sequence[Candidate], role: str) -> Candidate | None:
-    """The column that is named most clearly for a role."""
-    named = [one for one in columns if role in one.hints]
-    return max(named, key=lambda one: (one.hints[role], one.is_reference), default=None)
+def turning_of(yaw: Candidate, unit: str, known: Motion) -> float:
+    """Correlation of a yaw angle's derivative with the yaw rate, where the angle was not wrapped."""
+    turned = np.gradient(np.unwrap(yaw.values * factor_to_si(unit, "rad"))) * known.rate_hz
+    usual = np.abs(turned) < STEPS
+    return correlation(turned[usual], known["yaw_rate"][usual])

@@ -1,4 +1,4 @@
-"""What is proposed for a log, and what is left to be asked."""
+"""Proposals of channels for the columns of a log, with open questions."""
 
 from __future__ import annotations
 
@@ -11,36 +11,25 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.units import factor_to_si
 
+LATERAL = frozenset({"yaw_rate", "ay", "steer", "handwheel", "vy_ref", "sideslip_ref", "yaw_rate_ref", "roll", "roll_rate"})
+"""Channels whose sign depends on which way is left."""
+
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a column is taken for.
+    """Channel of a column."""
 
-    Args:
-        column: its name in the log.
-        channel: as `vehest data channels` lists it.
-        unit: of the column, as vehest spells it.
-        sign: 1, or -1 where it counts the other way round than ISO 8855.
-        evidence: what speaks for it.
-        asked: what the log does not decide; empty where it decides all of it.
-        factor: what the column is multiplied by to be in ``unit``.
-        offset: what the column shows at nil, in its own unit.
-        others: channels or units that would do as well.
-        delay: by how much it is late, as far as it is known [s].
-        gappy: whether samples are missing.
-    """
-
-    column: str
-    channel: str
-    unit: str
-    sign: int = 1
-    evidence: tuple[str, ...] = ()
-    asked: str = ""
-    factor: float = 1.0
-    offset: float = 0.0
-    others: tuple[str, ...] = ()
-    delay: float = 0.0
-    gappy: bool = False
+    column: str  # its name in the log
+    channel: str  # as `vehest data channels` lists it
+    unit: str  # of the column, as vehest spells it
+    sign: int = 1  # -1 where it counts the other way round than ISO 8855
+    evidence: tuple[str, ...] = ()  # for people
+    asked: str = ""  # question that the log leaves open; empty where it decides all
+    factor: float = 1.0  # by which the column is multiplied to be in ``unit``
+    offset: float = 0.0  # value of the column at zero, in its own unit
+    others: tuple[str, ...] = ()  # channels or units that would do as well
+    delay: float = 0.0  # by which it is late, as far as it is known [s]
+    gappy: bool = False  # whether samples are missing
 
     @property
     def in_words(self) -> str:
@@ -53,9 +42,9 @@ class Proposal:
 
     def beyond(self, values: FloatArray) -> NDArray[np.bool_]:
         """Which values of the column no vehicle can have, (T,)."""
-        told = CHANNELS[self.channel]
-        samples = self.sign * self.factor * factor_to_si(self.unit, told.unit) * (values - self.offset)
-        return np.asarray((samples < told.low) | (samples > told.high))
+        channel = CHANNELS[self.channel]
+        samples = self.sign * self.factor * factor_to_si(self.unit, channel.unit) * (values - self.offset)
+        return np.asarray((samples < channel.low) | (samples > channel.high))
 
     def with_evidence(self, *more: str) -> Proposal:
         """The same with more of it."""
@@ -64,25 +53,15 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Proposals:
-    """What is proposed for a log.
-
-    Args:
-        channels: a column each.
-        left_right: how it is known which way is left; empty where a log does not tell, and signs hold against each other only.
-        wheel_radius: rolling radius that the wheels' speeds make with what the car does [m]; None where it is not needed.
-        rate_hz: of a log without times, as far as accelerations tell [Hz]; None where it has times.
-        unused: columns that belong to no channel.
-        pose: part (``x``, ``y``, ``yaw``), column and unit of poses that a reference can be made of; empty where there are none.
-        notes: what else should be known.
-    """
+    """Proposals for a log."""
 
     channels: tuple[Proposal, ...]
-    left_right: str = ""
-    wheel_radius: float | None = None
-    rate_hz: float | None = None
-    unused: tuple[str, ...] = ()
-    pose: tuple[tuple[str, str, str], ...] = ()
-    notes: tuple[str, ...] = ()
+    left_right: str = ""  # evidence of which way is left; empty where a log has none, and signs hold against each other only
+    wheel_radius: float | None = None  # rolling radius by which the wheels make the speed [m]; None where the speed has a column
+    rate_hz: float | None = None  # of a log without times, as far as accelerations decide it [Hz]; None where it has times
+    unused: tuple[str, ...] = ()  # columns that belong to no channel
+    pose: tuple[tuple[str, str, str], ...] = ()  # part (``x``, ``y``, ``yaw``), column and unit, of which a reference can be made
+    notes: tuple[str, ...] = ()  # further remarks
 
     @property
     def by_channel(self) -> dict[str, Proposal]:
@@ -90,10 +69,6 @@ class Proposals:
         return {proposal.channel: proposal for proposal in self.channels}
 
     def mirrored(self) -> Proposals:
-        """The same for a car seen in a mirror: channels that know left and right count the other way."""
+        """The same for a car seen in a mirror, which reverses the signs of `LATERAL` channels."""
         turned = (replace(one, sign=-one.sign) if one.channel in LATERAL else one for one in self.channels)
         return replace(self, channels=tuple(turned))
-
-
-LATERAL = frozenset({"yaw_rate", "ay", "steer", "handwheel", "vy_ref", "sideslip_ref", "yaw_rate_ref", "roll", "roll_rate"})
-"""Channels whose sign depends on which way is left."""

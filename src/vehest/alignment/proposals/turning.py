@@ -1,187 +1,256 @@
-"""Speed, yaw rate and lateral acceleration, tied together by ay ≈ vx·yaw_rate: they are looked for first, and their units with them."""
+"""Speed, yaw rate and lateral acceleration with their units, by ay ≈ vx·yaw_rate, and columns that repeat them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from vehest.alignment.proposals.columns import Candidate
-from vehest.alignment.proposals.names import AY, HANDWHEEL, LATERAL_VELOCITY, OTHER, SIDESLIP, SPEED, STEER, STRONG, YAW_RATE
+from vehest.alignment.motion import Motion, rms
+from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
+from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
-from vehest.data.units import factor_to_si
 
 LEAST_CORRELATION = 0.75
-UNITS = {SPEED: ("m/s", "km/h", "mph", "knots"), YAW_RATE: ("rad/s", "deg/s"), AY: ("m/s²", "g")}
-RARE = {"mph": 0.1, "knots": 0.2}  # added to a mismatch
+RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
 CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
 APART = 0.2  # by which the next best units must be worse
-RANGES = {SPEED: (0.5, 110.0), YAW_RATE: (0.02, 8.0), AY: (0.3, 60.0)}  # of the 99th percentile, SI
+RANGES = {"vx": (0.5, 110.0), "yaw_rate": (0.02, 8.0), "ay": (0.3, 60.0)}  # of the 99th percentile, SI
 MOST_COLUMNS = 60
 MOST_KEPT = 8
 LEAST_SCORE = 6.0
-FOLLOWING = frozenset({STEER, HANDWHEEL, LATERAL_VELOCITY, SIDESLIP})
-"""What follows a turn at an even speed as an acceleration does, but for its scale; so a name that is clear decides."""
+FOLLOWING = ("steer", "handwheel", "vy_ref", "sideslip_ref")
+"""Channels that follow a turn at an even speed as an acceleration does, but for its scale; so a clear name decides."""
 UNNAMED = 3.0  # of score, for a column that no name speaks for where one speaks for another
-NAMELESS = 0.5  # rank of a column whose name says nothing
-
-
-@dataclass(frozen=True)
-class Units:
-    """Units in which speed, yaw rate and lateral acceleration agree.
-
-    Args:
-        speed: of the speed.
-        yaw_rate: of the yaw rate.
-        ay: of the lateral acceleration.
-        mismatch: logarithm of what is left of the scale.
-        decided: whether no others explain it as well.
-    """
-
-    speed: str
-    yaw_rate: str
-    ay: str
-    mismatch: float
-    decided: bool
+NAMELESS = 0.5  # rank of a column whose name suggests nothing
+STANDING = 0.02  # of the top speed; below, the car may stand
+SAME = 0.97  # correlation of one quantity measured twice
+SAME_NAMED = {"vx": 0.7, "yaw_rate": 0.9}  # of columns that are named alike; wheels slip
+SAME_AY = 0.99
+SAME_SCALE = 0.35  # logarithm
+LIKELY = 2  # units to try; a speed that seems to be in others may be in counts
 
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """Three columns that may be speed, yaw rate and lateral acceleration.
+    """Columns that may be speed, yaw rate and lateral acceleration."""
 
-    Args:
-        speed: index of the column.
-        yaw_rate: likewise.
-        ay: likewise; -1 where there is none, and names alone tell of the other two.
-        correlation: of ay with speed·yaw_rate, with its sign.
-        scale: ay over speed·yaw_rate in the file's units, positive.
-        units: that explain the scale.
-        score: of all evidence.
-    """
+    columns: Mapping[str, Candidate]  # by channel; without ``ay`` where only names suggest the other two
+    units: Mapping[str, str]  # by channel
+    decided: bool  # whether no other units explain the scale as well
+    correlation: float = 0.0  # of ay with vx·yaw_rate, with its sign
+    scale: float = 1.0  # ay over vx·yaw_rate in these units, positive
+    score: float = 0.0  # of all evidence
 
-    speed: int
-    yaw_rate: int
-    ay: int
-    correlation: float
-    scale: float
-    units: Units
-    score: float
+    @property
+    def is_close(self) -> bool:
+        """Whether the units explain the scale, or nearly."""
+        return abs(math.log(self.scale)) < FAR
+
+    @property
+    def signs(self) -> dict[str, int]:
+        """Channel -> sign by which the car drives ahead and ay is +vx·yaw_rate."""
+        ahead = -1 if float(np.median(self.columns["vx"].slow)) < 0.0 else 1
+        return {"vx": ahead, "yaw_rate": 1, "ay": -ahead if self.correlation < 0.0 else ahead}
+
+    def motion(self, rate_hz: float) -> Motion:
+        """The motion by these columns."""
+        signs = self.signs
+        channels = {name: column.values * signs[name] * si_factor(self.units[name], name) for name, column in self.columns.items()}
+        moving = np.abs(channels["vx"]) > STANDING * largest(channels["vx"])
+        return Motion(rate_hz, channels, "vx", "", moving)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A motion, and the columns that are left beside it."""
+
+    turning: Turning  # speed, yaw rate and lateral acceleration
+    known: Motion  # by these, ay = +vx·yaw_rate
+    free: list[Candidate]  # columns without a channel that repeat none; those that get one are removed
 
 
 def find_turning(columns: Sequence[Candidate]) -> list[Turning]:
     """Triples that may be speed, yaw rate and lateral acceleration, the best first."""
-    pools = {role: _pool(columns, role) for role in UNITS}
-    if not all(pools.values()):
+    speeds, rates, accelerations = (_pool(columns, channel) for channel in RANGES)
+    if not (speeds and rates and accelerations):
         return []
     found = []
-    accelerations = np.stack([columns[k].slow for k in pools[AY]])
-    accelerations = accelerations - accelerations.mean(axis=1, keepdims=True)
-    sizes = np.sqrt(np.mean(np.square(accelerations), axis=1))
-    for s in pools[SPEED]:
-        rates = np.stack([columns[k].slow for k in pools[YAW_RATE]]) * columns[s].slow
-        rates = rates - rates.mean(axis=1, keepdims=True)
-        scales = np.sqrt(np.mean(np.square(rates), axis=1))
+    shown, sizes = _centred(np.stack([one.slow for one in accelerations]))
+    for speed in speeds:
+        turning, scales = _centred(np.stack([one.slow for one in rates]) * speed.slow)
         with np.errstate(all="ignore"):
-            agreeing = np.nan_to_num((rates @ accelerations.T) / accelerations.shape[1] / np.outer(scales, sizes))
+            agreeing = np.nan_to_num((turning @ shown.T) / shown.shape[1] / np.outer(scales, sizes), posinf=0.0, neginf=0.0)
         for i, j in zip(*np.nonzero(np.abs(agreeing) >= LEAST_CORRELATION), strict=True):
-            r, a = pools[YAW_RATE][i], pools[AY][j]
-            if len({s, r, a}) == 3:
-                scale = float(sizes[j] / scales[i])
-                found.append(_scored(columns, (s, r, a), float(agreeing[i, j]), scale))
+            if len({id(one) for one in (speed, rates[i], accelerations[j])}) == 3:
+                named = {"vx": speed, "yaw_rate": rates[i], "ay": accelerations[j]}
+                found.append(_scored(columns, named, float(agreeing[i, j]), float(sizes[j] / scales[i])))
     return [one for one in sorted(found, key=lambda one: -one.score)[:MOST_KEPT] if one.score >= LEAST_SCORE]
 
 
 def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
-    """Speed and yaw rate by name, where no lateral acceleration ties them together; None where one has none."""
-    named = {}
-    for role in (SPEED, YAW_RATE):
-        pool = [k for k in _pool(columns, role) if role in columns[k].hints]
+    """Speed and yaw rate by name, where no lateral acceleration ties them together; None without one of them."""
+    named, units = {}, {}
+    for channel in ("vx", "yaw_rate"):
+        pool = [one for one in _pool(columns, channel) if channel in one.hints]
         if not pool:
             return None
-        named[role] = max(pool, key=lambda k: (columns[k].hints[role], not columns[k].is_filtered, bool(columns[k].unit), -k))
-    if named[SPEED] == named[YAW_RATE]:
-        return None
-    units = []
-    for role, k in named.items():
-        low, high = RANGES[role]
-        fitting = [unit for unit in UNITS[role] if low <= extent(columns[k], unit, factor_unit(role)) <= high]
-        units.append(columns[k].unit or (fitting or [UNITS[role][0]])[0])
-    decided = all(columns[k].unit for k in named.values())
-    return Turning(named[SPEED], named[YAW_RATE], -1, 0.0, 0.0, Units(units[0], units[1], "m/s²", 0.0, decided), 0.0)
+        named[channel] = column = max(pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
+        offered = column.units(channel)
+        units[channel] = next((unit for unit in offered if _is_plausible(column, channel, unit)), offered[0])
+    is_one = named["vx"] is named["yaw_rate"]
+    return None if is_one else Turning(named, units, all(one.unit for one in named.values()))
 
 
-def _pool(columns: Sequence[Candidate], role: str) -> list[int]:
-    """Columns that could have a role, those that are named for it first."""
-    si = factor_unit(role)
-    own = [k for k, one in enumerate(columns) if one.measures(si) and OTHER not in one.hints and not _is_wheel(one)]
-    own = [k for k in own if role in columns[k].hints or not _follows(columns[k])]
-    if role == SPEED:
-        own = [k for k in own if _forward(columns[k].slow)]
-    own.sort(key=lambda k: -(columns[k].hints.get(role) or (-1.0 if columns[k].hints else NAMELESS)))
-    return own[:MOST_COLUMNS]
+def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Signals (C, T) about their means, and their standard deviations, (C,)."""
+    rows = rows - rows.mean(axis=1, keepdims=True)
+    return rows, np.sqrt(np.mean(np.square(rows), axis=1))
 
 
-def factor_unit(role: str) -> str:
-    """SI unit of a role."""
-    return UNITS[role][0]
+def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
+    """Columns that could be a channel, those whose names suggest it first."""
+    own = [one for one in columns if one.measures(channel) and "other" not in one.hints and not one.is_wheel]
+    own = [one for one in own if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)]
+    own = [one for one in own if channel != "vx" or _is_forward(one.slow)]
+    return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
 
 
-def _is_wheel(one: Candidate) -> bool:
-    return any(role.startswith("wheel_speed") for role in one.hints)
-
-
-def _follows(one: Candidate) -> bool:
-    """Whether a column's name says clearly that it follows the turning, and is none of the three."""
-    return any(role in FOLLOWING and strength == STRONG for role, strength in one.hints.items())
-
-
-def _forward(slow: FloatArray) -> bool:
+def _is_forward(slow: FloatArray) -> bool:
     """Whether a column is of one sign but for a little, as the speed of a car is."""
-    largest = float(np.abs(slow).max())
-    backwards = min(float(np.mean(slow < -0.1 * largest)), float(np.mean(slow > 0.1 * largest)))
-    return largest > 0.0 and backwards < 0.02
+    bound = 0.1 * float(np.abs(slow).max())
+    return bound > 0.0 and min(float(np.mean(slow < -bound)), float(np.mean(slow > bound))) < 0.02
 
 
-def _scored(columns: Sequence[Candidate], triple: tuple[int, int, int], agreeing: float, scale: float) -> Turning:
-    named = dict(zip(UNITS, (columns[k] for k in triple), strict=True))
-    units = explained(named, scale)
-    score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
-    score += sum(one.hint(role) + (1.5 if one.unit else 0.0) - 0.5 * one.is_filtered for role, one in named.items())
-    score -= 0.5 * named[AY].is_reference
-    for role, one in named.items():
-        if role not in one.hints and any(role in other.hints for other in columns):
-            score -= UNNAMED
-    level = np.abs(named[SPEED].slow)
-    score -= 2.0 if float(np.std(level)) < 0.05 * float(np.mean(level)) and SPEED not in named[SPEED].hints else 0.0
-    score += 3.0 if units.mismatch < CLOSE else 1.0 if units.mismatch < FAR else -5.0
-    for role, unit in zip(UNITS, (units.speed, units.yaw_rate, units.ay), strict=True):
-        low, high = RANGES[role]
-        score -= 0.0 if low <= extent(named[role], unit, factor_unit(role)) <= high else 5.0
-    return Turning(*triple, agreeing, scale, units, score)
+def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
+    low, high = RANGES[channel]
+    return low <= largest(column.slow) * si_factor(unit, channel) <= high
 
 
-def extent(one: Candidate, unit: str, si_unit: str) -> float:
-    """How large a column gets, in SI units."""
-    return float(np.quantile(np.abs(one.slow), 0.99)) * factor_to_si(unit, si_unit)
-
-
-def explained(named: dict[str, Candidate], scale: float) -> Units:
-    """The units that explain a scale of ay over speed·yaw_rate; those of the header where it says."""
-    offered = [(named[role].unit,) if named[role].unit else units for role, units in UNITS.items()]
+def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float) -> Turning:
+    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, and the score of all evidence."""
     ranked = []
-    for speed, yaw_rate, ay in product(*offered):
-        expected = factor_to_si(speed, "m/s") * factor_to_si(yaw_rate, "rad/s") / factor_to_si(ay, "m/s²")
-        mismatch = abs(math.log(scale / expected)) if scale > 0.0 else math.inf
-        implausible = sum(
-            not RANGES[role][0] <= extent(named[role], unit, factor_unit(role)) <= RANGES[role][1]
-            for role, unit in zip(UNITS, (speed, yaw_rate, ay), strict=True)
-        )
-        rare = sum(RARE.get(unit, 0.0) for unit in (speed, yaw_rate, ay) if not named[SPEED].unit)
-        ranked.append((mismatch + rare + 1.0 * implausible, mismatch, speed, yaw_rate, ay))
+    for units in product(*(column.units(channel) for channel, column in named.items())):
+        speed, rate, acceleration = (si_factor(unit, channel) for unit, channel in zip(units, named, strict=True))
+        left = scale / (speed * rate / acceleration)
+        implausible = sum(not _is_plausible(column, channel, unit) for (channel, column), unit in zip(named.items(), units, strict=True))
+        rare = 0.0 if named["vx"].unit else RARE.get(units[0], 0.0)
+        ranked.append((abs(math.log(left)) + rare + implausible, abs(math.log(left)), units, left, implausible))
     ranked.sort()
-    best = ranked[0]
-    rival = ranked[1][0] if len(ranked) > 1 else math.inf
-    return Units(best[2], best[3], best[4], best[1], best[1] < FAR and rival - best[0] > APART)
+    cost, mismatch, units, left, implausible = ranked[0]
+    decided = mismatch < FAR and (len(ranked) == 1 or ranked[1][0] - cost > APART)
+    score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
+    for channel, one in named.items():
+        score += one.hint(channel) + (1.5 if one.unit else 0.0) - 0.5 * is_filtered(one.name)
+        if channel not in one.hints and any(channel in other.hints for other in columns):
+            score -= UNNAMED
+    score -= 0.5 * is_reference(named["ay"].name) + 5.0 * implausible
+    level = np.abs(named["vx"].slow)
+    if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
+        score -= 2.0
+    score += 3.0 if mismatch < CLOSE else 1.0 if mismatch < FAR else -5.0
+    return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
+
+
+class Repeat(NamedTuple):
+    """A column that measures the same as another one."""
+
+    column: Candidate
+    unit: str
+    sign: int
+
+
+def repeated(search: Search) -> Iterator[Proposal]:
+    """Proposals for speeds and yaw rates that are measured twice, those of the motion among them."""
+    for channel in SAME_NAMED:
+        first = Repeat(search.turning.columns[channel], search.turning.units[channel], search.turning.signs[channel])
+        same, scaled = [], []
+        for column in search.free:
+            agreeing = correlation(column.slow, first.column.slow)
+            unit = _unit(column, first, channel, agreeing)
+            if unit:
+                same.append(Repeat(column, unit, -first.sign if agreeing < 0.0 else first.sign))
+            elif channel == "vx" and column.hints.get("vx") == STRONG and not column.unit and abs(agreeing) > SAME_NAMED["vx"]:
+                scaled.append(column)  # named as a speed, and one but for its scale, as a motor's speed is
+        for one in same:
+            search.free.remove(one.column)
+        family = [*(() if first.column.is_made else (first,)), *same]
+        if same:
+            yield from _separated(family, channel)
+        elif scaled and family:
+            search.free.remove(scaled[0])
+            yield from _scaled_speed(scaled[0], first)
+    ay = search.turning.columns.get("ay")
+    for column in list(search.free):
+        if ay is not None and abs(correlation(column.slow, ay.slow)) > SAME_AY and column.hint("ay") >= 0.0:
+            search.free.remove(column)
+
+
+def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
+    """With a speed that is named as a reference, or like the lateral velocity, as the reference's, where wheels can give the car's own."""
+    own, lateral = found.get("vx"), found.get("vy_ref")
+    if own is None or lateral is None or "vx_ref" in found:
+        return found
+    evidence, asked = "named as a reference", own.asked
+    if not is_reference(own.column):
+        evidence = f"named like '{lateral.column}', and wheels are there for vx"
+        asked = asked or "whether it is the car's own speed or the reference's"
+        if not is_pair(own.column, lateral.column):
+            return found
+    reference = replace(own, channel="vx_ref", others=("vx",), asked=asked).with_evidence(evidence)
+    return {name: one for name, one in found.items() if name != "vx"} | {"vx_ref": reference}
+
+
+def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
+    """The unit in which a column is another one measured again; empty where it is not."""
+    least = SAME_NAMED[channel] if channel in column.hints else SAME
+    if abs(agreeing) < least or column.hint(channel) < 0.0 or column.is_wheel or not column.measures(channel):
+        return ""
+    size = rms(first.column.slow) * si_factor(first.unit, channel)
+    ranked = [(abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit) for unit in column.units(channel)[:LIKELY]]
+    return min(ranked)[1] if min(ranked)[0] < SAME_SCALE else ""
+
+
+def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
+    """The car's own speed in counts, and the reference's by which it is scaled."""
+    name = first.column.name
+    speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
+    factor = float(column.slow @ speed) / float(column.slow @ column.slow)
+    evidence = f"follows '{name}' ({correlation(column.slow, first.column.slow):.2f}), no unit of speed explains its scale"
+    asked = f"the car's own speed, {abs(factor):.5g} m/s for a unit of it, or another quantity; '{name}' is then the reference's"
+    sign = -1 if factor < 0.0 else 1
+    yield Proposal(column.name, "vx", "m/s", sign, (evidence,), asked, factor=float(f"{abs(factor):.5g}"))
+    asked = f"the reference's speed, or the car's own ('{column.name}' in counts)"
+    yield Proposal(name, "vx_ref", first.unit, first.sign, (f"'{column.name}' follows it",), asked)
+
+
+def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
+    """The car's own and the reference's of columns that measure the same; more than these two are left out."""
+    plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
+    own = [one for one in plain if not is_reference(one.column.name)]
+    references = [one for one in plain if is_reference(one.column.name)]
+    text = f"agrees {min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain):.2f} with the other {channel}"
+
+    def proposal(one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()) -> Proposal:
+        return Proposal(one.column.name, name, one.unit, one.sign, (text, *more), asked, others=others)
+
+    reference = f"{channel}_ref"
+    if own and references:
+        own.sort(key=lambda one: -max(one.column.hints.values(), default=0.0))
+        asked = f"{len(own)} columns could be the car's own {channel}" if len(own) > 1 else ""
+        first = proposal(own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:]))
+        return [first, proposal(references[0], reference, "named as a reference")]
+    if len(plain) < 2:
+        return [Proposal(one.column.name, channel, one.unit, one.sign) for one in plain]
+    asked = f"which is the car's own {channel}, and which the reference's: no name decides"
+    roughness = {id(one): float(np.std(np.diff(one.column.values, 2))) / max(float(np.std(one.column.values)), 1e-12) for one in plain}
+    rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]
+    return [
+        proposal(rough, channel, "the rougher of the two", asked=asked, others=(reference,)),
+        proposal(smooth, reference, "the smoother", asked=asked, others=(channel,)),
+    ]

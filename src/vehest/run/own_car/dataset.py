@@ -12,7 +12,7 @@ import numpy as np
 
 from vehest.alignment.align import align
 from vehest.alignment.checks import checks_of_recording
-from vehest.alignment.proposals.lateness import Late, late_channels
+from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
 from vehest.data.channels import CHANNELS

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vehest.alignment.findings import Finding, Level
 from vehest.alignment.motion import Motion
 from vehest.alignment.signs import settled_samples
-from vehest.alignment.spectra import MOST_GROUPS, Measured, student
-from vehest.constants import GRAVITY
+from vehest.alignment.spectra import MOST_GROUPS, Measured, jackknife
+from vehest.constants import GRAVITY, FloatArray
 
 NOTED_OFFSET = 0.15  # m/s²; a unit that is level to 0.9 degrees
 DOUBTFUL_OFFSET = 0.5  # m/s²; 2.9 degrees, more than the crown of a road and a careless mounting together
@@ -20,7 +22,7 @@ FEWEST_BLOCKS = 6
 def lateral_offset(motion: Motion) -> Measured | None:
     """The constant c of ay - d(vy)/dt = c + g·vx·yaw_rate over the drive [m/s²], with its interval from blocks of time.
 
-    The gain g takes what roll lets in of gravity, which is no offset in a drive of left turns only. Without a lateral velocity its
+    The gain g holds the gravity that roll lets in, which is no offset in a drive of left turns only. Without a lateral velocity its
     derivative counts as nil, which its mean is in any drive that is not short.
     """
     settled = settled_samples(motion)
@@ -33,18 +35,14 @@ def lateral_offset(motion: Motion) -> Measured | None:
         return None
     starts = np.linspace(0, len(left), number + 1).astype(int)[:-1]
     sums = np.stack([np.add.reduceat(values, starts) for values in (np.ones(len(left)), turning, left, turning * turning, turning * left)])
-    whole = sums.sum(axis=1)
-    values = np.array([_intercept(whole), *(_intercept(whole - sums[:, block]) for block in range(number))])
-    if not np.isfinite(values).all():
-        return None
-    spread = float(np.sqrt((number - 1) / number * np.square(values[1:] - values[1:].mean()).sum()))
-    return Measured(float(values[0]), student(number - 1) * spread)
+    (offset,) = jackknife(sums.T, _intercept)
+    return offset if math.isfinite(offset.value) and math.isfinite(offset.half_width) else None
 
 
-def _intercept(sums: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
+def _intercept(sums: FloatArray) -> FloatArray:
     number, turning, left, squared, product = sums.tolist()
     determinant = number * squared - turning * turning
-    return (left * squared - turning * product) / determinant if determinant > 0.0 else np.nan
+    return np.array([(left * squared - turning * product) / determinant if determinant > 0.0 else math.nan])
 
 
 def offset_findings(motion: Motion) -> list[Finding]:
@@ -57,13 +55,8 @@ def offset_findings(motion: Motion) -> list[Finding]:
     turning = -offset.value / max(float(np.mean(np.abs(motion.vx[motion.moving]))), 0.1)
     gyro = f", or an offset of yaw_rate of {turning:.3f} rad/s" if abs(turning) < LARGEST_GYRO_OFFSET else ""
     expected = f"{motion.speed}·yaw_rate" + (f" + d({motion.velocity})/dt" if motion.velocity else "")
-    return [
-        Finding(
-            level,
-            "offset",
-            "ay",
-            f"lies {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) beside {expected} over the whole drive: "
-            f"a unit or a road tilted by {degrees:.1f} deg{gyro}; "
-            f"the transform offset_correction takes it off",
-        )
-    ]
+    message = (
+        f"lies {offset.value:.2f} m/s² (95 %: {offset.low:.2f} to {offset.high:.2f}) beside {expected} over the whole drive: a unit or a "
+        f"road tilted by {degrees:.1f} deg{gyro}; the transform offset_correction takes it off"
+    )
+    return [Finding(level, "offset", "ay", message)]
