@@ -182,7 +182,7 @@ def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
         ({"drives": [drive("a", surface="icy")]}, "there is no surface 'icy'; there are dry, wet, patchy"),
         ({"drives": [drive("a", 0.0)]}, "data set 'sim': manoeuvre 'laps': duration must lie between"),
         ({"drives": [drive("a"), drive("a")]}, "two drives are called 'a'"),
-        ({"drives": 5}, "dataset.drives must be a list of mappings, not 5"),
+        ({"drives": 5}, "dataset.drives must be a list, not 5"),
         ({"rate_hz": "abc"}, "dataset.rate_hz must be a number between 1 and 1000, not 'abc'"),
         ({"rate_hz": 1e-9}, "rate_hz must be a number between 1 and 1000, not 1e-09"),
         ({"accept": 5}, "dataset.accept must be a list of checks, not 5"),

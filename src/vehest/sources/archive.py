@@ -18,10 +18,12 @@ from typing import Any, BinaryIO
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import regular_file, writing_error
-from vehest.data.limits import check_limit, check_unpacked, current_limits
+from vehest.data.limits import check_limit
 
 MOST_BYTES = 8 * 10**9
 MOST_FILES = 10_000
+SMALL, MOST_EXPANSION = 64 * 2**20, 250  # bytes, and times its size that a larger archive may unpack to
+DEEPEST = 60  # folders
 BLOCK = 1 << 20
 LONGEST_NAME = 255  # bytes, of a file or a folder
 
@@ -90,7 +92,8 @@ def _targets(file: Path, entries: list[zipfile.ZipInfo], most_bytes: int, most_f
             f"'{file}' would unpack to {size / 1e9:.3g} GB, more than the limit of {most_bytes / 1e9:.3g} GB; "
             f"unpack it by hand if you trust it"
         )
-    check_unpacked(file, file.stat().st_size, size)
+    if size > max(SMALL, MOST_EXPANSION * file.stat().st_size):
+        raise DataError(f"'{file}' would unpack to more than {MOST_EXPANSION} times its size; unpack it by hand if you trust it")
     targets: dict[tuple[str, ...], zipfile.ZipInfo] = {}
     for entry in entries:
         parts = _harmless_path(file, entry)
@@ -110,7 +113,7 @@ def _harmless_path(file: Path, entry: zipfile.ZipInfo) -> tuple[str, ...]:
     parts = tuple(part for part in name.replace("\\", "/").split("/") if part not in ("", "."))
     if name.startswith(("/", "\\")) or PureWindowsPath(name).drive or ".." in parts or not parts or any(ord(c) < 32 for c in name):
         raise DataError(f"'{file}': entry {name!r} would be written outside of the folder it belongs in; do not trust this archive")
-    if len(parts) > current_limits().depth or any(len(part.encode("utf-8", "surrogateescape")) > LONGEST_NAME for part in parts):
+    if len(parts) > DEEPEST or any(len(part.encode("utf-8", "surrogateescape")) > LONGEST_NAME for part in parts):
         raise DataError(f"'{file}': entry {name[:60]!r}… has too long a name, or lies in too many folders; pack it again")
     kind = stat.S_IFMT(entry.external_attr >> 16)
     if kind == stat.S_IFLNK:

@@ -26,7 +26,6 @@ MOST_STRETCH = 0.1  # of an interval, over a whole recording, by which a plain r
 MOST_DRIFT = 0.01  # of an interval, over a whole recording, that may come from the resolution of the stamps
 SHORTEST_INTERVAL = 1e-9  # s
 LONGEST_INTERVAL = 86_400.0  # s
-WORTH_A_LOOK = 64 * 2**20  # bytes of a channel on an even clock, from which on it may not be much longer than the file
 INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
 
 
@@ -216,9 +215,7 @@ def _require_length(stamps: FloatArray, rate: float, n_channels: int, where: str
             f"{longest + 2} ({stamps[longest + 1]:.12g} s): remove the row with the stray stamp, or what lies on one side)"
         )
     check_limit("samples", n_samples, what)
-    check_limit("values", n_samples * n_channels, f"{what} of {n_channels} channels")
-    if 8 * n_samples > WORTH_A_LOOK:
-        check_limit("expansion", n_samples / len(stamps), f"{what}, {n_samples / len(stamps):.0f} times as many as there are rows")
+    check_limit("memory", 8 * n_samples * n_channels, f"{what} of {n_channels} channels")
 
 
 def _interval(steps: FloatArray) -> float:

@@ -13,11 +13,11 @@ from typing import Any
 
 from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.files import remove, sha256_of, written_aside
-from vehest.data.limits import check_limit
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json
 from vehest.version import __version__
 
+MOST_BYTES = 8 * 2**30  # of one file
 CHUNK = 1 << 15  # bytes; at most this much is received twice after a break
 PASSING = frozenset({408, 425, 429, 500, 502, 503, 504})  # statuses that may be gone at the next attempt
 
@@ -166,11 +166,9 @@ class ResumingDownloader:
 
     def _refuse_too_much(self, size: int) -> None:
         """Stop where a file is longer than it may be, and keep nothing of it."""
-        try:
-            check_limit("unpacked_bytes", size, f"what is sent as '{self.name}' has {size} bytes or more")
-        except DataError:
+        if size > MOST_BYTES:
             self._drop()
-            raise
+            raise DataError(f"what is sent as '{self.name}' has {size} bytes or more; at most {MOST_BYTES} are fetched")
 
     def _begin(self, url: str, response: Any, first: bytes) -> None:
         """Start over: forget an earlier part, remember which version of the file this one is of."""

@@ -57,7 +57,7 @@ def check_size(file: Path, n_columns: int, longest_line: int = BLOCK) -> None:
                 if n_bytes > packed:
                     check_unpacked(file, packed, n_bytes)
                 check_limit("samples", lines, f"'{file}' has {lines} rows or more")
-                check_limit("values", lines * n_columns, f"'{file}' has {lines} rows or more, {lines * n_columns} values")
+                check_limit("memory", 8 * lines * n_columns, f"'{file}' has {lines} rows or more, {lines * n_columns} values")
     except (OSError, pa.ArrowException, MemoryError) as error:
         raise DataError(f"'{file}' cannot be read ({str(error).splitlines()[0][:160] or type(error).__name__})") from None
 

@@ -175,7 +175,7 @@ def read_series(
                 stamps[name].append(frame.timestamp)
                 values[name].append(value)
             count += len(found)
-            check_limit("values", count, f"'{file}' holds {count} values or more")
+            check_limit("memory", 8 * count, f"'{file}' holds {count} values or more")
     except MemoryError as error:
         raise DataError(f"'{file}' asks for more memory than there is ({first_line(error)}); read fewer signals of it") from None
     for name, one in wanted.items():

@@ -9,6 +9,8 @@ from typing import BinaryIO
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
 
+MOST_BLOCKS = 1_000_000  # that a file may chain
+
 
 class BlockFile:
     """An open file.
@@ -53,7 +55,8 @@ class BlockFile:
             DataError: they are more than the limit.
         """
         self.followed += blocks
-        check_limit("links", self.followed, f"'{self.path}' chains {self.followed} blocks or more")
+        if self.followed > MOST_BLOCKS:
+            raise DataError(f"'{self.path}' chains more than {MOST_BLOCKS} blocks; it is damaged")
 
     def keep_text(self, address: int, content: bytes, encoding: str) -> str:
         """A text up to its end, read once."""

@@ -158,7 +158,8 @@ def _columns(file: BlockFile, contents: Contents, group: Group, fields: Sequence
                 values[invalid_samples(records, field, group.record_bytes)] = np.nan
             part.append(values)
         count += len(records)
-        check_limit("values", count * len(fields), f"'{file.path}': group {shown(group.title)} holds {count * len(fields)} values or more")
+        n_values = count * len(fields)
+        check_limit("memory", 8 * n_values, f"'{file.path}': group {shown(group.title)} holds {n_values} values or more")
     columns = []
     while parts:
         part = parts.pop(0)

@@ -145,13 +145,12 @@ def read_mat_file(file: Path) -> dict[str, MatArray]:
         raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
     order = _byte_order(content, file)
     arrays: dict[str, MatArray] = {}
-    count = unpacked = 0
+    unpacked = 0
     try:
         elements = _Elements(content[_HEADER_BYTES:], order)
         while not elements.is_empty():
             kind, body = elements.any()
-            count, unpacked = count + 1, unpacked + (_announced(body, order) if kind == _COMPRESSED else 0)
-            check_limit("links", count, f"'{file}' holds {count} arrays or more")
+            unpacked += _announced(body, order) if kind == _COMPRESSED else 0
             check_unpacked(file, len(content), unpacked)
             if kind not in (_MATRIX, _COMPRESSED):
                 raise _DamageError(f"something of type {kind} stands where an array belongs")
@@ -232,7 +231,6 @@ class _Elements:
         width, text = self.numbers(), bytes(self.any()[1])
         if len(width) != 1 or width[0] < 1 or len(text) % int(width[0]):
             raise _DamageError("the names of a struct's fields are cut")
-        check_limit("links", len(text) // int(width[0]), f"a struct of {len(text) // int(width[0])} fields")
         starts = range(0, len(text), int(width[0]))
         return [_name(text[start : start + int(width[0])].split(b"\0")[0]) for start in starts]
 

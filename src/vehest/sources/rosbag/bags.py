@@ -11,7 +11,6 @@ from typing import Any
 
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
-from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line, read_yaml
 from vehest.sources.rosbag.storage import LATEST, HeldTopic, Storage, open_storage
 from vehest.sources.rosbag.unpacking import DamagedBagError, Unpacked, unpack_zstd
@@ -110,7 +109,6 @@ def _open_folder(bag: Path, stack: ExitStack) -> OpenBag:
         raise DamagedBagError(f"it is compressed in mode '{mode[:20]}', not file or message by zstd")
     storages: list[Storage] = []
     files = [regular_file(bag / name) for name in names]
-    check_limit("links", len(files), f"'{bag}' is made of {len(files)} files")
     for file in files:
         storage = open_storage(_unpacked_file(file, stack) if mode == "file" else file, kind)
         stack.callback(storage.close)

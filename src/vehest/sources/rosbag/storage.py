@@ -160,7 +160,7 @@ class SqliteStorage(Storage):
             ).fetchone()
             if count > possible:
                 raise DamagedBagError("its pages lead back to one another")
-            check_limit("values", count, f"it holds {count} messages")
+            check_limit("memory", 8 * count, f"it holds {count} messages")
             rows = self.connection.execute(
                 "SELECT topic_id, count(*), min(timestamp), max(timestamp), total(length(data)), "
                 "sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob') FROM messages NOT INDEXED GROUP BY topic_id LIMIT ?",
@@ -287,7 +287,6 @@ class McapStorage(Storage):
             elif kind == 0x06:
                 starts = [min([*starts, struct.unpack("<Q", self._read(begin, 8))[0]])]
                 self.chunks.append((begin, length, None))
-                check_limit("links", len(self.chunks), f"'{self.unpacked.path}' holds {len(self.chunks)} chunks or more")
             elif kind == 0x07 and self.chunks:
                 chunk_begin, chunk_length, inside = self.chunks[-1]
                 (number,) = struct.unpack("<H", _piece(self._read(begin, min(length, 2)), 0, 2))
