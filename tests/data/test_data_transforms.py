@@ -222,7 +222,7 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length: i
 
 @pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
 def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
-    with pytest.raises(ConfigurationError, match="half_window"):
+    with pytest.raises(ConfigurationError, match="must be a positive number"):
         RemoveOutliers(**arguments)  # type: ignore[arg-type]
 
 
@@ -466,7 +466,7 @@ def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:
         ({"name": "low_pass", "cutoff_hz": 5, "design": "fir", "reach": 1e308}, "filter_samples"),
         ({"name": "remove_outliers", "half_window": 10**9}, "filter_samples"),
         ({"name": "remove_outliers", "half_window": 10**30}, "filter_samples"),
-        ({"name": "remove_outliers", "half_window": 499_999, "channels": "long"}, "values"),
+        ({"name": "remove_outliers", "half_window": 499_999, "channels": "long"}, "memory"),
     ],
     ids=str,
 )
@@ -498,6 +498,7 @@ def test_a_rate_that_leaves_nothing_is_refused() -> None:
         ({"name": "mounting_correction", "yaw": [1]}, "yaw must be a number"),
         ({"name": "resample", "rate_hz": True}, "rate_hz must be a number, not True"),
         ({"name": ["resample"]}, "is not one of"),
+        ({"name": "resample", "rate_hz": 20, "method": "spline"}, "method 'spline' is not one of: polyphase, decimate"),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_named(config: dict[str, object], said: str) -> None:

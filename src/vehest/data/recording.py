@@ -137,6 +137,18 @@ class Recording:
         """The same drive with these channels only."""
         return replace(self, channels={name: self[name] for name in names})
 
+    def with_channels(self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None) -> Recording:
+        """The same drive with channels replaced or added.
+
+        Args:
+            changed: channel -> samples, shape (T,).
+            made_of: channels that they were made of: they may have gaps where one of these may. None: the gaps stay as they were.
+        """
+        gappy = self.gappy
+        if made_of is not None:
+            gappy = gappy | set(changed) if gappy & set(made_of) else gappy - set(changed)
+        return replace(self, channels={**self.channels, **changed}, gappy=gappy)
+
     def without_references(self) -> Recording:
         """The same drive as an estimator may see it: no ``_ref`` channels."""
         kept = [name for name in self.channels if not CHANNELS[name].is_reference]

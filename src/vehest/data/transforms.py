@@ -1,29 +1,33 @@
-"""What may be done to a recording before an estimator sees it; each transform says whether it is causal or offline."""
+"""Transforms of recordings before an estimator reads them, each causal or offline."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import (
     AccelerationFromSpeed,
-    Mode,
     ScaleToWheelbase,
     SideslipFromVelocity,
     SpeedFromWheels,
     SteeringCurve,
     SteeringRatio,
     VelocityFromSideslip,
+    derivative,
+    require_channel,
+    require_positive,
+    speed_of_reference,
 )
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.estimate import Mode
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
@@ -70,10 +74,7 @@ class Resample:
     cutoff: ClassVar[float] = 0.86  # of the slower Nyquist frequency, where the stop band has then begun
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise ConfigurationError(f"the new sampling rate must be positive, not {self.rate_hz}")
-        if self.method not in ("polyphase", "decimate"):
-            raise ConfigurationError(f"resampling method '{self.method}' is not one of: polyphase, decimate")
+        require_positive("resampling", rate_hz=self.rate_hz)
 
     @property
     def mode(self) -> Mode:
@@ -91,30 +92,26 @@ class Resample:
         expected = len(recording) * (self.rate_hz / recording.rate_hz)
         what = f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
         check_limit("samples", expected, what)
-        check_limit("values", expected * len(recording.channels), f"{what} in each of {len(recording.channels)} channels")
+        check_limit("memory", 8 * expected * len(recording.channels), f"{what} in each of {len(recording.channels)} channels")
         up, down = self.ratio(recording)
         if up == down:
             return recording
         n_out = -(-len(recording) * up // down)
         if self.method == "decimate":
             if up != 1:
-                raise ConfigurationError(
-                    f"recording '{recording.id}': plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio; "
-                    f"use method=polyphase"
-                )
+                what = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
+                raise ConfigurationError(f"recording '{recording.id}': {what}; use method=polyphase")
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:
             if recording.gappy:
-                raise DataError(
-                    f"recording '{recording.id}': channel '{sorted(recording.gappy)[0]}' has gaps and cannot be filtered; "
-                    f"use method=decimate or leave the channel out"
-                )
+                what = f"channel '{sorted(recording.gappy)[0]}' has gaps and cannot be filtered"
+                raise DataError(f"recording '{recording.id}': {what}; use method=decimate or leave the channel out")
             reach = self.zero_crossings * max(up, down)
             ratio = f"resampling by {up}/{down}, from {recording.rate_hz:g} to {self.rate_hz:g} Hz"
             check_limit("filter_samples", 2 * reach + 1, f"recording '{recording.id}': {ratio}, needs a filter of {2 * reach + 1} samples")
             taps = self._taps(up, down)
             channels = {name: _resampled(samples, up, down, taps)[:n_out] for name, samples in recording.channels.items()}
-        return replace(recording, rate_hz=float(self.rate_hz), channels=channels)
+        return replace(recording, rate_hz=self.rate_hz, channels=channels)
 
     def ratio(self, recording: Recording) -> tuple[int, int]:
         """Interpolation and decimation factors (up, down).
@@ -125,16 +122,15 @@ class Resample:
         exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
         ratio = exact.limit_denominator(1000)
         if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
-            raise DataError(
-                f"recording '{recording.id}': {self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
-            )
+            what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
+            raise DataError(f"recording '{recording.id}': {what}")
         return ratio.numerator, ratio.denominator
 
     def _taps(self, up: int, down: int) -> FloatArray:
         slower = max(up, down)
         half = self.zero_crossings * slower
-        taps = signal.firwin(2 * half + 1, self.cutoff / slower, window=("kaiser", self.kaiser_beta))
-        window = signal.get_window(("kaiser", self.kaiser_beta), len(taps), fftbins=False)
+        taps = scipy.signal.firwin(2 * half + 1, self.cutoff / slower, window=("kaiser", self.kaiser_beta))
+        window = scipy.signal.get_window(("kaiser", self.kaiser_beta), len(taps), fftbins=False)
         lag = np.arange(-half, half + 1) / half
         for phase in range(up):  # every branch has unit gain at 0 Hz and no delay: a constant stays that constant, a line that line
             branch = slice(phase, None, up)
@@ -170,14 +166,9 @@ class LowPass:
     reach: float = 0.3
 
     def __post_init__(self) -> None:
-        if self.direction not in ("causal", "zero_phase"):
-            raise ConfigurationError(f"low-pass direction '{self.direction}' is not one of: causal, zero_phase")
-        if self.design not in ("butterworth", "fir"):
-            raise ConfigurationError(f"low-pass design '{self.design}' is not one of: butterworth, fir")
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
-        if not (math.isfinite(self.reach) and self.reach > 0):
-            raise ConfigurationError(f"the reach of a low-pass must be positive, not {self.reach}")
+        require_positive("low-pass", reach=self.reach)
 
     @property
     def mode(self) -> Mode:
@@ -193,16 +184,15 @@ class LowPass:
             DataError: a channel is missing or has gaps.
         """
         sections = self._sections(recording.rate_hz, f"recording '{recording.id}': ")
-        settled = signal.sosfilt_zi(sections)
 
-        def apply(samples: FloatArray) -> FloatArray:
+        def filtered(samples: FloatArray) -> FloatArray:
             if self.design == "fir":
                 return self._symmetric(samples, recording.rate_hz)
             if self.direction == "causal":
-                return signal.sosfilt(sections, samples, zi=settled * samples[0])[0]
-            return signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
+                return scipy.signal.sosfilt(sections, samples, zi=scipy.signal.sosfilt_zi(sections) * samples[0])[0]
+            return scipy.signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
 
-        return _with_changed(recording, self.channels, apply)
+        return recording.with_channels({name: filtered(recording[name]) for name in _without_gaps(recording, self.channels)})
 
     def online(self, rate_hz: float) -> LowPassStepper:
         """The same for one sample at a time, as a car has them.
@@ -220,15 +210,14 @@ class LowPass:
         length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
         what = f"{where}a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
         check_limit("filter_samples", length, what, ConfigurationError)
-        return np.asarray(signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
+        return np.asarray(scipy.signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
         """By the ``fir``, on samples extended at both ends by odd reflection; a constant stays that constant, a line that line."""
         half = max(1, round(self.reach * rate_hz))
-        taps = signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
-        kind: dict[str, Any] = {"mode": "reflect", "reflect_type": "odd"} if len(samples) > 1 else {"mode": "edge"}
-        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else signal.oaconvolve
-        return convolve(np.pad(samples, half, **kind), taps, mode="valid")
+        taps = scipy.signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
+        convolve = np.convolve if len(taps) <= LONGEST_DIRECT else scipy.signal.oaconvolve
+        return convolve(_extended(samples, half), taps, mode="valid")
 
 
 class LowPassStepper:
@@ -255,8 +244,8 @@ class LowPassStepper:
             if not math.isfinite(value):
                 raise DataError(f"the sample's '{name}' is {'missing' if name not in sample else value}, and cannot be filtered")
             if name not in self._states:
-                self._states[name] = signal.sosfilt_zi(self._sections) * value
-            (filtered[name],), self._states[name] = signal.sosfilt(self._sections, [value], zi=self._states[name])
+                self._states[name] = scipy.signal.sosfilt_zi(self._sections) * value
+            (filtered[name],), self._states[name] = scipy.signal.sosfilt(self._sections, [value], zi=self._states[name])
         return {name: float(value) for name, value in filtered.items()}
 
 
@@ -279,10 +268,7 @@ class RemoveOutliers:
     mode: ClassVar[Mode] = "offline"
 
     def __post_init__(self) -> None:
-        if self.half_window < 1 or self.threshold <= 0:
-            raise ConfigurationError(
-                f"outlier removal needs half_window of 1 or more and a positive threshold, not {self.half_window} and {self.threshold}"
-            )
+        require_positive("outlier removal", half_window=self.half_window, threshold=self.threshold)
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -294,22 +280,22 @@ class RemoveOutliers:
         width = 2 * self.half_window + 1
         what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
         check_limit("filter_samples", width, what, ConfigurationError)
-        check_limit("values", width * len(recording), f"{what} compares {width * len(recording)} values a channel", ConfigurationError)
+        check_limit("memory", 8 * width * len(recording), f"{what} compares {width * len(recording)} values a channel", ConfigurationError)
         at_once = max(VALUES_AT_ONCE // width, 1)
 
-        def apply(samples: FloatArray) -> FloatArray:
+        def cleaned(samples: FloatArray) -> FloatArray:
             padded = np.pad(samples, self.half_window, mode="reflect" if len(samples) > 1 else "edge")
-            cleaned = np.empty(len(samples))
+            result = np.empty(len(samples))
             for begin in range(0, len(samples), at_once):
                 inside = samples[begin : begin + at_once]
                 neighbours = np.lib.stride_tricks.sliding_window_view(padded[begin : begin + len(inside) + width - 1], width)
                 median = np.median(neighbours, axis=1)
                 deviation = 1.4826 * np.median(np.abs(neighbours - median[:, None]), axis=1)
                 spike = np.abs(inside - median) > self.threshold * deviation + 1e-12
-                cleaned[begin : begin + len(inside)] = np.where(spike, median, inside)
-            return cleaned
+                result[begin : begin + len(inside)] = np.where(spike, median, inside)
+            return result
 
-        return _with_changed(recording, self.channels, apply)
+        return recording.with_channels({name: cleaned(recording[name]) for name in _without_gaps(recording, self.channels)})
 
 
 @dataclass(frozen=True)
@@ -343,15 +329,14 @@ class MountingCorrection:
         Raises:
             DataError: ax, ay or yaw_rate is missing or has gaps.
         """
-        _require_no_gaps(recording, ("ax", "ay", "yaw_rate"))
-        ax, ay, yaw_rate = recording["ax"], recording["ay"], recording["yaw_rate"]
+        ax, ay, yaw_rate = (recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate")))
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
         if self.mode == "offline":
-            yaw_acceleration = np.gradient(yaw_rate) * recording.rate_hz if len(yaw_rate) > 1 else np.zeros(1)
+            yaw_acceleration = derivative(yaw_rate, recording.rate_hz)
             rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
             rotated_y = rotated_y - yaw_acceleration * self.lever_x + yaw_rate**2 * self.lever_y
-        return replace(recording, channels={**recording.channels, "ax": rotated_x, "ay": rotated_y})
+        return recording.with_channels({"ax": rotated_x, "ay": rotated_y})
 
 
 @dataclass(frozen=True)
@@ -370,10 +355,6 @@ class ReferenceLever:
     lever_y: float = 0.0
     mode: ClassVar[Mode] = "causal"
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.lever_x) and math.isfinite(self.lever_y)):
-            raise ConfigurationError(f"the lever of a reference must be numbers [m], not {self.lever_x} and {self.lever_y}")
-
     def __call__(self, recording: Recording) -> Recording:
         """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate.
 
@@ -381,15 +362,14 @@ class ReferenceLever:
             DataError: vy_ref or the yaw rate is missing.
         """
         turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
-        forward = {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y} if "vx_ref" in recording else {}
-        moved = {**forward, "vy_ref": recording["vy_ref"] - recording[turning] * self.lever_x}
-        sources = {turning, *moved}
+        moved = {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y} if "vx_ref" in recording else {}
+        moved["vy_ref"] = recording["vy_ref"] - recording[turning] * self.lever_x
+        made_of = {turning, *moved}
         if "sideslip_ref" in recording:
-            speed = "vx_ref" if forward else "vx"
-            sources.add(speed)
-            moved["sideslip_ref"] = np.arctan2(moved["vy_ref"], forward.get("vx_ref", recording[speed]))
-        gappy = recording.gappy | set(moved) if sources & recording.gappy else recording.gappy
-        return replace(recording, channels={**recording.channels, **moved}, gappy=gappy)
+            speed = speed_of_reference(recording)
+            made_of.add(speed)
+            moved["sideslip_ref"] = np.arctan2(moved["vy_ref"], moved.get(speed, recording[speed]))
+        return recording.with_channels(moved, made_of if made_of & recording.gappy else None)
 
 
 @dataclass(frozen=True)
@@ -414,40 +394,24 @@ class DelayCorrection:
     reach: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
 
-    def __post_init__(self) -> None:
-        if not math.isfinite(self.delay):
-            raise ConfigurationError(f"a delay must be a number of seconds, not {self.delay}")
-
     def __call__(self, recording: Recording) -> Recording:
         """Shift the channels, and cut the recording to the samples that then exist.
 
         Raises:
             DataError: a channel is missing or has gaps, or the recording is too short.
         """
-        position = self.delay * recording.rate_hz
-        if not abs(position) < len(recording):
-            raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s")
-        whole = round(position)
+        length, position = len(recording), self.delay * recording.rate_hz
+        whole = round(min(max(position, -length), length))
         fraction = position - whole
-        if abs(fraction) < 1e-9:
-            taps, reach = np.ones(1), 0
-        else:
-            taps, reach = self._taps(fraction), self.reach
-        first, last = max(reach - whole, 0), len(recording) - max(reach + whole, 0)
+        reach = 0 if abs(fraction) < 1e-9 else self.reach
+        first, last = max(reach - whole, 0), length - max(reach + whole, 0)
         if first >= last:
             raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short to be shifted by {self.delay:g} s")
-
-        def apply(samples: FloatArray) -> FloatArray:
-            # Output sample k is the sum of taps over the samples around k + whole.
-            neighbours = np.lib.stride_tricks.sliding_window_view(samples, len(taps))
-            shifted = np.full(len(samples), np.nan)
-            shifted[first:last] = neighbours[first + whole - reach : last + whole - reach] @ taps
-            return shifted[first:last]
-
-        chosen = self.channels or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
-        _require_no_gaps(recording, chosen)
+        taps = self._taps(fraction) if reach else np.ones(1)
         channels = {name: samples[first:last] for name, samples in recording.channels.items()}
-        channels |= {name: apply(recording[name]) for name in chosen}
+        for name in _without_gaps(recording, self.channels):  # output sample k is the sum of taps over the samples around k + whole
+            neighbours = np.lib.stride_tricks.sliding_window_view(recording[name], len(taps))
+            channels[name] = neighbours[first + whole - reach : last + whole - reach] @ taps
         return replace(recording, start_time=recording.start_time + first / recording.rate_hz, channels=channels)
 
     def _taps(self, fraction: float) -> FloatArray:
@@ -465,18 +429,14 @@ class OffsetCorrection:
         offsets: channel -> what its sensor shows too much, in the channel's unit.
     """
 
-    offsets: Mapping[str, float] = field(hash=False)
+    offsets: dict[str, float] = field(hash=False)
     mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.offsets, Mapping) or not self.offsets:
-            raise ConfigurationError(f"offsets are a mapping from channels to values, such as {{ax: 0.1}}, not {self.offsets!r}")
-        for name, value in self.offsets.items():
-            if name not in CHANNELS:
-                raise ConfigurationError(f"offset of '{name}': there is no such channel; 'vehest data channels' lists them")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ConfigurationError(f"offset of '{name}' must be a number, not {value!r}")
-        object.__setattr__(self, "offsets", dict(self.offsets))
+        if not self.offsets:
+            raise ConfigurationError("offsets are a mapping from channels to values, such as {ax: 0.1}, and name none")
+        for name in self.offsets:
+            require_channel(name, "offset")
 
     def __call__(self, recording: Recording) -> Recording:
         """Subtract the offsets.
@@ -484,8 +444,7 @@ class OffsetCorrection:
         Raises:
             DataError: a channel is missing.
         """
-        changed = {name: recording[name] - value for name, value in self.offsets.items()}
-        return replace(recording, channels={**recording.channels, **changed})
+        return recording.with_channels({name: recording[name] - value for name, value in self.offsets.items()})
 
 
 TRANSFORMS: dict[str, type] = {
@@ -550,21 +509,25 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
 
 
 def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray) -> FloatArray:
-    """Polyphase filtering of samples extended at both ends by odd reflection, so that the ends do not ring."""
+    """Polyphase filtering; samples are extended at both ends, so that the ends do not ring."""
     reach = len(taps) // 2 // up + 1
     margin = -(-reach // down) * down  # whole steps of the output grid
-    extended = np.pad(samples, margin, mode="reflect", reflect_type="odd") if len(samples) > 1 else np.pad(samples, margin, mode="edge")
-    return signal.resample_poly(extended, up, down, window=taps)[margin * up // down :]
+    return scipy.signal.resample_poly(_extended(samples, margin), up, down, window=taps)[margin * up // down :]
 
 
-def _with_changed(recording: Recording, names: tuple[str, ...], change: Callable[[FloatArray], FloatArray]) -> Recording:
+def _extended(samples: FloatArray, margin: int) -> FloatArray:
+    """Samples with ``margin`` more at both ends, by odd reflection."""
+    return np.pad(samples, margin, mode="reflect", reflect_type="odd") if len(samples) > 1 else np.pad(samples, margin, mode="edge")
+
+
+def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names, of none those of all measured channels.
+
+    Raises:
+        DataError: one of the channels has gaps.
+    """
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
-    _require_no_gaps(recording, chosen)
-    changed = {name: change(recording[name]) for name in chosen}
-    return replace(recording, channels={**recording.channels, **changed})
-
-
-def _require_no_gaps(recording: Recording, names: tuple[str, ...]) -> None:
-    for name in names:
+    for name in chosen:
         if name in recording.gappy:
             raise DataError(f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out")
+    return chosen
