@@ -49,8 +49,6 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise DataError(f"recording '{self.id}': the sampling rate must be positive, not {self.rate_hz}")
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
             where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
             raise DataError(f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz")
@@ -60,37 +58,21 @@ class Recording:
             raise DataError(f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'")
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
-        if not self.channels:
-            raise DataError(f"recording '{self.id}' has no channels")
-        frozen: dict[str, FloatArray] = {}
-        for name, samples in self.channels.items():
-            channel(name)
-            array = np.array(samples, dtype=np.float64, copy=True)
-            if array.ndim != 1:
-                raise DataError(f"recording '{self.id}': channel '{name}' must be one-dimensional, not of shape {array.shape}")
-            array.flags.writeable = False
-            frozen[name] = array
-        lengths = {name: len(samples) for name, samples in frozen.items()}
-        if len(set(lengths.values())) != 1:
-            raise DataError(f"recording '{self.id}': channels differ in length: {lengths}")
-        if next(iter(lengths.values())) == 0:
-            raise DataError(f"recording '{self.id}' holds no samples")
+        frozen = {channel(name).name: np.array(samples, dtype=np.float64, copy=True) for name, samples in self.channels.items()}
+        n_samples = max((samples.size for samples in frozen.values()), default=0)
+        if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
+            shapes = {name: samples.shape for name, samples in frozen.items()}
+            raise DataError(f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}")
         object.__setattr__(self, "channels", frozen)
         object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
         for name, samples in frozen.items():
-            self._require_finite(name, samples)
-
-    def _require_finite(self, name: str, samples: FloatArray) -> None:
-        bad = np.isinf(samples) if name in self.gappy else ~np.isfinite(samples)
-        if not bad.any():
-            return
-        where = np.flatnonzero(bad)
-        first, last = (self.start_time + where[[0, -1]] / self.rate_hz).tolist()
-        what = "NaN" if np.isnan(samples[bad]).all() else "infinite values"
-        raise DataError(
-            f"recording '{self.id}': channel '{name}' holds {len(where)} {what} between {first:.12g} s and {last:.12g} s; "
-            f"cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
-        )
+            samples.flags.writeable = False
+            bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
+            if len(bad):
+                first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
+                what = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
+                fix = "cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
+                raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))

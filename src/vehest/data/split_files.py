@@ -13,9 +13,9 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
+from vehest.data.limit_minutes import limit_minutes
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
-from vehest.data.shortened import shortened
 from vehest.data.splits import VALIDATION, Kept, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
@@ -142,8 +142,8 @@ def _cut_down(split: Split, minutes: float, at: float, ranges: _Ranges) -> Split
     return replace(
         split,
         name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""),
-        train=shortened(split.train, share * learnt, at, bounds_of),
-        validation=shortened(split.validation, share * stopped, at, bounds_of),
+        train=limit_minutes(split.train, share * learnt, at, bounds_of),
+        validation=limit_minutes(split.validation, share * stopped, at, bounds_of),
     )
 
 

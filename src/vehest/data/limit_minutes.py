@@ -12,7 +12,7 @@ from vehest.data.splits import Span
 LEAST_SECONDS = 3.0  # of a piece; what is shorter holds no window after the start that is not scored
 
 
-def shortened(spans: Sequence[Span], seconds: float, at: float, bounds_of: Callable[[Span], tuple[float, float]]) -> tuple[Span, ...]:
+def limit_minutes(spans: Sequence[Span], seconds: float, at: float, bounds_of: Callable[[Span], tuple[float, float]]) -> tuple[Span, ...]:
     """A stretch of ranges laid end to end; it goes on at their start where it reaches their end. Ends of a few seconds are left out.
 
     Args:
