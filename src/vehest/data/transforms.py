@@ -183,34 +183,22 @@ class LowPass:
                 than the limit.
             DataError: a channel is missing or has gaps.
         """
-        sections = self._sections(recording.rate_hz, f"recording '{recording.id}': ")
+        where, rate_hz = f"recording '{recording.id}'", recording.rate_hz
+        if not 0 < self.cutoff_hz < rate_hz / 2:
+            raise ConfigurationError(f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
+        length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
+        what = f"{where}: a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
+        check_limit("filter_samples", length, what, ConfigurationError)
+        sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos")
 
         def filtered(samples: FloatArray) -> FloatArray:
             if self.design == "fir":
-                return self._symmetric(samples, recording.rate_hz)
+                return self._symmetric(samples, rate_hz)
             if self.direction == "causal":
                 return scipy.signal.sosfilt(sections, samples, zi=scipy.signal.sosfilt_zi(sections) * samples[0])[0]
             return scipy.signal.sosfiltfilt(sections, samples, padlen=min(3 * len(sections) * 3, len(samples) - 1))
 
         return recording.with_channels({name: filtered(recording[name]) for name in _without_gaps(recording, self.channels)})
-
-    def online(self, rate_hz: float) -> LowPassStepper:
-        """The same for one sample at a time, as a car has them.
-
-        Raises:
-            ConfigurationError: it is not causal, or the cut-off is not below the Nyquist frequency.
-        """
-        if self.mode != "causal":
-            raise ConfigurationError("a low-pass that sees later samples cannot run along with a drive; use direction=causal")
-        return LowPassStepper(self._sections(rate_hz, ""), self.channels)
-
-    def _sections(self, rate_hz: float, where: str) -> FloatArray:
-        if not 0 < self.cutoff_hz < rate_hz / 2:
-            raise ConfigurationError(f"{where}low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
-        length = rate_hz * (2 * self.reach if self.design == "fir" else 1 / self.cutoff_hz)
-        what = f"{where}a low-pass at {self.cutoff_hz:g} Hz reaches over {length:.6g} samples"
-        check_limit("filter_samples", length, what, ConfigurationError)
-        return np.asarray(scipy.signal.butter(2, self.cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
     def _symmetric(self, samples: FloatArray, rate_hz: float) -> FloatArray:
         """By the ``fir``, on samples extended at both ends by odd reflection; a constant stays that constant, a line that line."""
@@ -218,35 +206,6 @@ class LowPass:
         taps = scipy.signal.firwin(2 * half + 1, self.cutoff_hz, fs=rate_hz, window="hamming")
         convolve = np.convolve if len(taps) <= LONGEST_DIRECT else scipy.signal.oaconvolve
         return convolve(_extended(samples, half), taps, mode="valid")
-
-
-class LowPassStepper:
-    """A causal low-pass, one sample at a time; settled at the first.
-
-    Args:
-        sections: second-order ones, (n, 6).
-        channels: which channels; all that the first sample has if empty.
-    """
-
-    def __init__(self, sections: FloatArray, channels: tuple[str, ...] = ()) -> None:
-        self._sections, self._channels = sections, channels
-        self._states: dict[str, FloatArray] = {}
-
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """The sample with its channels filtered.
-
-        Raises:
-            DataError: a channel is missing, or its value is not finite.
-        """
-        filtered = dict(sample)
-        for name in self._channels or tuple(sample):
-            value = sample.get(name, math.nan)
-            if not math.isfinite(value):
-                raise DataError(f"the sample's '{name}' is {'missing' if name not in sample else value}, and cannot be filtered")
-            if name not in self._states:
-                self._states[name] = scipy.signal.sosfilt_zi(self._sections) * value
-            (filtered[name],), self._states[name] = scipy.signal.sosfilt(self._sections, [value], zi=self._states[name])
-        return {name: float(value) for name, value in filtered.items()}
 
 
 @dataclass(frozen=True)
