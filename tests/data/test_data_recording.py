@@ -163,9 +163,9 @@ def test_a_covariance_of_another_shape_is_refused(shape: tuple[int, ...]) -> Non
 @pytest.mark.parametrize("names", [(), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate")])
 def test_rows_of_a_covariance_must_have_names(names: tuple[str, ...]) -> None:
     channels = {"vy": np.zeros(3), "sideslip": np.zeros(3)}
-    with pytest.raises(DataError, match="covariance_of must name 2 different quantities"):
+    with pytest.raises(DataError, match=r"covariance_of name n quantities, not \(3, 2, 2\) and \("):
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance=np.zeros((3, 2, 2)), covariance_of=names)
-    with pytest.raises(DataError, match="must name 0"):
+    with pytest.raises(DataError, match=r"not None and \(vy\)"):
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance_of=("vy",))
 
 

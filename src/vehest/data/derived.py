@@ -82,7 +82,7 @@ class SteeringCurve:
     Args:
         inputs: values of the channel at the corners, increasing.
         angles: road-wheel angle at each [rad]; beyond the first and last corner the curve is flat.
-        channel: what the curve is applied to; ``steer`` itself may be it.
+        channel: that the curve is applied to; it may be ``steer``.
     """
 
     inputs: tuple[float, ...]
@@ -217,8 +217,8 @@ def _known_median(speeds: FloatArray) -> FloatArray:
 class AccelerationFromSpeed:
     """Make the longitudinal acceleration ``ax`` from a speed: ax ≈ dvx/dt, low-passed.
 
-    An accelerometer shows du/dt - v·r; the second term, v being what is looked for, is left out. It is small where sideslip is: 0.2 m/s²
-    for v = 0.5 m/s and r = 0.4 rad/s.
+    An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
+    v = 0.5 m/s and r = 0.4 rad/s.
 
     Args:
         channel: the speed; ``vx`` or ``vx_ref``.

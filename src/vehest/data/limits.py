@@ -71,7 +71,7 @@ def check_limit(name: str, value: float, what: str, error: type[ConfigurationErr
 
     Args:
         name: field of `Limits`.
-        value: what is asked for.
+        value: that is asked for.
         what: for the message, ``"'lap.csv' would hold 4000000000 samples"``.
         error: what to raise.
 

@@ -1,4 +1,4 @@
-"""What a recording is: one uninterrupted drive, uniformly sampled, in SI units and ISO 8855 axes."""
+"""Recordings: uninterrupted drives, uniformly sampled, in SI units and ISO 8855 axes."""
 
 from __future__ import annotations
 
@@ -83,11 +83,9 @@ class Recording:
         Raises:
             DataError: the recording does not have it.
         """
-        try:
-            return self.channels[name]
-        except KeyError:
-            have = ", ".join(self.channels)
-            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {have})") from None
+        if name not in self.channels:
+            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})")
+        return self.channels[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -146,36 +144,22 @@ class Recording:
         """
         first, last = self.index_range(start, stop)
         if first >= last:
-            raise DataError(
-                f"recording '{self.id}' spans {self.start_time:.12g} s to {self.end_time:.12g} s; "
-                f"it has no samples between {start:.12g} s and {stop:.12g} s"
-            )
-        return replace(
-            self,
-            start_time=self.start_time + first / self.rate_hz,
-            channels={name: samples[first:last] for name, samples in self.channels.items()},
-        )
+            spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
+            raise DataError(f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s")
+        channels = {name: samples[first:last] for name, samples in self.channels.items()}
+        return replace(self, start_time=self.start_time + first / self.rate_hz, channels=channels)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""
-        return (index_at_or_after(self, start), index_at_or_after(self, stop))
-
-
-def index_at_or_after(recording: Recording, time: float) -> int:
-    """Index of the first sample taken at or after ``time`` [s], to the tolerance of its clock; clipped to 0 … T."""
-    if time == math.inf:
-        return len(recording)
-    if time == -math.inf:
-        return 0
-    position = (time - recording.start_time) * recording.rate_hz
-    tolerance = clock_tolerance(recording.start_time, recording.end_time, recording.rate_hz)
-    return min(max(math.ceil(position - tolerance), 0), len(recording))
+        tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
+        first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
+        return math.ceil(min(max(first, 0.0), len(self))), math.ceil(min(max(end, 0.0), len(self)))
 
 
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
     """How far from a sample a time may lie and still be that sample's, in samples.
 
-    A millionth of a sample, or what a double resolves where the times are large: at 1.7e9 s (unix time) 0.24 µs.
+    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s (unix time) 0.24 µs.
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)

@@ -15,7 +15,7 @@ from vehest.data.store import RecordingDescription, description_of
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What a recording has.
+    """Channels and rate of a recording.
 
     Args:
         id: name, unique within its data set.

@@ -31,10 +31,10 @@ def validated(kind: type[Schema], content: Any, where: str, *, error: type[Vehes
 
     Args:
         kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or ``ValueError``.
-        content: what a file held: mappings, lists, text, numbers, truth values, nothing.
-        where: what is named first in a message, ``"'model.yaml'"``; may be empty.
+        content: of a file: mappings, lists, text, numbers, truth values, nothing.
+        where: first words of a message, ``"'model.yaml'"``; may be empty.
         error: what to raise.
-        group: what the keys belong to, ``training`` for ``training.patience``; may be empty.
+        group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
 
     Raises:
         DataError: a key is missing, unknown or of the wrong type, or a value makes no sense (or ``error``).
@@ -227,7 +227,7 @@ def _keys_of(kind: Any) -> str:
 
 
 def _type_at(kind: Any, path: Sequence[str | int]) -> Any:
-    """Annotated type of what is at a path inside a value of some type; None where that cannot be told."""
+    """Annotated type at a path inside a value of some type; None where it is not known."""
     for part in path:
         bare, _ = _bare(kind)
         if is_dataclass(bare):

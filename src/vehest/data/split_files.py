@@ -162,7 +162,7 @@ class _Ranges:
         return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
 
     def limited(self, split: Split, minutes: float) -> Split:
-        """A split with less to learn from: validation keeps its share of what is left."""
+        """The split with fewer minutes to learn from, of which validation keeps its share."""
 
         def bounds_of(span: Span) -> tuple[float, float]:
             recording = self._reader(span.dataset, span.recording)(None)

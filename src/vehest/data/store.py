@@ -1,4 +1,4 @@
-"""Recordings and estimates as Parquet files; what is read back is what was written, bit for bit."""
+"""Stores recordings and estimates as Parquet files, which come back bit for bit."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LAYOUT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class RecordingDescription:
-    """What the file of a recording says beside its table; see `Recording`."""
+    """Description of a recording beside its table; see `Recording`."""
 
     format: int
     content: Literal["recording"]
@@ -50,7 +50,7 @@ class RecordingDescription:
 
 @dataclass(frozen=True)
 class EstimateDescription:
-    """What the file of an estimate says beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
+    """Description of an estimate beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
 
     format: int
     content: Literal["estimate"]
@@ -149,7 +149,7 @@ def read_estimate(path: Path) -> Estimate:
 
 
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
-    """What the file of a recording or an estimate says beside its table.
+    """The description of a recording or an estimate beside its table.
 
     Raises:
         DataError: it is not of this kind, or of another format, or the description is damaged.

@@ -137,7 +137,7 @@ def number_in(row: Mapping[str, str], column: str, path: Path) -> float:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error of a library says, short enough for a message."""
+    """First line of a library's error, short enough for a message."""
     if isinstance(error, VehestError):
         return str(error)
     if isinstance(error, RecursionError):

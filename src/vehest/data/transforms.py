@@ -56,8 +56,8 @@ class Resample:
     """Change the sampling rate by any rational ratio; the first sample keeps its time.
 
     ``polyphase`` applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so nothing is
-    shifted and what lies above the new Nyquist frequency is removed before it can alias. ``decimate`` keeps every n-th sample as it is
-    (integer ratios only), which is what a slower sensor or a naive logger would deliver.
+    shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th sample as it
+    is (integer ratios only), as a slower sensor or a naive logger would.
 
     Args:
         rate_hz: the new rate [Hz].
@@ -144,7 +144,7 @@ class Resample:
 
 @dataclass(frozen=True)
 class LowPass:
-    """Remove what lies above a cut-off frequency.
+    """Remove frequencies above a cut-off.
 
     ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways. A ``fir`` is symmetric
     (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
@@ -333,7 +333,7 @@ class ReferenceLever:
 
 @dataclass(frozen=True)
 class DelayCorrection:
-    """Bring channels that are late onto the clock of the others: each sample becomes what the sensor will show ``delay`` later.
+    """Bring channels that are late onto the clock of the others: each sample becomes the sensor's value ``delay`` later.
 
     Between samples a band-limited interpolation (sinc under a Kaiser window) is used; it is within 0.1 % up to 0.8 of the Nyquist
     frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
@@ -385,7 +385,7 @@ class OffsetCorrection:
     """Take constant offsets off channels.
 
     Args:
-        offsets: channel -> what its sensor shows too much, in the channel's unit.
+        offsets: channel -> offset of its sensor, in the channel's unit.
     """
 
     offsets: dict[str, float] = field(hash=False)
@@ -430,7 +430,7 @@ OF_REFERENCES = frozenset({"reference_lever", "velocity_from_sideslip", "sidesli
 
 @dataclass(frozen=True)
 class Preparation:
-    """How recordings are brought to an estimator's rate, as ``downsample`` of a configuration or of a model says it.
+    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a model.
 
     Args:
         method: of `Resample`.
