@@ -25,7 +25,6 @@ import yaml
 
 from place import run_vehest
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
-from vehest.data.limits import Limits, use_limits
 from vehest.data.store import read_recording
 from vehest.sources import resuming
 from vehest.sources.base import open_source
@@ -786,11 +785,10 @@ def test_without_a_root_the_command_says_what_to_give(place: Place) -> None:
 
 
 @pytest.mark.parametrize("told", [True, False])
-def test_a_file_longer_than_the_limit_is_not_kept(server: Server, tmp_path: Path, told: bool) -> None:
+def test_a_file_longer_than_the_limit_is_not_kept(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: bool) -> None:
     server.length = told
-    with use_limits(Limits(unpacked_bytes=SIZE - 1)):
-        said = refusal(download(server, tmp_path, known={"a.csv": sha256(BYTES)}), DataError)
-    assert "bytes or more, more than the limit of 299999; if that is meant, raise it: limits.unpacked_bytes=NUMBER" in said
+    monkeypatch.setattr(resuming, "MOST_BYTES", SIZE - 1)
+    assert "bytes or more; at most 299999 are fetched" in refusal(download(server, tmp_path, known={"a.csv": sha256(BYTES)}), DataError)
     assert files(tmp_path) == {}
 
 

@@ -717,11 +717,11 @@ def test_metadata_that_lie_are_refused(folder: Path, before: str, after: str, sa
 def test_metadata_that_explode_are_refused(folder: Path) -> None:
     levels = "\n".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))
     (folder / "lap" / "metadata.yaml").write_text(f"a0: &a0 [x]\n{levels}\n")
-    assert "what aliases repeat included" in refusal(folder)
+    assert "'metadata.yaml' nests deeper than 60 levels or holds more than" in refusal(folder)
 
 
 def test_more_than_the_limits_is_refused(folder: Path) -> None:
-    for limits, said in ((Limits(samples=250), "limits.samples"), (Limits(values=1000), "limits.values")):
+    for limits, said in ((Limits(samples=250), "limits.samples"), (Limits(memory=8000), "limits.memory")):
         with use_limits(limits):
             assert f"raise it: {said}=NUMBER" in refusal(folder)
 
@@ -751,12 +751,10 @@ def compressed(bag: Path, mode: str) -> Path:
 
 
 @pytest.mark.parametrize("mode", ["file", "message"])
-def test_bags_that_ros_compressed_are_read_up_to_the_limits(folder: Path, mode: str) -> None:
+def test_bags_that_ros_compressed_are_read(folder: Path, mode: str) -> None:
     expected = read(folder)
     bags = compressed(folder / "lap", mode)
     np.testing.assert_array_equal(read(bags)["ax"], expected["ax"])
-    with use_limits(Limits(unpacked_bytes=10_000)):
-        assert "raise it: limits.unpacked_bytes=NUMBER" in refusal(bags)
 
 
 @pytest.mark.parametrize("compression", ["lz4", "zstd"])
@@ -772,7 +770,7 @@ def test_a_chunk_must_unpack_to_what_it_announces(tmp_path: Path, compression: s
             counted.block(packed, compression, announced)
     with pytest.raises(DamagedBagError, match="are announced in one block"):
         counted.block(pack(content), compression, 2**40)
-    with pytest.raises(DataError, match=r"limits.expansion=NUMBER"):
+    with use_limits(Limits(memory=2**26)), pytest.raises(DataError, match=r"limits.memory=NUMBER"):
         counted.block(pack(content), compression, 2**27)
 
 

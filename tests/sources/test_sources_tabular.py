@@ -529,11 +529,11 @@ def test_rows_are_counted_before_they_are_parsed(tmp_path: Path, ending: str) ->
         assert "has 51 rows or more, more than the limit of 50; if that is meant, raise it: limits.samples=NUMBER" in refusal(
             lambda: read(file)
         )
-    with use_limits(Limits(values=152)):
-        assert "51 rows or more, 153 values, more than the limit of 152; if that is meant, raise it: limits.values=" in refusal(
+    with use_limits(Limits(memory=8 * 152)):
+        assert "51 rows or more, 153 values, more than the limit of 1216; if that is meant, raise it: limits.memory=" in refusal(
             lambda: read(file)
         )
-    with use_limits(Limits(samples=51, values=153)):
+    with use_limits(Limits(samples=51, memory=8 * 153)):
         assert len(read(file)) == 50
 
 
@@ -570,10 +570,10 @@ def test_a_table_that_is_none_is_refused_in_one_line(tmp_path: Path, content: st
 def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path: Path) -> None:
     assert len(read(written(tmp_path, gzip.compress((HEADER + rows(50)).encode()), "lap.csv.gz"))) == 50
     bomb = written(tmp_path, gzip.compress(HEADER.encode() + (b"0,1,1" + b" " * 995 + b"\n") * 80_000, 9), "bomb.csv.gz")
-    assert "times its size, more than the limit of 250" in refusal(lambda: read(bomb))
+    with use_limits(Limits(memory=10**7)):
+        assert "beyond ten times its size, more than the limit of 10000000" in refusal(lambda: read(bomb))
     torn = written(tmp_path, bomb.read_bytes()[:-100], "torn.csv.gz")
-    with use_limits(Limits(expansion=10_000)):
-        assert "cannot be read" in refusal(lambda: read(torn))
+    assert "cannot be read" in refusal(lambda: read(torn))
 
 
 def test_encodings_that_are_none_of_text_are_refused(tmp_path: Path) -> None:
