@@ -79,12 +79,10 @@ def test_causal_low_pass_does_not_see_the_future(samples: np.ndarray, now: int, 
     np.testing.assert_array_equal(filtered(changed, "causal")[:now], filtered(samples, "causal")[:now])
 
 
-def test_zero_phase_low_pass_sees_the_future_and_says_so() -> None:
+def test_zero_phase_low_pass_sees_the_future() -> None:
     step = np.where(np.arange(200) < 100, 0.0, 1.0)
     assert abs(filtered(step, "zero_phase")[99]) > 0.1
     assert filtered(step, "causal")[99] == 0.0
-    assert LowPass(5.0, direction="zero_phase").mode == "offline"
-    assert LowPass(5.0, direction="causal").mode == "causal"
 
 
 def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
@@ -247,7 +245,6 @@ def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever
     np.testing.assert_allclose(corrected["ay"][inside], true_ay[inside], atol=1e-4)
     before = max(np.abs(recording["ax"] - true_ax).max(), np.abs(recording["ay"] - true_ay).max())
     assert before > 0.1
-    assert MountingCorrection(lever_x, lever_y, yaw).mode == ("causal" if lever_x == lever_y == 0.0 else "offline")
 
 
 def test_mounting_correction_of_one_sample_knows_the_centripetal_part() -> None:
@@ -349,8 +346,6 @@ def test_speed_from_wheels_inverts_what_rolling_wheels_do() -> None:
 def test_a_wheel_that_drops_out_or_spins_does_not_count(value: float) -> None:
     drive, u = damaged(value, "fl")
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
-    assert not WHEELS.plausible(drive)[0, 500:650].any()
-    assert WHEELS.plausible(drive)[1:].all()
 
 
 @pytest.mark.parametrize("wheels", [("rl", "rr"), ("fl", "fr", "rl"), ("fl", "fr", "rl", "rr")])

@@ -88,8 +88,6 @@ def channel(name: str) -> Channel:
     Raises:
         DataError: the name is not in the table.
     """
-    try:
-        return CHANNELS[name]
-    except KeyError:
-        known = ", ".join(sorted(CHANNELS))
-        raise DataError(f"channel '{name}' is not known to vehest; known channels: {known}") from None
+    if name not in CHANNELS:
+        raise DataError(f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}")
+    return CHANNELS[name]

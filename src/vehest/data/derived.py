@@ -1,4 +1,4 @@
-"""Transforms that make channels which a log lacks from others, each causal or offline."""
+"""Transforms that make channels which a log lacks from others, causal unless they say otherwise."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Mode
 from vehest.data.recording import Recording
 
 WHEELS = ("fl", "fr", "rl", "rr")
@@ -58,7 +56,6 @@ class SteeringRatio:
     ratio: float
     offset: float = 0.0
     channel: str = "handwheel"
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
         if self.ratio == 0.0:
@@ -88,7 +85,6 @@ class SteeringCurve:
     inputs: tuple[float, ...]
     angles: tuple[float, ...]
     channel: str = "steer"
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
         if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
@@ -134,7 +130,6 @@ class SpeedFromWheels:
     tolerance: float = 0.3
     most_acceleration: float = 12.0
     hold_seconds: float = 2.0
-    mode: ClassVar[Mode] = "causal"
     relative_tolerance: ClassVar[float] = 0.05
 
     def __post_init__(self) -> None:
@@ -161,23 +156,15 @@ class SpeedFromWheels:
         sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
         return wheels + sides[:, None] * recording["yaw_rate"]
 
-    def plausible(self, recording: Recording) -> NDArray[np.bool_]:
-        """Which wheels count, (4, T).
-
-        Raises:
-            DataError: a channel is missing.
-        """
-        speeds = self.corrected(recording)
-        median = _known_median(speeds)
-        return np.abs(speeds - median) <= self.tolerance + self.relative_tolerance * np.abs(median)
-
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
 
         Raises:
             DataError: a channel is missing, or no wheel was ever measured.
         """
-        speeds, counts = self.corrected(recording), self.plausible(recording)
+        speeds = self.corrected(recording)
+        medians = _known_median(speeds)
+        counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(medians)
         if not np.isfinite(speeds).any():
             raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
@@ -187,7 +174,7 @@ class SpeedFromWheels:
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
         ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         vx, held, now = np.empty(len(recording)), 0, math.nan
-        rows = zip(mean.tolist(), number.tolist(), _known_median(speeds).tolist(), ahead.tolist(), strict=True)
+        rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
             held = 0 if agreeing >= enough else held + 1
             wanted = wheels if agreeing >= enough else median
@@ -236,11 +223,6 @@ class AccelerationFromSpeed:
     def __post_init__(self) -> None:
         require_positive("acceleration from speed", cutoff_hz=self.cutoff_hz)
 
-    @property
-    def mode(self) -> Mode:
-        """As the direction says."""
-        return "causal" if self.direction == "causal" else "offline"
-
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.
 
@@ -267,8 +249,6 @@ class VelocityFromSideslip:
     It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set, moves it from there.
     """
 
-    mode: ClassVar[Mode] = "causal"
-
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
 
@@ -286,8 +266,6 @@ class VelocityFromSideslip:
 @dataclass(frozen=True)
 class SideslipFromVelocity:
     """Make the reference ``sideslip_ref`` from ``vy_ref``: β = atan2(v, u)."""
-
-    mode: ClassVar[Mode] = "causal"
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``sideslip_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where they have them.
@@ -323,7 +301,6 @@ class ScaleToWheelbase:
 
     wheelbase: float
     to: float
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
         require_positive("scale to wheelbase", wheelbase=self.wheelbase, to=self.to)

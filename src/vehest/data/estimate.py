@@ -88,10 +88,9 @@ class Estimate:
 
     def __getitem__(self, name: str) -> FloatArray:
         """Values of one quantity, shape (T,)."""
-        try:
-            return self.channels[name]
-        except KeyError:
-            raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'") from None
+        if name not in self.channels:
+            raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
+        return self.channels[name]
 
     @property
     def time(self) -> FloatArray:

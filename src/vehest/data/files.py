@@ -81,14 +81,8 @@ def regular_file(path: Path) -> Path:
     except (OSError, ValueError) as error:  # a name may be too long, or hold a null character
         raise DataError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
     if not stat.S_ISREG(mode):
-        kinds = {
-            stat.S_IFDIR: "a folder",
-            stat.S_IFIFO: "a pipe",
-            stat.S_IFCHR: "a device",
-            stat.S_IFBLK: "a device",
-            stat.S_IFSOCK: "a socket",
-        }
-        raise DataError(f"'{path}' is {kinds.get(stat.S_IFMT(mode), 'something else')}, not a file")
+        kind = {"d": "a folder", "p": "a pipe", "s": "a socket"}.get(stat.filemode(mode)[0], "a device")
+        raise DataError(f"'{path}' is {kind}, not a file")
     return path
 
 

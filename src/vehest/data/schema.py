@@ -45,7 +45,7 @@ def validated(kind: type[Schema], content: Any, where: str, *, error: type[Vehes
         return cast(Schema, _validated(kind, content))
     except ValidationError as problem:
         message = _in_words(problem, kind, content, above)
-    except _NotPlainError as problem:
+    except ValueError as problem:  # of content that is not plain
         message = str(problem)
     raise error(f"{where}: {message}" if where else message)
 
@@ -97,18 +97,14 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(list[kind], config={**FURTHER_KEYS, "extra": "forbid"})
 
 
-class _NotPlainError(Exception):
-    """Content that JSON cannot hold."""
-
-
 def _plain(value: Any, path: list[str]) -> Any:
     """Content with text as keys and lists for tuples.
 
     Raises:
-        _NotPlainError: a value is not plain, such as a date, or the content nests too deep.
+        ValueError: a value is not plain, such as a date, or the content nests too deep.
     """
     if len(path) > DEEPEST:
-        raise _NotPlainError(f"{path[0]} nests deeper than {DEEPEST} levels")
+        raise ValueError(f"{path[0]} nests deeper than {DEEPEST} levels")
     if isinstance(value, dict):
         return {str(key): _plain(inner, [*path, str(key)]) for key, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -116,7 +112,7 @@ def _plain(value: Any, path: list[str]) -> Any:
     if value is None or isinstance(value, str | bool | float) or (isinstance(value, int) and abs(value) < LARGEST):
         return value
     shown = "a whole number of more than 300 digits" if isinstance(value, int) else f"no plain value but a {type(value).__name__}"
-    raise _NotPlainError(f"{'.'.join(path) or 'it'} is {shown}, {_shown(value)}; put it in quotes if it is text")
+    raise ValueError(f"{'.'.join(path) or 'it'} is {shown}, {_shown(value)}; put it in quotes if it is text")
 
 
 # Bytes of file names that are not UTF-8 are lone surrogates in text (PEP 383), which JSON cannot hold: characters of plane 16,

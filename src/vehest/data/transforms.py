@@ -1,12 +1,12 @@
-"""Transforms of recordings before an estimator reads them, each causal or offline."""
+"""Transforms of recordings before an estimator reads them: pure functions with settings, causal unless they say otherwise."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import scipy
@@ -27,7 +27,6 @@ from vehest.data.derived import (
     speed_of_reference,
 )
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Mode
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
@@ -38,26 +37,16 @@ VALUES_AT_ONCE = 1 << 20
 """Samples that are compared at a time, windows included."""
 
 
-class Transform(Protocol):
-    """A pure function of a recording."""
-
-    @property
-    def mode(self) -> Mode:
-        """``causal`` if no output sample depends on later input samples."""
-        ...
-
-    def __call__(self, recording: Recording) -> Recording:
-        """Apply it."""
-        ...
+Transform = Callable[[Recording], Recording]
 
 
 @dataclass(frozen=True)
 class Resample:
     """Change the sampling rate by any rational ratio; the first sample keeps its time.
 
-    ``polyphase`` applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so nothing is
-    shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th sample as it
-    is (integer ratios only), as a slower sensor or a naive logger would.
+    ``polyphase`` is offline: it applies a linear-phase FIR low-pass (Kaiser window) in polyphase form whose delay is compensated, so
+    nothing is shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th
+    sample as it is (integer ratios only), as a slower sensor or a naive logger would.
 
     Args:
         rate_hz: the new rate [Hz].
@@ -75,11 +64,6 @@ class Resample:
 
     def __post_init__(self) -> None:
         require_positive("resampling", rate_hz=self.rate_hz)
-
-    @property
-    def mode(self) -> Mode:
-        """Zero phase needs future samples."""
-        return "causal" if self.method == "decimate" else "offline"
 
     def __call__(self, recording: Recording) -> Recording:
         """Resample every channel.
@@ -146,8 +130,8 @@ class Resample:
 class LowPass:
     """Remove frequencies above a cut-off.
 
-    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways. A ``fir`` is symmetric
-    (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
+    ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways, offline. A ``fir`` is
+    symmetric (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
 
     Args:
         cutoff_hz: -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz].
@@ -169,11 +153,6 @@ class LowPass:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
         require_positive("low-pass", reach=self.reach)
-
-    @property
-    def mode(self) -> Mode:
-        """Offline if it runs backwards too."""
-        return "causal" if self.direction == "causal" else "offline"
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels.
@@ -210,7 +189,7 @@ class LowPass:
 
 @dataclass(frozen=True)
 class RemoveOutliers:
-    """Replace isolated spikes by the median of their neighbourhood (Hampel filter).
+    """Replace isolated spikes by the median of their neighbourhood (Hampel filter); offline.
 
     Args:
         half_window: samples on either side that count as neighbours.
@@ -224,7 +203,6 @@ class RemoveOutliers:
     half_window: int = 5
     threshold: float = 6.0
     channels: tuple[str, ...] = ()
-    mode: ClassVar[Mode] = "offline"
 
     def __post_init__(self) -> None:
         require_positive("outlier removal", half_window=self.half_window, threshold=self.threshold)
@@ -262,7 +240,7 @@ class MountingCorrection:
     """Bring the accelerometer's readings to the centre of gravity and the vehicle's axes, in the plane.
 
     The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw`` about the vertical axis:
-    a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l).
+    a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l). With a lever arm it is offline: dω/dt is taken by central differences.
 
     Args:
         lever_x: forward offset of the sensor from the centre of gravity [m].
@@ -277,11 +255,6 @@ class MountingCorrection:
     lever_y: float = 0.0
     yaw: float = 0.0
 
-    @property
-    def mode(self) -> Mode:
-        """With a lever arm the yaw acceleration is needed, taken by central differences."""
-        return "causal" if self.lever_x == self.lever_y == 0.0 else "offline"
-
     def __call__(self, recording: Recording) -> Recording:
         """Correct ax and ay.
 
@@ -291,7 +264,7 @@ class MountingCorrection:
         ax, ay, yaw_rate = (recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate")))
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
-        if self.mode == "offline":
+        if self.lever_x or self.lever_y:
             yaw_acceleration = derivative(yaw_rate, recording.rate_hz)
             rotated_x = rotated_x + yaw_acceleration * self.lever_y + yaw_rate**2 * self.lever_x
             rotated_y = rotated_y - yaw_acceleration * self.lever_x + yaw_rate**2 * self.lever_y
@@ -312,7 +285,6 @@ class ReferenceLever:
 
     lever_x: float = 0.0
     lever_y: float = 0.0
-    mode: ClassVar[Mode] = "causal"
 
     def __call__(self, recording: Recording) -> Recording:
         """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate.
@@ -333,7 +305,7 @@ class ReferenceLever:
 
 @dataclass(frozen=True)
 class DelayCorrection:
-    """Bring channels that are late onto the clock of the others: each sample becomes the sensor's value ``delay`` later.
+    """Bring channels that are late onto the clock of the others: each sample becomes the sensor's value ``delay`` later; offline.
 
     Between samples a band-limited interpolation (sinc under a Kaiser window) is used; it is within 0.1 % up to 0.8 of the Nyquist
     frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
@@ -349,7 +321,6 @@ class DelayCorrection:
 
     delay: float
     channels: tuple[str, ...] = ()
-    mode: ClassVar[Mode] = "offline"
     reach: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
 
@@ -389,7 +360,6 @@ class OffsetCorrection:
     """
 
     offsets: dict[str, float] = field(hash=False)
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
         if not self.offsets:
@@ -406,7 +376,7 @@ class OffsetCorrection:
         return recording.with_channels({name: recording[name] - value for name, value in self.offsets.items()})
 
 
-TRANSFORMS: dict[str, type] = {
+TRANSFORMS: dict[str, type[Any]] = {
     "resample": Resample,
     "low_pass": LowPass,
     "remove_outliers": RemoveOutliers,
@@ -463,8 +433,7 @@ def transform_from_config(config: Mapping[str, Any]) -> Transform:
     name = config.get("name")
     if not isinstance(name, str) or name not in TRANSFORMS:
         raise ConfigurationError(f"transform '{name}' is not one of: {', '.join(TRANSFORMS)}")
-    transform: Transform = validated(TRANSFORMS[name], arguments, f"transform '{name}'", error=ConfigurationError)
-    return transform
+    return validated(TRANSFORMS[name], arguments, f"transform '{name}'", error=ConfigurationError)
 
 
 def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray) -> FloatArray:
