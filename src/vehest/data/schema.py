@@ -176,29 +176,29 @@ _WANTED = {
 
 
 def _in_words(problem: ValidationError, kind: type[Any], content: Any, group: list[str]) -> str:
-    """The first error of pydantic in one line, with the errors of other choices of the same union."""
+    """The first error of pydantic in one line, with the other choices of its union."""
     errors = problem.errors(include_url=False)
-    error, path = errors[0]["type"], _path(errors[0]["loc"], [content])[1:]
-    if error == "missing":
-        path = [*path, errors[0]["loc"][-1]]
+    error, loc, shown = errors[0], errors[0]["loc"], _shown(errors[0]["input"])
+    path = [*_path(loc, [content])[1:], *(loc[-1:] if error["type"] == "missing" else ())]
     name = ".".join(str(part) for part in [*group, *path]) or "it"
-    if error == "missing":
-        return f"{name} is missing"
-    if error == "unexpected_keyword_argument":
-        beside, known = name.rpartition(".")[0], _keys_of(_type_at(kind, path[:-1]))
-        return f"{name} is not an option of {beside}; options: {known}" if beside else f"unknown key '{name}'; there are: {known}"
-    if error == "literal_error":
-        choices = errors[0]["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
-        return f"{name} '{errors[0]['input']}' is not one of: {choices}"
-    if error == "value_error":
-        return f"{name}: {errors[0]['ctx']['error']}"
-    if error not in _WANTED:
-        return f"{name}: {errors[0]['msg'][:1].lower()}{errors[0]['msg'][1:]}, not {_shown(errors[0]['input'])}"
-    here = _type_at(kind, path)
-    choices = [_WANTED[own["type"]] for own in errors if own["type"] in _WANTED and _path(own["loc"], [content])[1:] == path]
-    wanted = _bare(here)[1] or " or ".join(dict.fromkeys(choices))
+    match error["type"]:
+        case "missing":
+            return f"{name} is missing"
+        case "unexpected_keyword_argument":
+            beside, known = name.rpartition(".")[0], _keys_of(_type_at(kind, path[:-1]))
+            return f"{name} is not an option of {beside}; options: {known}" if beside else f"unknown key '{name}'; there are: {known}"
+        case "literal_error":
+            choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
+            return f"{name} '{error['input']}' is not one of: {choices}"
+        case "value_error":
+            return f"{name}: {error['ctx']['error']}"
+        case other if other not in _WANTED:
+            return f"{name}: {error['msg'][:1].lower()}{error['msg'][1:]}, not {shown}"
+    here, is_choice = _type_at(kind, path), len(loc) > len(path) + 1
+    kinds = [own["type"] for own in errors if own["loc"][:-1] == loc[:-1]] if is_choice else [error["type"]]
+    wanted = _bare(here)[1] or " or ".join(dict.fromkeys(_WANTED[own] for own in kinds if own in _WANTED))
     options = f"; options: {keys}" if (keys := _keys_of(here)) else ""
-    return f"{name} must be {wanted}, not {_shown(errors[0]['input'])}{options}"
+    return f"{name} must be {wanted}, not {shown}{options}"
 
 
 def _shown(value: Any) -> str:
@@ -210,10 +210,10 @@ def _path(loc: Sequence[str | int], content: Any) -> list[str | int]:
     """Keys and indices of one of pydantic's locations, which also name choices of unions, as far as the content has them."""
     path: list[str | int] = []
     for part in loc:
-        held: dict[Any, Any] = content if isinstance(content, dict) else dict(enumerate(content)) if isinstance(content, list) else {}
-        if part in held:
+        is_item = isinstance(content, list) and isinstance(part, int) and part < len(content)
+        if is_item or (isinstance(content, dict) and part in content):
             path.append(part)
-            content = held[part]
+            content = content[part]
     return path
 
 
