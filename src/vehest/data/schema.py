@@ -98,11 +98,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _plain(value: Any, path: list[str]) -> Any:
-    """Content with text as keys and lists for tuples.
-
-    Raises:
-        ValueError: a value is not plain, such as a date, or the content nests too deep.
-    """
+    """Content with text as keys and lists for tuples; a ValueError where a value is not plain, such as a date, or it nests too deep."""
     if len(path) > DEEPEST:
         raise ValueError(f"{path[0]} nests deeper than {DEEPEST} levels")
     if isinstance(value, dict):

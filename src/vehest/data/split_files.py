@@ -228,11 +228,7 @@ class _Ranges:
         return laps[begin - 1][0], laps[stop - 1][1]
 
     def _reader(self, dataset: str, name: str) -> Reader:
-        """Reads a recording of a data set.
-
-        Raises:
-            ConfigurationError: the data set does not have it.
-        """
+        """Reads a recording that the data set has."""
         recordings = self._recordings(dataset)
         if name not in recordings:
             raise ConfigurationError(f"{self._where}: data set '{dataset}' has no recording '{name}'")

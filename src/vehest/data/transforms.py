@@ -449,11 +449,7 @@ def _extended(samples: FloatArray, margin: int) -> FloatArray:
 
 
 def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, of none those of all measured channels.
-
-    Raises:
-        DataError: one of the channels has gaps.
-    """
+    """The names, of none those of all measured channels; refused where one of the channels has gaps."""
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
     for name in chosen:
         if name in recording.gappy:
