@@ -97,16 +97,16 @@ def test_samples_are_copied_and_cannot_be_written_to() -> None:
 @pytest.mark.parametrize(
     ("changes", "what"),
     [
-        ({"channels": {}}, "no channels"),
-        ({"channels": {"ay": np.zeros(0)}}, "no samples"),
-        ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "differ in length"),
-        ({"channels": {"ay": np.zeros((3, 1))}}, "one-dimensional"),
+        ({"channels": {}}, "one common length"),
+        ({"channels": {"ay": np.zeros(0)}}, "one common length"),
+        ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "one common length"),
+        ({"channels": {"ay": np.zeros((3, 1))}}, "one common length"),
         ({"channels": {"vz": np.zeros(3)}}, "'vz' is not known"),
         ({"channels": {"ay": np.array([0.0, np.nan, 0.0])}}, "channel 'ay' holds 1 NaN between 0.1 s and 0.1 s"),
         ({"channels": {"ay": np.array([0.0, np.inf, 0.0])}}, "infinite"),
         ({"channels": {"ay": np.array([np.nan, -np.inf])}, "gappy": frozenset({"ay"})}, "holds 1 infinite values"),
-        ({"rate_hz": 0.0}, "rate must be positive"),
-        ({"rate_hz": math.nan}, "rate must be positive"),
+        ({"rate_hz": 0.0}, "rate must lie between 1e-06 and 1e+09 Hz, not at 0 Hz"),
+        ({"rate_hz": math.nan}, "rate must lie between"),
         ({"start_time": math.nan}, "start time must be finite"),
         ({"kind": "reel"}, "real or simulated"),
     ],
@@ -163,9 +163,9 @@ def test_a_covariance_of_another_shape_is_refused(shape: tuple[int, ...]) -> Non
 @pytest.mark.parametrize("names", [(), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate")])
 def test_rows_of_a_covariance_must_have_names(names: tuple[str, ...]) -> None:
     channels = {"vy": np.zeros(3), "sideslip": np.zeros(3)}
-    with pytest.raises(DataError, match="covariance_of must name 2 different quantities"):
+    with pytest.raises(DataError, match=r"covariance_of name n quantities, not \(3, 2, 2\) and \("):
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance=np.zeros((3, 2, 2)), covariance_of=names)
-    with pytest.raises(DataError, match="must name 0"):
+    with pytest.raises(DataError, match=r"not None and \(vy\)"):
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance_of=("vy",))
 
 

@@ -154,15 +154,13 @@ def test_plain_decimation_by_a_broken_ratio_points_at_the_filter() -> None:
         Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0))
 
 
-@pytest.mark.parametrize("arguments", [{"rate_hz": 0.0}, {"rate_hz": math.nan}, {"rate_hz": -1.0}, {"rate_hz": 20.0, "method": "spline"}])
-def test_senseless_settings_are_refused(arguments: dict[str, object]) -> None:
-    with pytest.raises(ConfigurationError):
-        Resample(**arguments)  # type: ignore[arg-type]
+@pytest.mark.parametrize("rate_hz", [0.0, math.nan, -1.0])
+def test_a_rate_that_is_not_positive_is_refused(rate_hz: float) -> None:
+    with pytest.raises(ConfigurationError, match="rate_hz must be a positive number"):
+        Resample(rate_hz)
 
 
-def test_only_decimation_calls_itself_causal() -> None:
-    assert Resample(20.0).mode == "offline"
-    assert Resample(20.0, method="decimate").mode == "causal"
+def test_only_decimation_is_causal() -> None:
     recording = recorded(np.zeros(400), 100.0)
     changed = recorded(np.where(np.arange(400) < 200, 0.0, 1.0), 100.0)
     for method, same in (("polyphase", False), ("decimate", True)):

@@ -173,9 +173,9 @@ def test_a_missing_file_is_missing(tmp_path: Path) -> None:
     assert "none.parquet" in one_line(error)
 
 
-def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
+def test_an_empty_file_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "r.parquet").touch()
-    with pytest.raises(DataError, match="is empty") as error:
+    with pytest.raises(DataError, match="size is 0 bytes") as error:
         read_recording(tmp_path / "r.parquet")
     assert "r.parquet" in one_line(error)
 

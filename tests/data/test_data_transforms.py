@@ -79,12 +79,10 @@ def test_causal_low_pass_does_not_see_the_future(samples: np.ndarray, now: int, 
     np.testing.assert_array_equal(filtered(changed, "causal")[:now], filtered(samples, "causal")[:now])
 
 
-def test_zero_phase_low_pass_sees_the_future_and_says_so() -> None:
+def test_zero_phase_low_pass_sees_the_future() -> None:
     step = np.where(np.arange(200) < 100, 0.0, 1.0)
     assert abs(filtered(step, "zero_phase")[99]) > 0.1
     assert filtered(step, "causal")[99] == 0.0
-    assert LowPass(5.0, direction="zero_phase").mode == "offline"
-    assert LowPass(5.0, direction="causal").mode == "causal"
 
 
 def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
@@ -126,23 +124,9 @@ def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length: int) -> None:
     np.testing.assert_allclose(LowPass(5.0, design="fir")(recorded(ay=line))["ay"], line, atol=1e-9)
 
 
-def test_a_causal_low_pass_runs_along_with_the_drive_as_over_the_recording() -> None:
-    generator = np.random.default_rng(0)
-    drive = recorded(ay=generator.standard_normal(80).cumsum() + 5.0, vx=generator.standard_normal(80))
-    low_pass = LowPass(5.0, ("ay",), "causal")
-    stepper, whole = low_pass.online(RATE), low_pass(drive)
-    steps = [stepper.step({name: float(drive[name][k]) for name in ("ay", "vx")}) for k in range(80)]
-    for name in ("ay", "vx"):
-        np.testing.assert_allclose([step[name] for step in steps], whole[name], rtol=0, atol=1e-12)
-    with pytest.raises(DataError, match="'ay' is missing"):
-        stepper.step({"vx": 1.0})
-
-
 def test_what_cannot_be_causal_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="use design=butterworth for a causal one"):
         LowPass(5.0, direction="causal", design="fir")
-    with pytest.raises(ConfigurationError, match="use direction=causal"):
-        LowPass(5.0, design="fir").online(RATE)
 
 
 def test_reference_lever_brings_velocities_to_the_centre_of_gravity() -> None:
@@ -222,7 +206,7 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length: i
 
 @pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
 def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
-    with pytest.raises(ConfigurationError, match="half_window"):
+    with pytest.raises(ConfigurationError, match="must be a positive number"):
         RemoveOutliers(**arguments)  # type: ignore[arg-type]
 
 
@@ -261,7 +245,6 @@ def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever
     np.testing.assert_allclose(corrected["ay"][inside], true_ay[inside], atol=1e-4)
     before = max(np.abs(recording["ax"] - true_ax).max(), np.abs(recording["ay"] - true_ay).max())
     assert before > 0.1
-    assert MountingCorrection(lever_x, lever_y, yaw).mode == ("causal" if lever_x == lever_y == 0.0 else "offline")
 
 
 def test_mounting_correction_of_one_sample_knows_the_centripetal_part() -> None:
@@ -363,8 +346,6 @@ def test_speed_from_wheels_inverts_what_rolling_wheels_do() -> None:
 def test_a_wheel_that_drops_out_or_spins_does_not_count(value: float) -> None:
     drive, u = damaged(value, "fl")
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
-    assert not WHEELS.plausible(drive)[0, 500:650].any()
-    assert WHEELS.plausible(drive)[1:].all()
 
 
 @pytest.mark.parametrize("wheels", [("rl", "rr"), ("fl", "fr", "rl"), ("fl", "fr", "rl", "rr")])
@@ -466,7 +447,7 @@ def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:
         ({"name": "low_pass", "cutoff_hz": 5, "design": "fir", "reach": 1e308}, "filter_samples"),
         ({"name": "remove_outliers", "half_window": 10**9}, "filter_samples"),
         ({"name": "remove_outliers", "half_window": 10**30}, "filter_samples"),
-        ({"name": "remove_outliers", "half_window": 499_999, "channels": "long"}, "values"),
+        ({"name": "remove_outliers", "half_window": 499_999, "channels": "long"}, "memory"),
     ],
     ids=str,
 )
@@ -498,6 +479,7 @@ def test_a_rate_that_leaves_nothing_is_refused() -> None:
         ({"name": "mounting_correction", "yaw": [1]}, "yaw must be a number"),
         ({"name": "resample", "rate_hz": True}, "rate_hz must be a number, not True"),
         ({"name": ["resample"]}, "is not one of"),
+        ({"name": "resample", "rate_hz": 20, "method": "spline"}, "method 'spline' is not one of: polyphase, decimate"),
     ],
 )
 def test_an_argument_of_the_wrong_type_is_named(config: dict[str, object], said: str) -> None:

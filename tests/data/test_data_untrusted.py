@@ -83,15 +83,14 @@ class Kinds:
     [
         ({"names": "a"}, "it.names must be a list of names, not 'a'"),
         ({"names": [3]}, "it.names.0 must be text, not 3"),
-        ({"inner": 3}, "it.inner must be a list of mappings, not 3"),
+        ({"inner": 3}, "it.inner must be a list, not 3"),
         ({"inner": ["a"]}, "it.inner.0 must be a group of options, not 'a'; options: gain, steps"),
         ({"inner": [{"gain": 1, "gian": 1}]}, "it.inner.0.gian is not an option of it.inner.0; options: gain, steps"),
-        ({"lists": 3}, "it.lists must be a list of lists of whole numbers, not 3"),
-        ({"lists": [3]}, "it.lists.0 must be a list of whole numbers, not 3"),
+        ({"lists": [3]}, "it.lists.0 must be a list, not 3"),
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
         ({"pair": [1, 2]}, "it.pair.1 must be text, not 2"),
-        ({"files": 3}, "it.files must be text or a list of text, not 3"),
-        ({"values": {"a": [1]}}, "it.values.a must be a number or true or false or text, not [1]"),
+        ({"files": 3}, "it.files must be text or a list, not 3"),
+        ({"values": {"a": [1]}}, "it.values.a must be a whole number or a number or true or false or text, not [1]"),
         ({"rate": "x"}, "it.rate must be a number up to 5, not 'x'"),
         ({"rate": float("nan")}, "it.rate must be a number up to 5, not nan"),
         ({"maps": {"a": 3}}, "it.maps.a must be a mapping, not 3"),
@@ -119,7 +118,7 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
     file = tmp_path / "bomb.yaml"
     file.write_text("\n".join(lines))
     started = time.process_time()
-    with pytest.raises(DataError, match=r"bomb.yaml' holds more than 500000 values"):
+    with pytest.raises(DataError, match=r"bomb.yaml' nests deeper than 60 levels or holds more than 500000 values"):
         read_yaml(file)
     assert time.process_time() - started < 5.0  # processor time of a bomb that would take hours
 
@@ -127,8 +126,8 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: &a [*a]", "repeats 'a' inside itself"),
-        ("[" * 100 + "]" * 100, "nests deeper than 60 levels"),
+        ("a: &a [*a]", "holds more than 500000 values, repeated ones included"),
+        ("[" * 100000, "nests deeper than 60 levels"),
         ("a: [1", "cannot be read as YAML"),
         ("a: !!python/object/apply:os.system ['true']", "cannot be read as YAML"),
         ("a: 2020-13-45", "cannot be read as YAML"),
@@ -146,9 +145,9 @@ def test_honest_yaml_with_anchors_is_read():
     assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
 
 
-@pytest.mark.parametrize("text", ["[" * 100000, '{"a": ' * 70 + "1" + "}" * 70, "{", "1" * 5000, b"\xff\xfe"])
+@pytest.mark.parametrize("text", ["[" * 100000, "{", "1" * 5000, b"\xff\xfe"])
 def test_json_that_is_none_is_one_line(text):
-    with pytest.raises(DataError, match=r"cannot be read as JSON|nests deeper"):
+    with pytest.raises(DataError, match="cannot be read as JSON"):
         parse_json(text, "'f'")
 
 
@@ -182,8 +181,8 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
         with pytest.raises(DataError, match=r"6 samples, more than the limit of 5"):
             check_limit("samples", 6, "'f' holds 6 samples")
     assert current_limits() == Limits()
-    for wrong in ({"sample": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
-        with pytest.raises(ConfigurationError, match=r"limits\.sample"):
+    for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
+        with pytest.raises(ConfigurationError, match=r"limits\.(samples must be a whole number|values is not an option .*samples)"):
             limits_from_config(wrong)
 
 
@@ -191,18 +190,16 @@ def test_the_configuration_names_every_limit_with_its_default():
     assert limits_from_config(compose_config("ingest", ["dataset=tabular"])["limits"]) == Limits()
 
 
-def test_a_file_may_not_unpack_to_hundreds_of_times_its_size():
-    check_unpacked("f", 1000, 60 * 2**20)
-    check_unpacked("f", 2**20, 200 * 2**20)
-    with pytest.raises(DataError, match="times its size"):
-        check_unpacked("f", 1000, 100 * 2**20)
-    with pytest.raises(DataError, match="bytes"):
-        check_unpacked("f", 2**40, 2**41)
+def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
+    with use_limits(Limits(memory=1000)):
+        check_unpacked("f", 200, 3000)
+        with pytest.raises(DataError, match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER"):
+            check_unpacked("f", 200, 3001)
 
 
-def test_an_hour_at_1_khz_stays_below_half_of_the_limits():
-    assert Limits().samples > 2 * 3600 * 1000
-    assert Limits().values > 2 * 3600 * 1000 * 55
+def test_an_hour_at_1_khz_stays_below_the_limits():
+    assert Limits().samples > 3600 * 1000
+    assert Limits().memory > 8 * 3600 * 1000 * 55
 
 
 @given(st.text(max_size=300))

@@ -261,7 +261,7 @@ def test_inputs_stay_apart_from_what_is_read_for_the_sideslip_only() -> None:
     ("config", "message"),
     [
         ({"inputs": []}, "at least one channel"),
-        ({"inputs": "ax"}, r"estimator\.inputs must be a list of text, not 'ax'"),
+        ({"inputs": "ax"}, r"estimator\.inputs must be a list, not 'ax'"),
         ({"inputs": ["ax", "ax"]}, "list of different channels"),
         ({"inputs": ["warp"]}, "channel 'warp' is not known"),
         ({"inputs": ["vy_ref"]}, "'vy_ref' comes from a reference sensor"),

@@ -13,13 +13,13 @@ import yaml
 
 from conftest import planar_drive
 from place import DATASET, Place
-from vehest.data.contents import Contents, common_channels, contents_of, stored_contents
+from vehest.data.derivable_channels import MAKES, derivation_of
 from vehest.data.derived import WHEELS
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.data.recording_summary import RecordingSummary, common_channels, stored_summary, summary_of
 from vehest.data.schema import settings_from_config
 from vehest.data.store import write_recording
-from vehest.data.supplies import MAKES, supply_of
 from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.needs import lacking_to_train
@@ -49,7 +49,7 @@ def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float
 
 
 def rows(recording: Recording) -> dict[str, dict]:
-    return {row.estimator: row.as_plain() for row in all_usabilities([contents_of(recording)])}
+    return {row.estimator: row.as_plain() for row in all_usabilities([summary_of(recording)])}
 
 
 def with_values(entries: list[dict]) -> list[dict]:
@@ -91,16 +91,16 @@ def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do
     recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
     write_recording(recording, tmp_path / "gap.parquet")
     assert (
-        stored_contents(tmp_path / "gap.parquet")
-        == contents_of(recording)
-        == Contents("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
+        stored_summary(tmp_path / "gap.parquet")
+        == summary_of(recording)
+        == RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
     )
 
 
 def test_table_of_someone_else_is_no_recording(tmp_path):
     pd.DataFrame({"vx": [1.0]}).to_parquet(tmp_path / "other.parquet")
     with pytest.raises(DataError, match="not a recording that vehest wrote"):
-        stored_contents(tmp_path / "other.parquet")
+        stored_summary(tmp_path / "other.parquet")
 
 
 # What estimators need
@@ -152,7 +152,7 @@ def test_estimator_of_another_package_says_itself_what_it_learns_from():
 
 
 def test_estimator_without_a_file_in_conf_is_told_by_its_defaults():
-    found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [contents_of(log(FULL))])
+    found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))])
     assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
 
 
@@ -199,7 +199,7 @@ def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels
 
 @pytest.mark.parametrize("name", ["dugoff_ukf", "sideslip_ffnn", "cnn_ukf", "ensemble_ukf", "velocity_gru", "velocity_lstm"])
 def test_settings_that_are_offered_make_the_estimator_usable(name):
-    contents = [contents_of(log(FULL))]
+    contents = [summary_of(log(FULL))]
     config = compose_config("train", [f"estimator={name}"])
     plain = usability(name, config, contents)
     assert plain.usable == "no"
@@ -208,7 +208,7 @@ def test_settings_that_are_offered_make_the_estimator_usable(name):
 
 
 def test_wheelbase_is_a_missing_setting_and_giving_it_helps():
-    contents = [contents_of(log(FULL))]
+    contents = [summary_of(log(FULL))]
     row = usability("data_sheet", compose_config("train", ["estimator=data_sheet"]), contents)
     assert row.usable == "no"
     assert "estimator.wheelbase=" in row.to_give
@@ -224,10 +224,10 @@ def test_log_without_a_reference_will_do_for_models_from_elsewhere():
 
 
 def test_nothing_is_made_of_a_speed_with_gaps_or_of_channels_that_are_not_there():
-    assert supply_of("ax", {"vx"}, {"vx"}, 50.0) is None
-    assert supply_of("steer", {"vx", "yaw_rate"}, (), 50.0) is None
-    assert supply_of("vy_ref", {"sideslip_ref"}, (), 50.0) is None
-    assert supply_of("motor_current", set(UNITS), (), 50.0) is None
+    assert derivation_of("ax", {"vx"}, {"vx"}, 50.0) is None
+    assert derivation_of("steer", {"vx", "yaw_rate"}, (), 50.0) is None
+    assert derivation_of("vy_ref", {"sideslip_ref"}, (), 50.0) is None
+    assert derivation_of("motor_current", set(UNITS), (), 50.0) is None
 
 
 def test_gaps_are_told_to_estimators_that_cannot_skip_them():
@@ -240,7 +240,7 @@ def test_gaps_are_told_to_estimators_that_cannot_skip_them():
 
 
 def test_channels_count_that_every_recording_has():
-    one, other = contents_of(log(FULL)), contents_of(log(FULL - {"ax"}, name="other"))
+    one, other = summary_of(log(FULL)), summary_of(log(FULL - {"ax"}, name="other"))
     assert common_channels([one, other]) == FULL - {"ax"}
     assert usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
 
@@ -448,7 +448,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
 
 
 def test_rates_that_recordings_have_are_left_alone():
-    config, limit = compose_config("eval", ["estimator=luenberger"]), Contents("lap", 100.0, frozenset())
+    config, limit = compose_config("eval", ["estimator=luenberger"]), RecordingSummary("lap", 100.0, frozenset())
     for group in ("estimator", "evaluation"):
         assert lower_rate(config, group, limit) == (config, [])
 
@@ -456,10 +456,10 @@ def test_rates_that_recordings_have_are_left_alone():
 def test_setting_that_makes_no_sense_at_the_lower_rate_is_told_with_it():
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
     with pytest.raises(DataError, match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window"):
-        lower_rate(config, "estimator", Contents("lap", 20.0, frozenset()))
+        lower_rate(config, "estimator", RecordingSummary("lap", 20.0, frozenset()))
 
 
 def test_lengths_that_a_training_counts_in_samples_are_told():
     config = compose_config("eval", ["estimator=velocity_gru"])
-    _, ((_, text),) = lower_rate(config, "estimator", Contents("lap", 50.0, frozenset()))
+    _, ((_, text),) = lower_rate(config, "estimator", RecordingSummary("lap", 50.0, frozenset()))
     assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text

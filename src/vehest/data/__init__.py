@@ -1,1 +1,1 @@
-"""What a recording is: channels, recordings, estimates, their store, transforms, splits and windows."""
+"""Channels, recordings, estimates, their store, transforms, splits and windows; limits and schemas of files."""

@@ -1,4 +1,4 @@
-"""The one table of channels: canonical name, unit, meaning and the range that a road vehicle can reach.
+"""Table of channels: canonical name, unit, meaning and the range that a road vehicle can reach.
 
 Axes are those of ISO 8855 (x forward, y left, z up, counter-clockwise positive), units are SI, angles are radians.
 Channels whose name ends in ``_ref`` come from a reference sensor; estimators never see them.
@@ -21,7 +21,7 @@ class Channel:
     Args:
         name: canonical name.
         unit: SI unit, ``1`` where the quantity has none.
-        meaning: what is measured, with its sign convention.
+        meaning: measured quantity, with its sign convention.
         low: smallest value that a road vehicle can produce [unit].
         high: largest value that a road vehicle can produce [unit].
         rests: whether it may stay at exactly zero while the car moves, as the pressure of a brake does.
@@ -88,8 +88,6 @@ def channel(name: str) -> Channel:
     Raises:
         DataError: the name is not in the table.
     """
-    try:
-        return CHANNELS[name]
-    except KeyError:
-        known = ", ".join(sorted(CHANNELS))
-        raise DataError(f"channel '{name}' is not known to vehest; known channels: {known}") from None
+    if name not in CHANNELS:
+        raise DataError(f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}")
+    return CHANNELS[name]

@@ -1,4 +1,4 @@
-"""Channels that are made of others, where a log lacks them: each transform says from what, and whether it is causal or offline."""
+"""Transforms that make channels which a log lacks from others, causal unless they say otherwise."""
 
 from __future__ import annotations
 
@@ -7,16 +7,40 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 
-Mode = Literal["causal", "offline"]
 WHEELS = ("fl", "fr", "rl", "rr")
+
+
+def require_channel(name: str, what: str) -> None:
+    """Refuse a channel that is not in the table.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if name not in CHANNELS:
+        raise ConfigurationError(f"{what} of '{name}': there is no such channel; 'vehest data channels' lists them")
+
+
+def require_positive(what: str, **values: float) -> None:
+    """Refuse values that are not positive.
+
+    Raises:
+        ConfigurationError: one is zero, negative or not finite.
+    """
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise ConfigurationError(f"{what}: {name} must be a positive number, not {value!r}")
+
+
+def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
+    """Central differences of samples, shape (T,) [unit/s]."""
+    return np.gradient(samples) * rate_hz if len(samples) > 1 else np.zeros(1)
 
 
 @dataclass(frozen=True)
@@ -32,15 +56,11 @@ class SteeringRatio:
     ratio: float
     offset: float = 0.0
     channel: str = "handwheel"
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.ratio) and self.ratio != 0.0 and math.isfinite(self.offset)):
-            raise ConfigurationError(
-                f"a steering ratio must be a number other than zero and its offset a number, not {self.ratio} and {self.offset}"
-            )
-        if self.channel not in CHANNELS:
-            raise ConfigurationError(f"steering ratio of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
+        if self.ratio == 0.0:
+            raise ConfigurationError("a steering ratio must be a number other than zero")
+        require_channel(self.channel, "steering ratio")
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``; it has gaps where the angle has them.
@@ -49,8 +69,7 @@ class SteeringRatio:
             DataError: the channel is missing.
         """
         steer = (recording[self.channel] - self.offset) / self.ratio
-        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
-        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
+        return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
 
 @dataclass(frozen=True)
@@ -60,19 +79,17 @@ class SteeringCurve:
     Args:
         inputs: values of the channel at the corners, increasing.
         angles: road-wheel angle at each [rad]; beyond the first and last corner the curve is flat.
-        channel: what the curve is applied to; ``steer`` itself may be it.
+        channel: that the curve is applied to; it may be ``steer``.
     """
 
     inputs: tuple[float, ...]
     angles: tuple[float, ...]
     channel: str = "steer"
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
         if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
             raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
-        if self.channel not in CHANNELS:
-            raise ConfigurationError(f"steering curve of '{self.channel}': there is no such channel; 'vehest data channels' lists them")
+        require_channel(self.channel, "steering curve")
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``; it has gaps where the channel has them.
@@ -81,8 +98,7 @@ class SteeringCurve:
             DataError: the channel is missing.
         """
         steer = np.interp(recording[self.channel], self.inputs, self.angles)
-        gappy = recording.gappy | {"steer"} if self.channel in recording.gappy else recording.gappy - {"steer"}
-        return replace(recording, channels={**recording.channels, "steer": steer}, gappy=gappy)
+        return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
 
 @dataclass(frozen=True)
@@ -114,16 +130,13 @@ class SpeedFromWheels:
     tolerance: float = 0.3
     most_acceleration: float = 12.0
     hold_seconds: float = 2.0
-    mode: ClassVar[Mode] = "causal"
     relative_tolerance: ClassVar[float] = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("wheel_radius", "track_front", "track_rear", "tolerance", "most_acceleration", "hold_seconds"):
-            value = getattr(self, name)
-            may_be_zero = name.startswith("track")
-            if not (isinstance(value, int | float) and math.isfinite(value) and (value > 0 or (may_be_zero and value == 0))):
-                what = "zero or a positive number" if may_be_zero else "a positive number"
-                raise ConfigurationError(f"speed from wheels: {name} must be {what}, not {value!r}")
+        require_positive("speed from wheels", wheel_radius=self.wheel_radius, tolerance=self.tolerance)
+        require_positive("speed from wheels", most_acceleration=self.most_acceleration, hold_seconds=self.hold_seconds)
+        if not min(self.track_front, self.track_rear) >= 0.0:
+            raise ConfigurationError(f"speed from wheels: tracks must be zero or positive, not {self.track_front} and {self.track_rear}")
 
     def corrected(self, recording: Recording) -> FloatArray:
         """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
@@ -143,23 +156,15 @@ class SpeedFromWheels:
         sides = 0.5 * np.array([self.track_front, -self.track_front, self.track_rear, -self.track_rear])
         return wheels + sides[:, None] * recording["yaw_rate"]
 
-    def plausible(self, recording: Recording) -> NDArray[np.bool_]:
-        """Which wheels count, (4, T).
-
-        Raises:
-            DataError: a channel is missing.
-        """
-        speeds = self.corrected(recording)
-        median = _known_median(speeds)
-        return np.abs(speeds - median) <= self.tolerance + self.relative_tolerance * np.abs(median)
-
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
 
         Raises:
             DataError: a channel is missing, or no wheel was ever measured.
         """
-        speeds, counts = self.corrected(recording), self.plausible(recording)
+        speeds = self.corrected(recording)
+        medians = _known_median(speeds)
+        counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(medians)
         if not np.isfinite(speeds).any():
             raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
         enough = min(2, sum(f"wheel_speed_{wheel}" in recording for wheel in WHEELS))
@@ -169,7 +174,7 @@ class SpeedFromWheels:
         mean = np.where(counts, speeds, 0.0).sum(0) / np.maximum(number, 1)
         ahead = np.nan_to_num(recording["ax"]) * step if "ax" in recording else np.zeros(len(recording))
         vx, held, now = np.empty(len(recording)), 0, math.nan
-        rows = zip(mean.tolist(), number.tolist(), _known_median(speeds).tolist(), ahead.tolist(), strict=True)
+        rows = zip(mean.tolist(), number.tolist(), medians.tolist(), ahead.tolist(), strict=True)
         for k, (wheels, agreeing, median, gain) in enumerate(rows):
             held = 0 if agreeing >= enough else held + 1
             wanted = wheels if agreeing >= enough else median
@@ -183,7 +188,7 @@ class SpeedFromWheels:
         if not np.isfinite(vx).any():
             raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
         vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
-        return replace(recording, channels={**recording.channels, "vx": vx}, gappy=recording.gappy - {"vx"})
+        return recording.with_channels({"vx": vx}, made_of=())
 
 
 def _known_median(speeds: FloatArray) -> FloatArray:
@@ -199,8 +204,8 @@ def _known_median(speeds: FloatArray) -> FloatArray:
 class AccelerationFromSpeed:
     """Make the longitudinal acceleration ``ax`` from a speed: ax ≈ dvx/dt, low-passed.
 
-    An accelerometer shows du/dt - v·r; the second term, v being what is looked for, is left out. It is small where sideslip is: 0.2 m/s²
-    for v = 0.5 m/s and r = 0.4 rad/s.
+    An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
+    v = 0.5 m/s and r = 0.4 rad/s.
 
     Args:
         channel: the speed; ``vx`` or ``vx_ref``.
@@ -216,13 +221,7 @@ class AccelerationFromSpeed:
     direction: Literal["causal", "zero_phase"] = "causal"
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.cutoff_hz) and self.cutoff_hz > 0):
-            raise ConfigurationError(f"acceleration from speed: cutoff_hz must be a positive number, not {self.cutoff_hz}")
-
-    @property
-    def mode(self) -> Mode:
-        """As the direction says."""
-        return "causal" if self.direction == "causal" else "offline"
+        require_positive("acceleration from speed", cutoff_hz=self.cutoff_hz)
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.
@@ -235,14 +234,12 @@ class AccelerationFromSpeed:
             raise DataError(f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it")
         if not self.cutoff_hz < rate / 2:
             raise DataError(f"recording '{recording.id}': cutoff_hz must lie below half of {rate:g} Hz, not at {self.cutoff_hz:g}")
-        sections = signal.butter(2, self.cutoff_hz, fs=rate, output="sos")
+        sections = scipy.signal.butter(2, self.cutoff_hz, fs=rate, output="sos")
         if self.direction == "causal":
-            steps = np.diff(speed, prepend=speed[0]) * rate
-            ax = signal.sosfilt(sections, steps)
+            ax = scipy.signal.sosfilt(sections, np.diff(speed, prepend=speed[0]) * rate)
         else:
-            steps = np.gradient(speed) * rate if len(speed) > 1 else np.zeros(1)
-            ax = signal.sosfiltfilt(sections, steps, padlen=min(9, len(steps) - 1))
-        return replace(recording, channels={**recording.channels, "ax": np.asarray(ax)}, gappy=recording.gappy - {"ax"})
+            ax = scipy.signal.sosfiltfilt(sections, derivative(speed, rate), padlen=min(9, len(speed) - 1))
+        return recording.with_channels({"ax": ax}, made_of=())
 
 
 @dataclass(frozen=True)
@@ -252,29 +249,23 @@ class VelocityFromSideslip:
     It holds where the angle was measured; `ReferenceLever`, or ``reference_point`` of a data set, moves it from there.
     """
 
-    mode: ClassVar[Mode] = "causal"
-
     def __call__(self, recording: Recording) -> Recording:
         """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
 
         Raises:
             DataError: the angle or the speed is missing, or the angle reaches 90 degrees, where it says nothing.
         """
-        angle, speed = recording["sideslip_ref"], _speed_of_reference(recording)
+        angle, speed = recording["sideslip_ref"], speed_of_reference(recording)
         if np.nanmax(np.abs(angle), initial=0.0) >= 0.5 * np.pi:
             worst = int(np.nanargmax(np.abs(angle)))
             what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
             raise DataError(f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only")
-        sources = {"sideslip_ref", _name_of_speed(recording)}
-        gappy = recording.gappy | {"vy_ref"} if sources & recording.gappy else recording.gappy - {"vy_ref"}
-        return replace(recording, channels={**recording.channels, "vy_ref": speed * np.tan(angle)}, gappy=gappy)
+        return recording.with_channels({"vy_ref": recording[speed] * np.tan(angle)}, made_of=("sideslip_ref", speed))
 
 
 @dataclass(frozen=True)
 class SideslipFromVelocity:
     """Make the reference ``sideslip_ref`` from ``vy_ref``: β = atan2(v, u)."""
-
-    mode: ClassVar[Mode] = "causal"
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``sideslip_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where they have them.
@@ -282,18 +273,13 @@ class SideslipFromVelocity:
         Raises:
             DataError: the velocity or the speed is missing.
         """
-        angle = np.arctan2(recording["vy_ref"], _speed_of_reference(recording))
-        sources = {"vy_ref", _name_of_speed(recording)}
-        gappy = recording.gappy | {"sideslip_ref"} if sources & recording.gappy else recording.gappy - {"sideslip_ref"}
-        return replace(recording, channels={**recording.channels, "sideslip_ref": angle}, gappy=gappy)
+        speed = speed_of_reference(recording)
+        return recording.with_channels({"sideslip_ref": np.arctan2(recording["vy_ref"], recording[speed])}, made_of=("vy_ref", speed))
 
 
-def _name_of_speed(recording: Recording) -> str:
+def speed_of_reference(recording: Recording) -> str:
+    """Channel of the forward speed that goes with a reference."""
     return "vx_ref" if "vx_ref" in recording else "vx"
-
-
-def _speed_of_reference(recording: Recording) -> FloatArray:
-    return recording[_name_of_speed(recording)]
 
 
 @dataclass(frozen=True)
@@ -315,13 +301,9 @@ class ScaleToWheelbase:
 
     wheelbase: float
     to: float
-    mode: ClassVar[Mode] = "causal"
 
     def __post_init__(self) -> None:
-        for name in ("wheelbase", "to"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigurationError(f"scale to wheelbase: {name} must be a positive number of metres, not {value}")
+        require_positive("scale to wheelbase", wheelbase=self.wheelbase, to=self.to)
 
     def __call__(self, recording: Recording) -> Recording:
         """Scale rate, start time and channels."""
@@ -330,9 +312,4 @@ class ScaleToWheelbase:
         channels = {
             name: samples * factors[unit] for name, samples in recording.channels.items() if (unit := CHANNELS[name].unit) in factors
         }
-        return replace(
-            recording,
-            rate_hz=recording.rate_hz / stretch,
-            start_time=recording.start_time * stretch,
-            channels=channels,
-        )
+        return replace(recording, rate_hz=recording.rate_hz / stretch, start_time=recording.start_time * stretch, channels=channels)

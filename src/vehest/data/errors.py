@@ -1,4 +1,4 @@
-"""Errors that a user of vehest can act on; each message is one line that names what is wrong and what to do."""
+"""Errors that a user can act on; each message is one line that names the cause and the remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an estimator returns: time series of the estimated quantities on a recording's clock."""
+"""Estimates: time series of the estimated quantities on a recording's clock."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUANTITIES: dict[str, str] = {
     "health": "1",
     "health_reason": "1",
 }
-"""What an estimate may hold, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
+"""Quantities of an estimate, with units. ``rim_speed`` is the driven wheels' angular speed times their radius; a cornering stiffness is an
 axle's force per slip angle where there is none, ``tyre_c1`` where its curve bends (`vehest.vehicle.rational_tyres`); ``nis`` the normalised
 innovation squared of a filter's update, eᵀS⁻¹e, and ``nis_dof`` how many numbers were measured at it. ``band_vy`` and ``band_sideslip`` are
 half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) or 2 (invalid), ``health_reason`` says why by a number
@@ -71,22 +71,16 @@ class Estimate:
     covariance_of: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        lengths = set()
-        for name, values in self.channels.items():
-            if name not in QUANTITIES:
-                raise DataError(f"estimate of '{self.recording_id}': unknown quantity '{name}'")
-            lengths.add(len(values))
+        where, lengths = f"estimate of '{self.recording_id}'", {len(values) for values in self.channels.values()}
+        for name in self.channels.keys() - QUANTITIES.keys():
+            raise DataError(f"{where}: unknown quantity '{name}'")
         if len(lengths) != 1:
-            raise DataError(f"estimate of '{self.recording_id}': quantities must have one common length, not {sorted(lengths)}")
-        if self.covariance is not None:
-            shape = self.covariance.shape
-            if len(shape) != 3 or shape[0] != len(self) or shape[1] != shape[2]:
-                raise DataError(f"estimate of '{self.recording_id}': the covariance must be of shape ({len(self)}, n, n), not {shape}")
-        n_rows = 0 if self.covariance is None else self.covariance.shape[1]
-        if len(set(self.covariance_of)) != n_rows or len(self.covariance_of) != n_rows or set(self.covariance_of) - set(QUANTITIES):
+            raise DataError(f"{where}: quantities must have one common length, not {sorted(lengths)}")
+        n_rows, shape = len(self.covariance_of), None if self.covariance is None else self.covariance.shape
+        if shape != ((len(self), n_rows, n_rows) if n_rows else None) or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows:
+            names = ", ".join(self.covariance_of)
             raise DataError(
-                f"estimate of '{self.recording_id}': covariance_of must name {n_rows} different quantities, one a row of the covariance, "
-                f"not ({', '.join(self.covariance_of)})"
+                f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, not {shape} and ({names})"
             )
 
     def __len__(self) -> int:
@@ -94,10 +88,9 @@ class Estimate:
 
     def __getitem__(self, name: str) -> FloatArray:
         """Values of one quantity, shape (T,)."""
-        try:
-            return self.channels[name]
-        except KeyError:
-            raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'") from None
+        if name not in self.channels:
+            raise DataError(f"estimator '{self.estimator}' does not estimate '{name}'")
+        return self.channels[name]
 
     @property
     def time(self) -> FloatArray:
@@ -105,7 +98,7 @@ class Estimate:
         return self.start_time + np.arange(len(self)) / self.rate_hz
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
-        """Values of ``name`` at other times: the latest one that is not in the future, NaN outside the estimate.
+        """Values of ``name`` at other times: the latest that is not in the future, NaN outside the estimate.
 
         Args:
             times: shape (K,) [s].

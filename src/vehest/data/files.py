@@ -1,4 +1,4 @@
-"""Writing so that a reader never meets half a file: write aside, flush to disk, rename."""
+"""Writes files so that no reader meets half of one: write aside, flush to disk, rename."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError, VehestError
 
 ASIDE_PREFIX = ".writing-"
-FOREIGN_SECONDS = 24 * 3600.0  # after which what another host writes is taken for left over; its processes cannot be looked at from here
+_ASIDE = re.compile(rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?")  # process and host before the name
+FOREIGN_SECONDS = 24 * 3600.0  # after which files of another host count as left over, whose processes cannot be seen from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _NO_ROOM_WORDS = {
     **{os.strerror(number): number for number in sorted(NO_ROOM)},
@@ -52,7 +53,8 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
         else:
             os.replace(aside, path)
     except OSError as error:
-        raise writing_error(_target(path, aside, error), error) from error
+        named = Path(error.filename) if isinstance(error.filename, str) else aside
+        raise writing_error(path if named.is_relative_to(aside) or ASIDE_PREFIX in str(named) else named, error) from error
     except VehestError:
         raise
     except Exception as error:
@@ -79,33 +81,26 @@ def regular_file(path: Path) -> Path:
     except (OSError, ValueError) as error:  # a name may be too long, or hold a null character
         raise DataError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
     if not stat.S_ISREG(mode):
-        kinds = {
-            stat.S_IFDIR: "a folder",
-            stat.S_IFIFO: "a pipe",
-            stat.S_IFCHR: "a device",
-            stat.S_IFBLK: "a device",
-            stat.S_IFSOCK: "a socket",
-        }
-        raise DataError(f"'{path}' is {kinds.get(stat.S_IFMT(mode), 'something else')}, not a file")
+        kind = {"d": "a folder", "p": "a pipe", "s": "a socket"}.get(stat.filemode(mode)[0], "a device")
+        raise DataError(f"'{path}' is {kind}, not a file")
     return path
 
 
 def file_name(name: str, ending: str = "") -> str:
-    """A name from anywhere as a file's name: one component of a path, the same for the same name, another for another.
+    """A name as one component of a path, another for another name.
 
-    Letters, digits, ``_``, ``-``, ``+``, ``=`` and ``.`` stay; a name that holds anything else, begins with a dot or is long gets what is
-    left of it and the start of its hash.
+    Letters, digits, ``_``, ``-``, ``+``, ``=`` and ``.`` stay; of a name that holds anything else, begins with a dot or is long, the rest
+    is followed by the start of its hash.
     """
     kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
     if kept != name or not name or len(kept.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
-        short = kept.encode()[:100].decode("utf-8", "ignore")
-        return f"{short}~{digest}{ending}"
+        kept = f"{kept.encode()[:100].decode('utf-8', 'ignore')}~{digest}"
     return f"{kept}{ending}"
 
 
 def no_room(error: BaseException) -> OSError | None:
-    """The full disk behind an error of a library that has its own kind of error for it; None where it is something else."""
+    """The full disk behind an error, also one that a library only words; None where the cause is another."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in NO_ROOM:
@@ -120,18 +115,16 @@ def no_room(error: BaseException) -> OSError | None:
 
 def writing_error(path: Path, error: OSError) -> VehestError:
     """The one-line error for a failure to write to ``path``."""
-    path, full = _as_finished(path), no_room(error)
+    path, full = Path(*(_ASIDE.sub("", part) for part in path.parts)), no_room(error)  # as it is called in the end
     if full is not None:
         return MissingError(f"no room left to write '{path}' ({full.strerror}); free some space and run again")
     return MissingError(f"cannot write '{path}': {error.strerror or error}; check the folder and its permissions")
 
 
 def as_os_error(error: Exception) -> OSError:
-    """The failed write that safetensors reports in prose, with the number of its error."""
-    text = str(error)
-    marker = "os error "
-    number = int(text.split(marker)[1].split(")")[0]) if marker in text else errno.EIO
-    return OSError(number, text)
+    """The failed write that safetensors reports as text, with the number of its error."""
+    number = re.search(r"os error (\d+)", str(error))
+    return OSError(int(number[1]) if number else errno.EIO, str(error))
 
 
 def remove(path: Path) -> None:
@@ -143,7 +136,7 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Remove what killed writers left in ``folder``; what a living process is writing stays. Returns how many."""
+    """Remove files of ended writers in ``folder``; those of running processes stay. Returns their number."""
     leftovers = [path for path in folder.glob(f"{ASIDE_PREFIX}*") if is_left_over(path)] if folder.is_dir() else []
     for leftover in leftovers:
         remove(leftover)
@@ -151,20 +144,20 @@ def remove_leftovers(folder: Path) -> int:
 
 
 def is_left_over(path: Path) -> bool:
-    """Whether the process that was writing ``path``, by its name something aside, is gone; on another host: whether it is a day old."""
+    """Whether ``path`` was written aside and its process has ended; of another host: whether it is a day old."""
     if not path.name.startswith(ASIDE_PREFIX):
         return False
-    host = re.match(rf"{re.escape(ASIDE_PREFIX)}\d+-([0-9a-f]{{8}})[0-9a-f]{{8}}-", path.name)
-    if host is not None and host[1] != _host():
-        try:
-            return time.time() - path.lstat().st_mtime > FOREIGN_SECONDS
-        except OSError:
-            return False
-    return not _is_alive(_writer(path))
+    process, host = found.groups() if (found := _ASIDE.match(path.name)) else ("0", None)
+    if host in (None, _host()):
+        return not _is_alive(int(process))
+    try:
+        return time.time() - path.lstat().st_mtime > FOREIGN_SECONDS
+    except OSError:
+        return False
 
 
 def aside_of(path: Path) -> Path:
-    """A free place beside ``path`` for what this process writes or takes away; what is left there is removed later."""
+    """A free place beside ``path`` for this process; files that stay there are removed later."""
     return path.with_name(_aside_name(path.name))
 
 
@@ -181,32 +174,14 @@ def sha256_of(path: Path) -> str:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
 
 
-def _target(path: Path, aside: Path, error: OSError) -> Path:
-    """What could not be written: the file that the error names, unless it is a part of what is written aside."""
-    named = error.filename
-    if not isinstance(named, str) or Path(named).is_relative_to(aside) or ASIDE_PREFIX in named:
-        return path
-    return Path(named)
-
-
-def _as_finished(path: Path) -> Path:
-    """A path as it will be called once what is written aside is in its place."""
-    return Path(*(re.sub(rf"^{re.escape(ASIDE_PREFIX)}\d+-(?:[0-9a-f]{{8}}){{1,2}}-", "", part) for part in path.parts))
-
-
 def _aside_name(name: str) -> str:
     return f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name}"
 
 
 @cache
 def _host() -> str:
-    """Start of a hash of this host's name: process numbers mean nothing on another one that shares the folder."""
+    """Start of a hash of this host's name, since process numbers mean nothing on another host that shares the folder."""
     return hashlib.sha256(socket.gethostname().encode("utf-8", "surrogateescape")).hexdigest()[:8]
-
-
-def _writer(path: Path) -> int:
-    number = path.name.removeprefix(ASIDE_PREFIX).split("-")[0]
-    return int(number) if number.isdigit() else 0
 
 
 def _is_alive(process: int) -> bool:

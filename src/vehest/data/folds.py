@@ -1,4 +1,4 @@
-"""Blocked cross-validation: recordings, laps or stretches of time are dealt into folds that follow one another."""
+"""Blocked cross-validation: folds of recordings, laps or stretches of time that follow one another."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class FoldsFile:
 
     Args:
         number: of folds, three or more.
-        of: what is never cut in two: a recording, a lap, or ``block_seconds`` of driving.
+        of: unit that is never cut in two: a recording, a lap, or ``block_seconds`` of driving.
         recordings: pattern of those that take part.
         block_seconds: length of a block for ``of: seconds`` [s].
         gap_seconds: taken off training and validation where they border on another fold [s], since filters and windows reach across.
@@ -49,8 +49,8 @@ def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str
     """The blocks of recordings in order, each with its start and stop.
 
     Args:
-        folds: what is never cut in two.
-        recordings: a span that names a recording -> what reads it.
+        folds: with the unit that is never cut in two.
+        recordings: a span that names a recording -> its reader.
 
     Raises:
         DataError: laps are asked for and a recording lacks speed or yaw rate.
@@ -59,7 +59,7 @@ def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str
     for whole, read in recordings.items():
         recording = read(None)
         bounds = [recording.start_time, recording.end_time]
-        if folds.of == "laps":  # what is before the first or after the last belongs to that lap
+        if folds.of == "laps":  # the rest before the first or after the last belongs to that lap
             bounds += [stop for _, stop in laps_of(recording)[:-1]]
         elif folds.of == "seconds":  # a rest of less than half a block belongs to the one before
             number = max(round(recording.duration / folds.block_seconds), 1)
@@ -95,9 +95,8 @@ def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> 
     roles = np.where(dealt == fold, 2, np.where(dealt == (fold + 1) % folds.number, 1, 0)).tolist()
     train, validation, test = (_joined(blocks, roles, role, 0.0 if role == 2 else folds.gap_seconds) for role in range(3))
     if not (train and validation):
-        raise ConfigurationError(
-            f"{where}: gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from; set folds.gap_seconds lower"
-        )
+        what = f"gaps of {folds.gap_seconds:g} s leave fold {fold} nothing to learn from"
+        raise ConfigurationError(f"{where}: {what}; set folds.gap_seconds lower")
     return train, validation, test
 
 

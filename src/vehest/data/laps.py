@@ -1,4 +1,4 @@
-"""Laps of a recording, found without positions: where the curvature of the path, over the distance driven, begins to repeat."""
+"""Finds laps without positions: the curvature of the path, over the distance driven, repeats."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recording is: one uninterrupted drive, uniformly sampled, in SI units and ISO 8855 axes."""
+"""Recordings: uninterrupted drives, uniformly sampled, in SI units and ISO 8855 axes."""
 
 from __future__ import annotations
 
@@ -49,8 +49,6 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise DataError(f"recording '{self.id}': the sampling rate must be positive, not {self.rate_hz}")
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:
             where = f"between {LOWEST_RATE:g} and {HIGHEST_RATE:g} Hz"
             raise DataError(f"recording '{self.id}': the sampling rate must lie {where}, not at {self.rate_hz:g} Hz")
@@ -60,37 +58,21 @@ class Recording:
             raise DataError(f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'")
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
-        if not self.channels:
-            raise DataError(f"recording '{self.id}' has no channels")
-        frozen: dict[str, FloatArray] = {}
-        for name, samples in self.channels.items():
-            channel(name)
-            array = np.array(samples, dtype=np.float64, copy=True)
-            if array.ndim != 1:
-                raise DataError(f"recording '{self.id}': channel '{name}' must be one-dimensional, not of shape {array.shape}")
-            array.flags.writeable = False
-            frozen[name] = array
-        lengths = {name: len(samples) for name, samples in frozen.items()}
-        if len(set(lengths.values())) != 1:
-            raise DataError(f"recording '{self.id}': channels differ in length: {lengths}")
-        if next(iter(lengths.values())) == 0:
-            raise DataError(f"recording '{self.id}' holds no samples")
+        frozen = {channel(name).name: np.array(samples, dtype=np.float64, copy=True) for name, samples in self.channels.items()}
+        n_samples = max((samples.size for samples in frozen.values()), default=0)
+        if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
+            shapes = {name: samples.shape for name, samples in frozen.items()}
+            raise DataError(f"recording '{self.id}': channels must hold samples and have one common length, not the shapes {shapes}")
         object.__setattr__(self, "channels", frozen)
         object.__setattr__(self, "gappy", frozenset(self.gappy) & frozenset(frozen))
         for name, samples in frozen.items():
-            self._require_finite(name, samples)
-
-    def _require_finite(self, name: str, samples: FloatArray) -> None:
-        bad = np.isinf(samples) if name in self.gappy else ~np.isfinite(samples)
-        if not bad.any():
-            return
-        where = np.flatnonzero(bad)
-        first, last = (self.start_time + where[[0, -1]] / self.rate_hz).tolist()
-        what = "NaN" if np.isnan(samples[bad]).all() else "infinite values"
-        raise DataError(
-            f"recording '{self.id}': channel '{name}' holds {len(where)} {what} between {first:.12g} s and {last:.12g} s; "
-            f"cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
-        )
+            samples.flags.writeable = False
+            bad = np.flatnonzero(np.isinf(samples) if name in self.gappy else ~np.isfinite(samples))
+            if len(bad):
+                first, last = (self.start_time + bad[[0, -1]] / self.rate_hz).tolist()
+                what = f"{len(bad)} {'NaN' if np.isnan(samples[bad]).all() else 'infinite values'} between {first:.12g} s and {last:.12g} s"
+                fix = "cut the range out, or declare the channel in 'gappy' if a gap means 'not measured'"
+                raise DataError(f"recording '{self.id}': channel '{name}' holds {what}; {fix}")
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))
@@ -101,11 +83,9 @@ class Recording:
         Raises:
             DataError: the recording does not have it.
         """
-        try:
-            return self.channels[name]
-        except KeyError:
-            have = ", ".join(self.channels)
-            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {have})") from None
+        if name not in self.channels:
+            raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})")
+        return self.channels[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self.channels
@@ -137,6 +117,18 @@ class Recording:
         """The same drive with these channels only."""
         return replace(self, channels={name: self[name] for name in names})
 
+    def with_channels(self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None) -> Recording:
+        """The same drive with channels replaced or added.
+
+        Args:
+            changed: channel -> samples, shape (T,).
+            made_of: channels that they were made of: they may have gaps where one of these may. None: the gaps stay as they were.
+        """
+        gappy = self.gappy
+        if made_of is not None:
+            gappy = gappy | set(changed) if gappy & set(made_of) else gappy - set(changed)
+        return replace(self, channels={**self.channels, **changed}, gappy=gappy)
+
     def without_references(self) -> Recording:
         """The same drive as an estimator may see it: no ``_ref`` channels."""
         kept = [name for name in self.channels if not CHANNELS[name].is_reference]
@@ -152,36 +144,22 @@ class Recording:
         """
         first, last = self.index_range(start, stop)
         if first >= last:
-            raise DataError(
-                f"recording '{self.id}' spans {self.start_time:.12g} s to {self.end_time:.12g} s; "
-                f"it has no samples between {start:.12g} s and {stop:.12g} s"
-            )
-        return replace(
-            self,
-            start_time=self.start_time + first / self.rate_hz,
-            channels={name: samples[first:last] for name, samples in self.channels.items()},
-        )
+            spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
+            raise DataError(f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s")
+        channels = {name: samples[first:last] for name, samples in self.channels.items()}
+        return replace(self, start_time=self.start_time + first / self.rate_hz, channels=channels)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""
-        return (index_at_or_after(self, start), index_at_or_after(self, stop))
-
-
-def index_at_or_after(recording: Recording, time: float) -> int:
-    """Index of the first sample taken at or after ``time`` [s], to the tolerance of its clock; clipped to 0 … T."""
-    if time == math.inf:
-        return len(recording)
-    if time == -math.inf:
-        return 0
-    position = (time - recording.start_time) * recording.rate_hz
-    tolerance = clock_tolerance(recording.start_time, recording.end_time, recording.rate_hz)
-    return min(max(math.ceil(position - tolerance), 0), len(recording))
+        tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
+        first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
+        return math.ceil(min(max(first, 0.0), len(self))), math.ceil(min(max(end, 0.0), len(self)))
 
 
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
     """How far from a sample a time may lie and still be that sample's, in samples.
 
-    A millionth of a sample, or what a double resolves where the times are large: at 1.7e9 s (unix time) 0.24 µs.
+    A millionth of a sample, or the resolution of a double where the times are large: at 1.7e9 s (unix time) 0.24 µs.
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)

@@ -1,21 +1,20 @@
-"""Splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions, percentages, laps and folds, to a `Split`."""
+"""Reads splits as conf/split/*.yaml holds them: ranges, patterns of recordings, conditions, percentages, laps and folds."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
-from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
+from vehest.data.limit_minutes import limit_minutes
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
-from vehest.data.shortened import shortened
 from vehest.data.splits import VALIDATION, Kept, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
@@ -30,24 +29,8 @@ SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
 
 
 @dataclass(frozen=True)
-class BoundsFile:
-    """Bounds of a channel's magnitude in its unit; what is None is not said."""
-
-    at_least: float | None = None
-    at_most: float | None = None
-
-
-@dataclass(frozen=True)
-class KeepFile:
-    """A condition: channel -> bounds of its magnitude, and how long it must hold at least [s]."""
-
-    magnitude: dict[str, BoundsFile]
-    at_least_seconds: float = 0.0
-
-
-@dataclass(frozen=True)
 class RangeFile:
-    """One range as conf/split/*.yaml names it: a recording, or a pattern of several; from start to stop [s or %], or some of its laps."""
+    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps."""
 
     dataset: str | None = None
     recording: str | None = None
@@ -55,12 +38,12 @@ class RangeFile:
     start: Annotated[float | str, SECONDS_OR_SHARE] = -math.inf
     stop: Annotated[float | str, SECONDS_OR_SHARE] = math.inf
     laps: str | None = None
-    keep: KeepFile | None = None
+    keep: Condition | None = None
 
 
 @dataclass(frozen=True)
 class SplitFile:
-    """What conf/split/*.yaml says. ``minutes`` cuts training and validation down to so many in all, as if no more had been recorded with
+    """Content of conf/split/*.yaml. ``minutes`` cuts training and validation down to so many in all, as if no more had been recorded with
     a reference; ``minutes_at`` is the share of them after which these begin."""
 
     name: str = "unnamed"
@@ -78,35 +61,32 @@ class SplitFile:
 def _read(config: Any) -> SplitFile:
     name = config.get("name") if isinstance(config, Mapping) else None
     where = f"split '{name}'" if isinstance(name, str) else ""
-    plain = _spelt_out(dict(config), where) if isinstance(config, Mapping) else config
+    plain = _spelt_out(config, where) if isinstance(config, Mapping) else config
     return validated(SplitFile, plain, where, error=ConfigurationError, group="split")
 
 
-def _spelt_out(config: dict[str, Any], where: str) -> dict[str, Any]:
+def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Roles in short (``60 %``, ``last lap``) as ranges of all recordings; percentages follow one another, training first."""
-    tests = config.get("tests")
-    roles: dict[tuple[str, ...], Any] = {("train",): config.get("train"), (VALIDATION,): config.get(VALIDATION)}
-    roles |= {("tests", str(name)): entries for name, entries in tests.items()} if isinstance(tests, Mapping) else {}
     done = 0.0
-    ranges: dict[tuple[str, ...], Any] = {}
-    for role, entries in roles.items():
-        ranges[role] = entries
+
+    def ranges(role: str, entries: Any) -> Any:
+        nonlocal done
         if not isinstance(entries, str):
-            continue
+            return entries
         if (share := PERCENT.fullmatch(entries)) is not None:
             begin, done = done, done + float(share[1])
             if done > 100.0 + 1e-9:
                 raise ConfigurationError(f"{where}: the percentages come to {done:g} %, more than there is")
-            ranges[role] = [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
-        elif LAPS.fullmatch(entries) is not None:
-            ranges[role] = [{"recordings": "*", "laps": entries}]
-        else:
-            what = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
-            raise ConfigurationError(f"{where}: {'.'.join(role)} must be {what}")
-    said = {key: ranges[(key,)] for key in ("train", VALIDATION) if key in config}
-    if isinstance(tests, Mapping):
-        said["tests"] = {name: ranges[("tests", str(name))] for name in tests}
-    return {**config, **said}
+            return [{"recordings": "*", "start": f"{begin:g} %", "stop": f"{done:g} %"}]
+        if LAPS.fullmatch(entries) is not None:
+            return [{"recordings": "*", "laps": entries}]
+        what = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
+        raise ConfigurationError(f"{where}: {role} must be {what}")
+
+    spelt = {role: ranges(role, config[role]) for role in ("train", VALIDATION) if role in config}
+    if isinstance(tests := config.get("tests"), Mapping):
+        spelt["tests"] = {name: ranges(f"tests.{name}", entries) for name, entries in tests.items()}
+    return {**config, **spelt}
 
 
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
@@ -114,59 +94,17 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
 
     Args:
         config: its values.
-        catalogue: the recordings; asked only for data sets whose recordings are named by a pattern or cut by a condition.
+        catalogue: the recordings; needed only where a pattern, a condition, percentages, laps or folds name or cut recordings.
 
     Raises:
         ConfigurationError: a key is missing, misspelt or of the wrong type; a pattern that no recording's id matches; a condition that
-            none meets; or either of them without a catalogue.
+            none meets; or one of them without a catalogue.
         DataError: a recording lacks a channel that a condition looks at.
     """
-    told = _read(config)
-    ranges = _Ranges(told.name, told.dataset, catalogue)
-    made = _split_of(told, ranges) if told.folds is None else _folded(told, told.folds, ranges)
-    return made if told.minutes is None else _cut_down(made, told.minutes, told.minutes_at, ranges)
-
-
-def _cut_down(split: Split, minutes: float, at: float, ranges: _Ranges) -> Split:
-    """A split with less to learn from: validation keeps its share of what is left."""
-
-    def bounds_of(span: Span) -> tuple[float, float]:
-        recording = ranges.recording(span.dataset, span.recording)(None)
-        return recording.start_time, recording.end_time
-
-    def length(spans: Sequence[Span]) -> float:
-        return sum(min(span.stop, bounds_of(span)[1]) - max(span.start, bounds_of(span)[0]) for span in spans)
-
-    learnt, stopped = length(split.train), length(split.validation)
-    share = 60.0 * minutes / (learnt + stopped)
-    return replace(
-        split,
-        name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""),
-        train=shortened(split.train, share * learnt, at, bounds_of),
-        validation=shortened(split.validation, share * stopped, at, bounds_of),
-    )
-
-
-def _split_of(told: SplitFile, ranges: _Ranges) -> Split:
-    """Ranges as they are written."""
-    return Split(
-        name=told.name,
-        train=ranges.spans("train", told.train or ()),
-        validation=ranges.spans(VALIDATION, told.validation or ()),
-        tests={test: ranges.spans(test, entries) for test, entries in (told.tests or {}).items()},
-        kept=ranges.kept,
-    )
-
-
-def _folded(told: SplitFile, folds: FoldsFile, ranges: _Ranges) -> Split:
-    """One fold of a cross-validation."""
-    where = f"split '{told.name}'"
-    if told.train or told.validation or told.tests:
-        raise ConfigurationError(f"{where}: folds make training, validation and test; leave train, validation and tests out")
-    dataset = _dataset_of(RangeFile(recordings=folds.recordings), told.dataset, told.name)
-    blocks = blocks_of(folds, {Span(dataset, name): ranges.recording(dataset, name) for name in ranges.matching(dataset, folds.recordings)})
-    train, validation, test = fold_of(blocks, folds, told.fold, where)
-    return Split(f"{told.name}_fold_{told.fold + 1}", train, validation, {"test": test})
+    file = _read(config)
+    ranges = _Ranges(file, catalogue)
+    split = ranges.fold(file.folds) if file.folds is not None else ranges.split()
+    return split if file.minutes is None else ranges.limited(split, file.minutes)
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
@@ -175,18 +113,18 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
     Raises:
         ConfigurationError: as `split_from_config`, where a range names none.
     """
-    told = _read(config)
-    if told.folds is not None:
-        return [_dataset_of(RangeFile(recordings=told.folds.recordings), told.dataset, told.name)]
-    entries = [*(told.train or ()), *(told.validation or ()), *(entry for entries in (told.tests or {}).values() for entry in entries)]
-    return sorted({_dataset_of(entry, told.dataset, told.name) for entry in entries})
+    file = _read(config)
+    entries = [*(file.train or ()), *(file.validation or ()), *(entry for entries in (file.tests or {}).values() for entry in entries)]
+    if file.folds is not None:
+        entries = [RangeFile(recordings=file.folds.recordings)]
+    return sorted({_dataset_of(entry, file) for entry in entries})
 
 
-def _dataset_of(entry: RangeFile, default: str | None, split: str) -> str:
-    dataset = entry.dataset or default
+def _dataset_of(entry: RangeFile, file: SplitFile) -> str:
+    dataset = entry.dataset or file.dataset
     if dataset is None or (entry.recording is None) == (entry.recordings is None):
         needed = "each range needs a recording and a dataset (or recordings, a pattern)"
-        raise ConfigurationError(f"split '{split}': {needed}, not {_shown(entry)}")
+        raise ConfigurationError(f"split '{file.name}': {needed}, not {_shown(entry)}")
     return dataset
 
 
@@ -195,136 +133,139 @@ def _shown(entry: RangeFile) -> dict[str, Any]:
 
 
 class _Ranges:
-    """Turns the ranges of a configuration into spans.
+    """Makes spans of the ranges of a configuration.
 
     Args:
-        split: its name.
-        dataset: that serves ranges which name none.
+        file: the configuration.
         catalogue: the recordings.
     """
 
-    def __init__(self, split: str, dataset: str | None, catalogue: Catalogue | None) -> None:
-        self._split, self._dataset, self._catalogue = split, dataset, catalogue
+    def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
+        self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
         self._known: dict[str, Mapping[str, Reader]] = {}
-        self.kept: dict[str, Kept] = {}
+        self._kept: dict[str, Kept] = {}
 
-    def spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
+    def split(self) -> Split:
+        """The split of the ranges."""
+        train, validation = self._spans("train", self._file.train or ()), self._spans(VALIDATION, self._file.validation or ())
+        tests = {test: self._spans(test, entries) for test, entries in (self._file.tests or {}).items()}
+        return Split(self._file.name, train, validation, tests, self._kept)
+
+    def fold(self, folds: FoldsFile) -> Split:
+        """The split of one fold of a cross-validation."""
+        file = self._file
+        if file.train or file.validation or file.tests:
+            raise ConfigurationError(f"{self._where}: folds make training, validation and test; leave train, validation and tests out")
+        dataset = _dataset_of(RangeFile(recordings=folds.recordings), file)
+        readers = {Span(dataset, name): self._reader(dataset, name) for name in self._matching(dataset, folds.recordings)}
+        train, validation, test = fold_of(blocks_of(folds, readers), folds, file.fold, self._where)
+        return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
+
+    def limited(self, split: Split, minutes: float) -> Split:
+        """The split with fewer minutes to learn from, of which validation keeps its share."""
+
+        def bounds_of(span: Span) -> tuple[float, float]:
+            recording = self._reader(span.dataset, span.recording)(None)
+            return recording.start_time, recording.end_time
+
+        def length(spans: Sequence[Span]) -> float:
+            return sum(min(span.stop, bounds_of(span)[1]) - max(span.start, bounds_of(span)[0]) for span in spans)
+
+        at = self._file.minutes_at
+        train, validation = length(split.train), length(split.validation)
+        share = 60.0 * minutes / (train + validation)
+        return replace(
+            split,
+            name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""),
+            train=limit_minutes(split.train, share * train, at, bounds_of),
+            validation=limit_minutes(split.validation, share * validation, at, bounds_of),
+        )
+
+    def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
         """The spans of one role."""
         spans: list[Span] = []
         for entry in entries:
-            whole = self._named(entry)
-            if entry.keep is None:
-                spans += whole
-            else:
-                condition = _condition(entry.keep, f"split '{self._split}': keep of {role}")
-                spans += self._cut(role, whole, condition)
+            dataset = _dataset_of(entry, self._file)
+            names = [entry.recording] if entry.recording is not None else self._matching(dataset, str(entry.recordings))
+            whole = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
+            if entry.keep is not None:
+                whole = self._cut(role, whole, entry.keep)
+            spans += whole
         return tuple(spans)
 
-    def _named(self, entry: RangeFile) -> list[Span]:
-        """Spans of one entry, before any condition."""
-        dataset = _dataset_of(entry, self._dataset, self._split)
-        names = [entry.recording] if entry.recording is not None else self.matching(dataset, str(entry.recordings))
-        return [self._span(dataset, name, entry) for name in names]
+    def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
+        """Start and stop of an entry in one recording [s]."""
+        if entry.laps is None:
+            return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)
+        if (entry.start, entry.stop) != (-math.inf, math.inf):
+            raise ConfigurationError(f"{self._where}: a range has laps, or start and stop, not both: {_shown(entry)}")
+        return self._laps(dataset, name, entry.laps)
 
-    def _span(self, dataset: str, name: str, entry: RangeFile) -> Span:
-        """The stretch of one recording that an entry means."""
-        if entry.laps is not None:
-            if (entry.start, entry.stop) != (-math.inf, math.inf):
-                raise ConfigurationError(f"split '{self._split}': a range has laps, or start and stop, not both: {_shown(entry)}")
-            return Span(dataset, name, *self._laps(dataset, name, entry.laps))
-        start, stop = entry.start, entry.stop
-        return Span(dataset, name, self._time(dataset, name, start), self._time(dataset, name, stop))
+    def _time(self, dataset: str, name: str, bound: float | str) -> float:
+        if not isinstance(bound, str):
+            return bound
+        found = PERCENT.fullmatch(bound)
+        share = float(found[1]) if found else math.inf
+        if share > 100.0:
+            raise ConfigurationError(f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'")
+        if share in (0.0, 100.0):
+            return -math.inf if share == 0.0 else math.inf
+        recording = self._reader(dataset, name)(None)
+        return recording.start_time + round(share / 100.0 * len(recording)) / recording.rate_hz
 
-    def _time(self, dataset: str, name: str, said: float | str) -> float:
-        if not isinstance(said, str):
-            return said
-        share = PERCENT.fullmatch(said)
-        if share is None or float(share[1]) > 100.0:
-            raise ConfigurationError(f"split '{self._split}': start and stop are {SECONDS_OR_SHARE}, not '{said[:60]}'")
-        if float(share[1]) in (0.0, 100.0):
-            return -math.inf if float(share[1]) == 0.0 else math.inf
-        recording = self.recording(dataset, name)(None)
-        samples = round(float(share[1]) / 100.0 * len(recording))
-        return recording.start_time + samples / recording.rate_hz
-
-    def _laps(self, dataset: str, name: str, said: str) -> tuple[float, float]:
-        found = LAPS.fullmatch(said)
+    def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
+        found = LAPS.fullmatch(words)
         if found is None:
-            what = "first, last, first 3, last 2, a number, or 2 to 4"
-            raise ConfigurationError(f"split '{self._split}': laps are said as {what}, not '{said[:60]}'")
+            raise ConfigurationError(f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'")
         end, number, first, last = found.groups()
-        laps = laps_of(self.recording(dataset, name)(None))
+        laps = laps_of(self._reader(dataset, name)(None))
         count = int(number or 1)
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
         if not 1 <= begin <= stop <= len(laps):
             there = f"{len(laps)} complete laps were found" if laps else "its course does not repeat"
-            missing = f"recording '{name}' has no '{said.strip()}': {there}"
-            raise ConfigurationError(f"split '{self._split}': {missing}; name times instead")
+            raise ConfigurationError(f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead")
         return laps[begin - 1][0], laps[stop - 1][1]
 
-    def recording(self, dataset: str, name: str) -> Reader:
-        """A recording of a data set, as a function that reads it.
-
-        Raises:
-            ConfigurationError: the data set does not have it.
-        """
+    def _reader(self, dataset: str, name: str) -> Reader:
+        """Reads a recording that the data set has."""
         recordings = self._recordings(dataset)
         if name not in recordings:
-            raise ConfigurationError(f"split '{self._split}': data set '{dataset}' has no recording '{name}'")
+            raise ConfigurationError(f"{self._where}: data set '{dataset}' has no recording '{name}'")
         return recordings[name]
 
-    def matching(self, dataset: str, pattern: str) -> list[str]:
+    def _matching(self, dataset: str, pattern: str) -> list[str]:
         """Names of a data set's recordings that fit a pattern, sorted."""
         recordings = self._recordings(dataset)
         names = sorted(name for name in recordings if fnmatchcase(name, pattern))
         if not names:
             known = ", ".join([*sorted(recordings)[:5], *(["…"] if len(recordings) > 5 else [])])
-            raise ConfigurationError(f"split '{self._split}': no recording of data set '{dataset}' matches '{pattern}' (it has {known})")
+            raise ConfigurationError(f"{self._where}: no recording of data set '{dataset}' matches '{pattern}' (it has {known})")
         return names
 
     def _recordings(self, dataset: str) -> Mapping[str, Reader]:
         if dataset not in self._known:
             if self._catalogue is None:
-                raise ConfigurationError(f"split '{self._split}': its patterns and the like need the recordings of data set '{dataset}'")
+                raise ConfigurationError(f"{self._where}: its patterns and the like need the recordings of data set '{dataset}'")
             self._known[dataset] = self._catalogue(dataset)
         return self._known[dataset]
 
     def _cut(self, role: str, whole: Sequence[Span], condition: Condition) -> list[Span]:
-        """Those stretches of spans in which a condition holds; notes how much that is."""
+        """Stretches of spans in which a condition holds; their amount is added up by role."""
         spans: list[Span] = []
         seconds = of_seconds = 0.0
         for span in whole:
-            recording = self.recording(span.dataset, span.recording)(condition.magnitude)
+            recording = self._reader(span.dataset, span.recording)(condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
             of_seconds += (end - first) / recording.rate_hz
             for begin, after in stretches_where(recording, condition, first, end):
                 start = span.start if begin == first else recording.start_time + begin / recording.rate_hz
                 stop = span.stop if after == end else recording.start_time + after / recording.rate_hz
-                spans.append(Span(span.dataset, span.recording, start, stop))
+                spans.append(replace(span, start=start, stop=stop))
                 seconds += (after - begin) / recording.rate_hz
         if not spans:
-            raise ConfigurationError(f"split '{self._split}': the condition of {role} keeps nothing ({condition.describe()})")
-        before = self.kept.get(role, Kept(0, 0, 0.0, 0.0))
-        self.kept[role] = Kept(
-            before.n_recordings + len(whole), before.n_spans + len(spans), before.seconds + seconds, before.of_seconds + of_seconds
-        )
+            raise ConfigurationError(f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})")
+        so_far = self._kept.get(role, Kept(0, 0, 0.0, 0.0))
+        more = (len(whole), len(spans), seconds, of_seconds)
+        self._kept[role] = Kept(*(one + other for one, other in zip(astuple(so_far), more, strict=True)))
         return spans
-
-
-def _condition(keep: KeepFile, where: str) -> Condition:
-    if not keep.magnitude:
-        raise ConfigurationError(f"{where}: magnitude maps channels to {{at_least, at_most}}, and names none")
-    bounds: dict[str, tuple[float, float]] = {}
-    for channel, limits in keep.magnitude.items():
-        if channel not in CHANNELS:
-            raise ConfigurationError(f"{where}: there is no channel '{channel}'; see 'vehest data channels'")
-        if limits.at_least is None and limits.at_most is None:
-            raise ConfigurationError(f"{where}: '{channel}' needs at_least, at_most or both")
-        at_least, at_most = (limits.at_least or 0.0), (math.inf if limits.at_most is None else limits.at_most)
-        if not 0.0 <= at_least <= at_most:
-            raise ConfigurationError(f"{where}: no magnitude of '{channel}' lies between {at_least:g} and {at_most:g}")
-        bounds[channel] = (at_least, at_most)
-    if keep.at_least_seconds < 0.0:
-        raise ConfigurationError(f"{where}: at_least_seconds must be zero or positive, not {keep.at_least_seconds:g}")
-    return Condition(bounds, keep.at_least_seconds)

@@ -1,4 +1,4 @@
-"""Which stretch of which recording serves for training, validation and each named test."""
+"""Stretches of recordings for training, validation and each named test."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise, product
 
 from vehest.data.errors import ConfigurationError
 
@@ -14,7 +15,7 @@ TRAINING = "training"
 
 
 def check_name(name: str, what: str) -> None:
-    """See that a name can be part of a file's name.
+    """Refuse a name that cannot be part of a file's name.
 
     Raises:
         ConfigurationError: it holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot.
@@ -50,11 +51,11 @@ class Span:
 
 @dataclass(frozen=True)
 class Kept:
-    """How much a condition left of the recordings that it was put to.
+    """Amount of driving that meets a condition.
 
     Args:
-        n_recordings: how many there were.
-        n_spans: how many stretches were kept.
+        n_recordings: number of recordings.
+        n_spans: number of stretches that were kept.
         seconds: their time [s].
         of_seconds: time of the recordings, or of their ranges [s].
     """
@@ -67,11 +68,8 @@ class Kept:
     def describe(self) -> str:
         """For messages and reports, for example ``61.2 of 90.0 min in 402 stretches of 161 recordings``."""
         minutes = f"{self.seconds / 60.0:.1f} of {self.of_seconds / 60.0:.1f} min"
-        return f"{minutes} in {_counted(self.n_spans, 'stretch', 'es')} of {_counted(self.n_recordings, 'recording', 's')}"
-
-
-def _counted(number: int, what: str, plural: str) -> str:
-    return f"{number} {what}{'' if number == 1 else plural}"
+        stretches = f"{self.n_spans} {'stretch' if self.n_spans == 1 else 'stretches'}"
+        return f"{minutes} in {stretches} of {self.n_recordings} {'recording' if self.n_recordings == 1 else 'recordings'}"
 
 
 @dataclass(frozen=True)
@@ -109,24 +107,16 @@ class Split:
         for name, spans in self.tests.items():
             check_name(name, f"split '{self.name}': test set")
             if name in (VALIDATION, TRAINING):
-                raise ConfigurationError(
-                    f"split '{self.name}': a test set cannot be called '{name}'; that is what the {name} range is called in metrics"
-                )
+                raise ConfigurationError(f"split '{self.name}': a test set cannot be called '{name}', as the {name} range is in metrics")
             if not spans:
                 raise ConfigurationError(f"split '{self.name}': test set '{name}' is empty")
-        roles = [("train", self.train), ("validation", self.validation)]
-        roles += [(f"test '{name}'", spans) for name, spans in self.tests.items()]
-        for position, (role, spans) in enumerate(roles):
-            for other_role, other_spans in roles[position + 1 :]:
-                if role.startswith("test") and other_role.startswith("test"):
-                    continue
-                for span in spans:
-                    for other in other_spans:
-                        if span.overlaps(other):
-                            raise ConfigurationError(
-                                f"split '{self.name}': {role} and {other_role} share samples of recording '{span.recording}' "
-                                f"({span.describe()} and {other.describe()}); separate the ranges"
-                            )
+        learnt = [("train", self.train), ("validation", self.validation)]
+        tests = [(f"test '{name}'", spans) for name, spans in self.tests.items()]
+        for (role, spans), (other_role, other_spans) in [*pairwise(learnt), *product(learnt, tests)]:
+            for span, other in product(spans, other_spans):
+                if span.overlaps(other):
+                    what = f"{role} and {other_role} share samples of recording '{span.recording}'"
+                    raise ConfigurationError(f"split '{self.name}': {what} ({span.describe()} and {other.describe()}); separate the ranges")
 
     @property
     def datasets(self) -> tuple[str, ...]:
@@ -135,6 +125,5 @@ class Split:
 
     @property
     def all_spans(self) -> tuple[Span, ...]:
-        """Every stretch, whatever it serves for."""
-        tests = tuple(span for spans in self.tests.values() for span in spans)
-        return self.train + self.validation + tests
+        """Every stretch of training, validation and tests."""
+        return tuple(span for spans in (self.train, self.validation, *self.tests.values()) for span in spans)

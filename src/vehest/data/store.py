@@ -1,4 +1,4 @@
-"""Recordings and estimates as Parquet files; what is read back is what was written, bit for bit."""
+"""Stores recordings and estimates as Parquet files, which come back bit for bit."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError
 from vehest.data.estimate import Estimate, Mode
 from vehest.data.files import writing_error, written_aside
 from vehest.data.parquet import parquet_file, read_numbers
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import check_format, validated
-from vehest.data.text_files import parse_json
+from vehest.data.text_files import first_line, parse_json
 
 _METADATA_KEY = b"vehest"
 _FORMAT = 1
@@ -34,7 +35,7 @@ _LAYOUT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class RecordingDescription:
-    """What the file of a recording says beside its table; see `Recording`."""
+    """Description of a recording beside its table; see `Recording`."""
 
     format: int
     content: Literal["recording"]
@@ -49,7 +50,7 @@ class RecordingDescription:
 
 @dataclass(frozen=True)
 class EstimateDescription:
-    """What the file of an estimate says beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
+    """Description of an estimate beside its table; see `Estimate`. ``n_states`` is the side of the covariance."""
 
     format: int
     content: Literal["estimate"]
@@ -62,6 +63,9 @@ class EstimateDescription:
     covariance_of: tuple[str, ...] = ("vy", "yaw_rate")  # of files from before rows had names
 
 
+_OF_RECORDING = ("id", "vehicle", "rate_hz", "start_time", "kind")
+_OF_ESTIMATE = ("recording_id", "estimator", "rate_hz", "start_time", "mode")
+
 _Description = TypeVar("_Description", RecordingDescription, EstimateDescription)
 
 
@@ -71,18 +75,8 @@ def write_recording(recording: Recording, path: Path) -> None:
     Raises:
         MissingError: the file cannot be written.
     """
-    description = {
-        "format": _FORMAT,
-        "content": "recording",
-        "id": recording.id,
-        "vehicle": recording.vehicle,
-        "rate_hz": recording.rate_hz,
-        "start_time": recording.start_time,
-        "kind": recording.kind,
-        "gappy": sorted(recording.gappy),
-        "provenance": dict(recording.provenance),
-    }
-    _write(path, dict(recording.channels), description)
+    about = _attributes(recording, _OF_RECORDING) | {"gappy": sorted(recording.gappy), "provenance": dict(recording.provenance)}
+    _write(path, recording.channels, "recording", about)
 
 
 def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recording:
@@ -93,17 +87,9 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
         DataError: the file is damaged, not a recording, or lacks a channel.
     """
     columns, described = _read(path, RecordingDescription, None if channels is None else list(channels))
+    gappy, about = described.gappy & columns.keys(), _attributes(described, _OF_RECORDING)
     try:
-        return Recording(
-            id=described.id,
-            vehicle=described.vehicle,
-            rate_hz=described.rate_hz,
-            start_time=described.start_time,
-            channels=columns,
-            kind=described.kind,
-            gappy=described.gappy & frozenset(columns),
-            provenance=described.provenance,
-        )
+        return Recording(channels=columns, gappy=gappy, provenance=described.provenance, **about)
     except DataError as error:
         raise DataError(f"'{path}': {error}") from None
 
@@ -112,14 +98,14 @@ def is_stored_recording(path: Path) -> bool:
     """Whether ``path`` is a Parquet file that vehest wrote as a recording.
 
     Raises:
-        DataError: it is one, and what it says about itself is damaged.
+        DataError: it is one, and its description is damaged.
     """
     try:
         with parquet_file(path) as file:
             schema = file.schema_arrow
     except (DataError, MissingError):
         return False
-    return _description(schema, path).get("content") == "recording"
+    return _metadata(schema, path).get("content") == "recording"
 
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
@@ -128,22 +114,13 @@ def write_estimate(estimate: Estimate, path: Path) -> None:
     Raises:
         MissingError: the file cannot be written.
     """
-    description = {
-        "format": _FORMAT,
-        "content": "estimate",
-        "recording_id": estimate.recording_id,
-        "estimator": estimate.estimator,
-        "rate_hz": estimate.rate_hz,
-        "start_time": estimate.start_time,
-        "mode": estimate.mode,
-    }
-    columns: dict[str, Any] = {"time": estimate.time, **estimate.channels}
+    about = _attributes(estimate, _OF_ESTIMATE)
+    columns = {"time": estimate.time, **estimate.channels}
     if estimate.covariance is not None:
-        description["n_states"] = estimate.covariance.shape[1]
-        description["covariance_of"] = list(estimate.covariance_of)
+        about |= {"n_states": estimate.covariance.shape[1], "covariance_of": list(estimate.covariance_of)}
         for row, column in np.ndindex(estimate.covariance.shape[1:]):
             columns[f"{_COVARIANCE}_{row}_{column}"] = estimate.covariance[:, row, column]
-    _write(path, columns, description)
+    _write(path, columns, "estimate", about)
 
 
 def read_estimate(path: Path) -> Estimate:
@@ -153,44 +130,47 @@ def read_estimate(path: Path) -> Estimate:
         MissingError: there is no such file.
         DataError: the file is damaged or not an estimate.
     """
-    columns, described = _read(path, EstimateDescription, None)
-    if columns.pop("time", None) is None:
-        raise DataError(f"'{path}' has no column 'time'; make it again")
-    covariance = None
-    if described.n_states is not None:
-        covariance = _covariance(columns, described.n_states, path)
+    columns, described = _read(path, EstimateDescription)
+    covariance, n_states = None, described.n_states
     try:
-        return Estimate(
-            recording_id=described.recording_id,
-            estimator=described.estimator,
-            rate_hz=described.rate_hz,
-            start_time=described.start_time,
-            channels=columns,
-            mode=described.mode,
-            covariance=covariance,
-            covariance_of=() if covariance is None else described.covariance_of,
-        )
+        del columns["time"]
+        if n_states is not None:
+            here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
+            if n_states < 1 or n_states**2 != here:
+                raise DataError(f"n_states is {n_states}, and there are {here} columns of the covariance; make it again")
+            entries = [columns.pop(f"{_COVARIANCE}_{row}_{column}") for row, column in np.ndindex(n_states, n_states)]
+            covariance = np.stack(entries, axis=1).reshape(-1, n_states, n_states)
+        covariance_of = () if covariance is None else described.covariance_of
+        return Estimate(channels=columns, covariance=covariance, covariance_of=covariance_of, **_attributes(described, _OF_ESTIMATE))
+    except KeyError as error:
+        raise DataError(f"'{path}' has no column {error}; make it again") from None
     except DataError as error:
         raise DataError(f"'{path}': {error}") from None
 
 
-def _covariance(columns: dict[str, Any], n_states: int, path: Path) -> Any:
-    """Take the entries of the covariance out of the columns; shape (T, n, n)."""
-    here = sum(name.startswith(f"{_COVARIANCE}_") for name in columns)
-    if n_states < 1 or n_states**2 != here:
-        raise DataError(f"'{path}': n_states is {n_states}, and there are {here} columns of the covariance; make it again")
-    names = [f"{_COVARIANCE}_{row}_{column}" for row, column in np.ndindex(n_states, n_states)]
-    missing = [name for name in names if name not in columns]
-    if missing:
-        raise DataError(f"'{path}' has no column '{missing[0]}'; make it again")
-    return np.stack([columns.pop(name) for name in names], axis=1).reshape(-1, n_states, n_states)
+def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
+    """The description of a recording or an estimate beside its table.
+
+    Raises:
+        DataError: it is not of this kind, or of another format, or the description is damaged.
+    """
+    content = "recording" if kind is RecordingDescription else "estimate"
+    found = _metadata(schema, path)
+    if found.get("content") != content:
+        raise DataError(f"'{path}' is a Parquet file, but not {'a' if content == 'recording' else 'an'} {content} that vehest wrote")
+    check_format(found.get("format", 0), _FORMAT, f"'{path}'")
+    return validated(kind, found, f"'{path}'")
 
 
-def _write(path: Path, columns: Mapping[str, Any], description: Mapping[str, Any]) -> None:
+def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
+    return {name: getattr(of, name) for name in names}
+
+
+def _write(path: Path, columns: Mapping[str, FloatArray], content: str, about: Mapping[str, Any]) -> None:
     try:
-        described = json.dumps(description).encode()
+        described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
-        raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({_first_line(error)})") from None
+        raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})") from None
     arrays = {name: pa.array(np.asarray(values, dtype=np.float64)) for name, values in columns.items()}
     table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: described})
     with written_aside(path) as aside, open(aside, "wb") as stream:  # pyarrow itself takes no names that are not UTF-8
@@ -200,43 +180,20 @@ def _write(path: Path, columns: Mapping[str, Any], description: Mapping[str, Any
             raise writing_error(path, OSError(str(error))) from error
 
 
-def _read(path: Path, kind: type[_Description], names: list[str] | None) -> tuple[dict[str, Any], _Description]:
-    try:
-        with parquet_file(path) as file:
-            described = _described(file.schema_arrow, path, kind)
-            _check_columns(file.schema_arrow, path)
-            missing = [name for name in names or [] if name not in file.schema_arrow.names]
-            if missing:
-                have = ", ".join(file.schema_arrow.names)
-                raise DataError(f"'{path}' has no channel '{missing[0]}' (it has {have})")
-            return dict(read_numbers(path, file, file.schema_arrow.names if names is None else names)), described
-    except (ValueError, KeyError) as error:
-        raise DataError(f"'{path}' is truncated or damaged ({_first_line(error)}); make it again") from error
+def _read(path: Path, kind: type[_Description], names: list[str] | None = None) -> tuple[dict[str, FloatArray], _Description]:
+    with parquet_file(path) as file:
+        schema = file.schema_arrow
+        described = description_of(schema, path, kind)
+        for name, column in zip(schema.names, schema.types, strict=True):
+            if column != pa.float64() or schema.names.count(name) > 1:
+                raise DataError(f"'{path}': column '{name}' is there twice, or of type {column}, not double; make it again")
+        missing = [name for name in names or [] if name not in schema.names]
+        if missing:
+            raise DataError(f"'{path}' has no channel '{missing[0]}' (it has {', '.join(schema.names)})")
+        return read_numbers(path, file, schema.names if names is None else names), described
 
 
-def _described(schema: Any, path: Path, kind: type[_Description]) -> _Description:
-    content = "recording" if kind is RecordingDescription else "estimate"
-    found = _description(schema, path)
-    if found.get("content") != content:
-        article = "an" if content == "estimate" else "a"
-        raise DataError(f"'{path}' is a Parquet file, but not {article} {content} that vehest wrote")
-    check_format(found.get("format", 0), _FORMAT, f"'{path}'")
-    return validated(kind, found, f"'{path}'")
-
-
-def _check_columns(schema: Any, path: Path) -> None:
-    for name, column in zip(schema.names, schema.types, strict=True):
-        if schema.names.count(name) > 1:
-            raise DataError(f"'{path}' has {schema.names.count(name)} columns called '{name}'; make it again")
-        if column != pa.float64():
-            raise DataError(f"'{path}': column '{name}' is of type {column}, not double; make it again")
-
-
-def _description(schema: Any, path: Path) -> dict[str, Any]:
-    """What vehest wrote beside the table; empty for a table of someone else's."""
+def _metadata(schema: pa.Schema, path: Path) -> dict[str, Any]:
+    """The description of vehest beside a table; empty for a table of someone else's."""
     described = parse_json((schema.metadata or {}).get(_METADATA_KEY, b"{}"), f"'{path}': the description beside the table")
     return described if isinstance(described, dict) else {}
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0][:120] if str(error).strip() else type(error).__name__

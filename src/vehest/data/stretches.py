@@ -3,13 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Smallest and largest magnitude of a channel, both included, in its unit; None is no bound.
+
+    Raises:
+        ValueError: there is none, or no magnitude lies between them.
+    """
+
+    at_least: float | None = None
+    at_most: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.at_least is None and self.at_most is None:
+            raise ValueError("needs at_least, at_most or both")
+        if not 0.0 <= self.low <= self.high:
+            raise ValueError(f"no magnitude lies between {self.low:g} and {self.high:g}")
+
+    @property
+    def low(self) -> float:
+        """Smallest magnitude."""
+        return self.at_least or 0.0
+
+    @property
+    def high(self) -> float:
+        """Largest magnitude."""
+        return math.inf if self.at_most is None else self.at_most
 
 
 @dataclass(frozen=True)
@@ -17,21 +45,32 @@ class Condition:
     """What must hold at every sample of a stretch, and how long for.
 
     Args:
-        magnitude: channel -> smallest and largest magnitude, both included, in the channel's unit.
+        magnitude: channel -> bounds of its magnitude.
         at_least_seconds: shortest stretch [s].
+
+    Raises:
+        ValueError: there is no channel, an unknown one, or the time is negative.
     """
 
-    magnitude: Mapping[str, tuple[float, float]]
+    magnitude: dict[str, Bounds]
     at_least_seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.magnitude:
+            raise ValueError("magnitude maps channels to {at_least, at_most}, and names none")
+        for channel in self.magnitude.keys() - CHANNELS.keys():
+            raise ValueError(f"there is no channel '{channel}'; see 'vehest data channels'")
+        if self.at_least_seconds < 0.0:
+            raise ValueError(f"at_least_seconds must be zero or positive, not {self.at_least_seconds:g}")
 
     def describe(self) -> str:
         """For messages, for example ``0 <= |ay| <= 7, 2 s or longer``."""
-        bounds = [f"{low:g} <= |{channel}| <= {high:g}" for channel, (low, high) in self.magnitude.items()]
+        bounds = [f"{bounds.low:g} <= |{channel}| <= {bounds.high:g}" for channel, bounds in self.magnitude.items()]
         return ", ".join([*bounds, f"{self.at_least_seconds:g} s or longer"])
 
 
 def stretches_where(recording: Recording, condition: Condition, first: int = 0, end: int | None = None) -> list[tuple[int, int]]:
-    """Longest runs [first, end) of samples, as indices, that all meet a condition; a sample that was not measured does not.
+    """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not.
 
     Args:
         recording: as it is, at its own rate and unfiltered.
@@ -43,9 +82,9 @@ def stretches_where(recording: Recording, condition: Condition, first: int = 0, 
     """
     end = len(recording) if end is None else end
     holds = np.ones(max(end - first, 0), dtype=bool)
-    for channel, (low, high) in condition.magnitude.items():
+    for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])
-        holds &= (size >= low) & (size <= high)
+        holds &= (size >= bounds.low) & (size <= bounds.high)
     edges = true_runs(holds) + first
     shortest = max(math.ceil(condition.at_least_seconds * recording.rate_hz - 1e-9), 1)
     return [(begin, after) for begin, after in edges.tolist() if after - begin >= shortest]

@@ -1,4 +1,4 @@
-"""Conversion of the units that files use to the SI units of the channel table."""
+"""Converts the units that files use to the SI units of the channel table."""
 
 from __future__ import annotations
 

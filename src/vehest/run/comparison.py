@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from vehest.data.contents import Contents
 from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.recording_summary import RecordingSummary
 from vehest.data.splits import Split
 from vehest.run.artefacts import Artefact
 from vehest.run.config import GIVEN, Config
@@ -145,7 +145,7 @@ class Comparison:
             runner.messages.line("fail", "train", name, failure.message)
 
 
-def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[Contents]]) -> list[Note]:
+def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> list[Note]:
     """Lower the rates of a job to those of recordings; it fails where these lack something."""
     job.config, notes = lower_rate(job.config, "evaluation", slowest(contents))
     try:
@@ -159,12 +159,12 @@ def _fit_to_recordings(job: Job, split: Split, contents: Mapping[str, Sequence[C
         return []
 
 
-def slowest(contents: Mapping[str, Sequence[Contents]]) -> Contents:
+def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSummary:
     """The recording with the lowest rate of all data sets."""
     return min((recording for recordings in contents.values() for recording in recordings), key=lambda recording: recording.rate_hz)
 
 
-def lower_rate(config: Config, group: str, limit: Contents) -> tuple[Config, list[Note]]:
+def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
     """A configuration whose ``GROUP.rate_hz`` is no higher than that of a recording, and a note if it was.
 
     Raises:

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from vehest.data.channels import CHANNELS
-from vehest.data.contents import stored_contents
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.data.recording_summary import stored_summary
 from vehest.data.schema import validated
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
@@ -119,7 +119,7 @@ def check_channels(faults: Sequence[FaultSettings], split: Split, data: Mapping[
     """Raise `ConfigurationError` where a scored recording lacks a faulty channel; no samples are read."""
     spans = [span for spans in (split.validation, *split.tests.values()) for span in spans] if faults else []
     for dataset, recording in dict.fromkeys((span.dataset, span.recording) for span in spans):
-        held = stored_contents(recording_file(data[dataset], Span(dataset, recording))).channels
+        held = stored_summary(recording_file(data[dataset], Span(dataset, recording))).channels
         for fault in faults:
             if fault.channel not in held:
                 known = ", ".join(sorted(name for name in held if not CHANNELS[name].is_reference))

@@ -18,10 +18,10 @@ import numpy as np
 from vehest.alignment.checks import checks_of_recording
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
-from vehest.data.contents import Contents, contents_of, stored_contents
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
+from vehest.data.recording_summary import RecordingSummary, stored_summary, summary_of
 from vehest.data.store import read_recording
 from vehest.run.artefacts import find
 from vehest.run.config import Config, compose_config
@@ -133,13 +133,13 @@ def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
         yield config
 
 
-def _contents(source: str, config: Config) -> list[Contents]:
-    """Contents of the recordings, from the store where they are ingested; of a slow source the first alone."""
+def _contents(source: str, config: Config) -> list[RecordingSummary]:
+    """Summaries of the recordings, from the store where they are ingested; of a slow source the first alone."""
     ingested = find(plan_ingest(config)) if source in choices("dataset") else None
     if ingested is not None:
-        return [stored_contents(ingested.folder / file) for file in ingested.outputs]
+        return [stored_summary(ingested.folder / file) for file in ingested.outputs]
     first = 1 if open_source(config["dataset"]).slow else None
-    return [contents_of(read()) for _, read in islice(_readers(source, config), first)]
+    return [summary_of(read()) for _, read in islice(_readers(source, config), first)]
 
 
 def _readers(source: str, config: Config) -> Iterator[tuple[str, Callable[[], Recording]]]:

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from vehest.data.contents import Contents, stored_contents
 from vehest.data.errors import DataError, MissingError
+from vehest.data.recording_summary import RecordingSummary, stored_summary
 from vehest.data.split_files import Reader, dataset_names, split_from_config
 from vehest.data.splits import Split
 from vehest.data.store import read_recording
@@ -116,12 +116,12 @@ class Runner:
 
         return self._once("split", config["split"], make)
 
-    def contents(self, config: Config) -> dict[str, tuple[Contents, ...]]:
+    def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
         """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
 
-        def read(name: str) -> tuple[Contents, ...]:
+        def read(name: str) -> tuple[RecordingSummary, ...]:
             ingested = self._ingested(name, config)
-            return tuple(stored_contents(ingested.folder / file) for file in ingested.outputs)
+            return tuple(stored_summary(ingested.folder / file) for file in ingested.outputs)
 
         return {name: self._once("contents", name, partial(read, name)) for name in dataset_names(config["split"])}
 

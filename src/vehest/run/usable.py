@@ -7,11 +7,11 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from vehest.data.contents import Contents, common_channels
+from vehest.data.derivable_channels import Derivation, derivation_of, made_by
 from vehest.data.errors import ConfigurationError
+from vehest.data.recording_summary import RecordingSummary, common_channels
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
-from vehest.data.supplies import Supply, made_by, supply_of
 from vehest.estimators.base import Estimator
 from vehest.estimators.needs import gaps_that_matter, lacking_to_estimate, lacking_to_train, settings_without_recordings
 from vehest.estimators.registry import estimator_class, estimator_names
@@ -34,7 +34,7 @@ class Missing:
 
     to_estimate: list[str]
     to_train: list[str]
-    supplies: dict[str, Supply | None]
+    supplies: dict[str, Derivation | None]
 
     @property
     def unsupplied(self) -> list[str]:
@@ -98,7 +98,7 @@ class Usability:
         }
 
 
-def all_usabilities(recordings: Sequence[Contents]) -> list[Usability]:
+def all_usabilities(recordings: Sequence[RecordingSummary]) -> list[Usability]:
     """A row for each estimator of conf/estimator, then of other packages that have no file there; there is at least one recording."""
     configs: dict[str, Config] = {name: compose_config("train", [f"estimator={name}"]) for name in choices("estimator")}
     for name in estimator_names():
@@ -106,7 +106,9 @@ def all_usabilities(recordings: Sequence[Contents]) -> list[Usability]:
     return [usability(name, config, recordings) for name, config in configs.items()]
 
 
-def usability(name: str, config: Config, recordings: Sequence[Contents], to_estimate: Sequence[Contents] | None = None) -> Usability:
+def usability(
+    name: str, config: Config, recordings: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary] | None = None
+) -> Usability:
     """Whether the estimator of a configuration can be trained on recordings and used on them.
 
     Args:
@@ -174,7 +176,7 @@ def _cells(row: Usability) -> list[str]:
     return [row.estimator, row.usable, rate, *("; ".join(filter(None, texts)) for texts in (missing, supplies))]
 
 
-def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Contents]]) -> str:
+def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
     """Channels that recordings of a split lack and its estimator needs, as one line; empty if none.
 
     Args:
@@ -206,13 +208,13 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Contents]
     return f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}" if patterns else ""
 
 
-def absent_channels(channels: Sequence[str], recordings: Sequence[Contents]) -> Missing:
+def absent_channels(channels: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
     """Those of the channels that some recording lacks."""
     absent = [name for own in recordings for name in channels if name not in own.channels]
     return _with_supplies(absent, absent, recordings)
 
 
-def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[Contents]]) -> list[Contents]:
+def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[RecordingSummary]]) -> list[RecordingSummary]:
     """The recordings of ranges, each once; unknown ones are skipped, and reported where they are read."""
     named = {(span.dataset, span.recording) for span in spans}
     return [own for dataset, recordings in contents.items() for own in recordings if (dataset, own.id) in named]
@@ -224,24 +226,24 @@ def _built(config: Config) -> tuple[Estimator, Any]:
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 
 
-def _missing(estimator: Estimator, training: Any, to_train: Sequence[Contents], to_estimate: Sequence[Contents]) -> Missing:
+def _missing(estimator: Estimator, training: Any, to_train: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary]) -> Missing:
     read = [name for own in to_estimate for name in lacking_to_estimate(estimator, own.channels)]
     learnt = [name for own in to_train for name in lacking_to_train(estimator, training, own.channels)]
     return _with_supplies(read, learnt, [*to_train, *to_estimate])
 
 
-def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[Contents]) -> Missing:
+def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
     held, gappy, rate = common_channels(recordings), _gappy(recordings), min((own.rate_hz for own in recordings), default=0.0)
-    supplies = {name: supply_of(name, held, gappy, rate) for name in (*read, *learnt)}
+    supplies = {name: derivation_of(name, held, gappy, rate) for name in (*read, *learnt)}
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
 
 
-def _gappy(recordings: Sequence[Contents]) -> frozenset[str]:
+def _gappy(recordings: Sequence[RecordingSummary]) -> frozenset[str]:
     return frozenset(name for recording in recordings for name in recording.gappy)
 
 
 def _settings_without(
-    config: Config, missing: list[str], to_train: Sequence[Contents], to_estimate: Sequence[Contents]
+    config: Config, missing: list[str], to_train: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary]
 ) -> tuple[tuple[str, ...], str]:
     """Overrides that avoid channels without a supply, taken while they help; and the same in words."""
     found: dict[str, Any] = {}

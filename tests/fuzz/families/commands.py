@@ -18,7 +18,7 @@ KEYS = (
     "estimator.n_hidden", "estimator.bias", "split", "split.name", "split.train", "split.tests", "split.tests.test", "training",
     "training.max_epochs", "training.batch_size", "training.learning_rate", "training.patience", "training.dtype",
     "training.checkpoint_seconds", "training.compiled", "tracking", "tracking.uri", "downsample.method", "downsample.transforms",
-    "limits.samples", "limits.jobs", "limits.text_bytes", "limits.nodes", "limits.depth", "nothing.there", "evaluation.rate_hz",
+    "limits.samples", "limits.jobs", "limits.text_bytes", "limits.memory", "limits.columns", "nothing.there", "evaluation.rate_hz",
     "evaluation.warm_up_seconds", "evaluation.skip_seconds", "evaluation.sequence_seconds", "evaluation.initial_state",
 )  # fmt: skip
 VALUES = (

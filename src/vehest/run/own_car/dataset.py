@@ -16,10 +16,10 @@ from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
 from vehest.data.channels import CHANNELS
-from vehest.data.contents import Contents, common_channels, contents_of
+from vehest.data.derivable_channels import derivation_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
-from vehest.data.supplies import supply_of
+from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
@@ -56,7 +56,7 @@ class Draft:
     examined: Examined
     dataset: Mapping[str, Any]
     late: Mapping[str, Late]
-    contents: list[Contents]
+    contents: list[RecordingSummary]
     remarks: list[str]
     ratio: tuple[float, float] | None
     notes: list[str]
@@ -101,7 +101,7 @@ def draft(examined: Examined) -> Draft:
         replace(examined, proposals=replace(proposals, channels=channels)),
         dataset,
         late,
-        [contents_of(own) for own in recordings],
+        [summary_of(own) for own in recordings],
         _remarks(longest, recordings),
         ratio,
         notes,
@@ -246,7 +246,7 @@ def _transforms(
         made.append({"name": "offset_correction", "offsets": offsets})
     made += speed
     for name in ("vy_ref", "ax"):
-        supply = supply_of(name, longest.channels, longest.gappy, longest.rate_hz) if name not in longest else None
+        supply = derivation_of(name, longest.channels, longest.gappy, longest.rate_hz) if name not in longest else None
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
     if "handwheel" in longest and "steer" not in longest and ratio:

@@ -12,10 +12,10 @@ import yaml
 
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
-from vehest.data.contents import Contents
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
+from vehest.data.recording_summary import RecordingSummary
 from vehest.estimators.registry import estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
@@ -151,7 +151,7 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
 
 
-def _plan_of(contents: Sequence[Contents], vehicle: Mapping[str, float | None]) -> Plan:
+def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     plan, values = Plan(), _car(vehicle)
     known = {"learned_ukf_variant"}  # only a paper's study compares it
@@ -184,7 +184,7 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
 
 
-def _lack(name: str, words: Sequence[str], contents: Sequence[Contents]) -> str:
+def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary]) -> str:
     """Channels that an estimator lacks; empty if none."""
     first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
     try:

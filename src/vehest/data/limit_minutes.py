@@ -1,4 +1,4 @@
-"""Ranges cut down to a number of minutes, as if less had been recorded."""
+"""Limits ranges to a number of minutes, as if less had been recorded."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from dataclasses import replace
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span
 
-LEAST_SECONDS = 3.0  # of a piece; what is shorter holds no window after the start that is not scored
+LEAST_SECONDS = 3.0  # of a piece; shorter ones hold no window after the start that is not scored
 
 
-def shortened(spans: Sequence[Span], seconds: float, at: float, bounds_of: Callable[[Span], tuple[float, float]]) -> tuple[Span, ...]:
+def limit_minutes(spans: Sequence[Span], seconds: float, at: float, bounds_of: Callable[[Span], tuple[float, float]]) -> tuple[Span, ...]:
     """A stretch of ranges laid end to end; it goes on at their start where it reaches their end. Ends of a few seconds are left out.
 
     Args:
         spans: ranges.
-        seconds: how much to keep [s]; all, if there is less.
+        seconds: time to keep [s]; all, if there is less.
         at: share of the ranges after which to begin, 0 to 1.
         bounds_of: first and last time of the recording of a range [s].
 

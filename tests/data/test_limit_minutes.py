@@ -7,8 +7,8 @@ import math
 import pytest
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.limit_minutes import limit_minutes
 from vehest.data.recording import Recording
-from vehest.data.shortened import shortened
 from vehest.data.split_files import split_from_config
 from vehest.data.splits import Span
 
@@ -26,7 +26,7 @@ def total(spans) -> float:
 @pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
 @pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
 def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
-    kept = shortened(SPANS, seconds, at, bounds)
+    kept = limit_minutes(SPANS, seconds, at, bounds)
     assert total(kept) == pytest.approx(seconds)
     assert all(any(own.start >= span.start and own.stop <= span.stop for span in SPANS if span.recording == own.recording) for own in kept)
     for position, one in enumerate(kept):
@@ -34,22 +34,22 @@ def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
 
 
 def test_the_stretch_begins_where_it_is_said_and_goes_on_at_the_start():
-    assert shortened(SPANS, 60.0, 0.5, bounds) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
+    assert limit_minutes(SPANS, 60.0, 0.5, bounds) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
 
 
 def test_an_end_of_a_second_is_left_out():
-    assert shortened(SPANS, 31.0, 0.0, bounds) == (Span("d", "one", 10.0, 40.0),)
+    assert limit_minutes(SPANS, 31.0, 0.0, bounds) == (Span("d", "one", 10.0, 40.0),)
 
 
 def test_ranges_without_ends_end_with_their_recordings():
-    assert shortened((Span("d", "one"),), 20.0, 0.0, bounds) == (Span("d", "one", 0.0, 20.0),)
-    assert shortened((Span("d", "one", 30.0, math.inf),), 60.0, 0.0, bounds) == (Span("d", "one", 30.0, math.inf),)
+    assert limit_minutes((Span("d", "one"),), 20.0, 0.0, bounds) == (Span("d", "one", 0.0, 20.0),)
+    assert limit_minutes((Span("d", "one", 30.0, math.inf),), 60.0, 0.0, bounds) == (Span("d", "one", 30.0, math.inf),)
 
 
 @pytest.mark.parametrize(("seconds", "at", "message"), [(0.0, 0.0, "split.minutes must"), (60.0, 1.0, "split.minutes_at must")])
 def test_no_time_and_no_place_are_refused(seconds, at, message):
     with pytest.raises(ConfigurationError, match=message):
-        shortened(SPANS, seconds, at, bounds)
+        limit_minutes(SPANS, seconds, at, bounds)
 
 
 def test_minutes_of_a_split_are_shared_by_training_and_validation_and_leave_tests_alone():

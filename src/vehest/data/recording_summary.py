@@ -1,0 +1,56 @@
+"""Summaries of recordings, without their samples: channels, those with gaps, and the sampling rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vehest.data.parquet import parquet_file
+from vehest.data.recording import Recording
+from vehest.data.store import RecordingDescription, description_of
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """Channels and rate of a recording.
+
+    Args:
+        id: name, unique within its data set.
+        rate_hz: sampling rate [Hz].
+        channels: that it has.
+        gappy: those of them that were not measured throughout.
+    """
+
+    id: str
+    rate_hz: float
+    channels: frozenset[str]
+    gappy: frozenset[str] = frozenset()
+
+
+def summary_of(recording: Recording) -> RecordingSummary:
+    """Summary of a recording; ``gappy`` are those channels that do have gaps."""
+    gappy = frozenset(name for name in recording.gappy if np.isnan(recording[name]).any())
+    return RecordingSummary(recording.id, recording.rate_hz, frozenset(recording.channels), gappy)
+
+
+def stored_summary(path: Path) -> RecordingSummary:
+    """Summary of a recording in the store, from the description in its file; ``gappy`` are those channels that may have gaps.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: the file is damaged, or not a recording.
+    """
+    with parquet_file(path) as file:
+        schema = file.schema_arrow
+    described = description_of(schema, path, RecordingDescription)
+    channels = frozenset(schema.names)
+    return RecordingSummary(described.id, described.rate_hz, channels, described.gappy & channels)
+
+
+def common_channels(recordings: Iterable[RecordingSummary]) -> frozenset[str]:
+    """Channels that all recordings have; none where there are no recordings."""
+    held = [recording.channels for recording in recordings]
+    return frozenset.intersection(*held) if held else frozenset()
