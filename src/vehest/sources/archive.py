@@ -17,10 +17,11 @@ from typing import Any
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.files import no_room, regular_file, writing_error
-from vehest.data.limits import check_limit, check_unpacked
+from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 
 MOST_BYTES = 8 * 10**9
+SMALL, MOST_EXPANSION = 64 * 2**20, 250  # bytes; times its packed size that a larger archive may unpack to
 MOST_FILES = 10_000
 
 _UNSOUND = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, OverflowError, MemoryError)
@@ -59,7 +60,8 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
                 if len(entries) > most_files or size > most_bytes:
                     limits = f"{most_files} entries and {most_bytes / 1e9:.3g} GB"
                     raise DataError(f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, more than the limit of {limits}")
-                check_unpacked(file, file.stat().st_size, size)
+                if size > max(SMALL, MOST_EXPANSION * file.stat().st_size):
+                    raise DataError(f"'{file}' would unpack to more than {MOST_EXPANSION} times its size; unpack it by hand")
                 targets = {entry: folder / _checked_path(file, entry) for entry in entries if not entry.is_dir()}
                 for entry, target in targets.items():
                     target.parent.mkdir(parents=True, exist_ok=True)

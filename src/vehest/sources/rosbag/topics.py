@@ -17,7 +17,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.files import writing_error
 from vehest.data.text_files import first_line, read_text
-from vehest.sources.archive import BLOCK, MOST_BYTES, temporary_folder, unpacked
+from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked
 from vehest.sources.limited import Reading, read_limited, require_package
 
 METADATA = "metadata.yaml"
@@ -173,7 +173,7 @@ def _decompress(path: Path, packed: Sequence[Path], folder: Path, most_bytes: in
     for file in packed:
         try:
             with zstd.open(file) as stream, open(folder / file.name, "xb") as plain:
-                while block := stream.read(BLOCK):
+                while block := stream.read(1 << 20):
                     left -= len(block)
                     if left < 0:
                         raise DataError(f"'{path}' would unpack to more than the limit of {most_bytes / 1e9:.3g} GB; raise unpacked_limit")
