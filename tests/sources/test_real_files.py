@@ -9,52 +9,12 @@ import pandas as pd
 import pytest
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.data.recording import Recording
 from vehest.run.config import compose_config
 from vehest.sources.base import Source, open_source
-
-F1TENTH = {  # file: rows, runs (the publishers' own counts)
-    "iros_hoons_1_with_friction": (14_867, [0, 1, 2, 3, 4, 5, 6]),
-    "hoons_all_test": (8_293, [4, 21, 22]),
-    "xray_duck_all_test": (18_239, [0, 7, 24, 25]),
-}
-TUM = {"data_to_run": 14_380, "data_to_train_12": 24_855, "data_to_train_2": 25_065}
 
 
 def source_of(name: str, data_root: Path) -> Source:
     return open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
-
-
-@pytest.mark.parametrize("file", F1TENTH)
-def test_f1tenth_files_hold_the_runs_and_rows_that_their_publishers_say(data_root: Path, file: str) -> None:
-    rows, runs = F1TENTH[file]
-    source = source_of("f1tenth", data_root)
-    recordings = [source.read(name) for name in source.ids() if name.startswith(file)]
-    assert [recording.id for recording in recordings] == [f"{file}_run_{run}" for run in runs]
-    assert sum(len(recording) for recording in recordings) == rows
-    assert all(recording.rate_hz == 100.0 and recording.kind == "real" for recording in recordings)
-
-
-def test_f1tenth_channels_are_the_columns_that_pandas_reads(data_root: Path) -> None:
-    table = pd.read_csv(data_root / "f1tenth" / "xray_duck_all_test.csv")
-    run = table[table["run_id"] == 24]
-    recording = source_of("f1tenth", data_root).read("xray_duck_all_test_run_24")
-    pairs = {"vx": "omega_wheels", "yaw_rate": "r_imu", "ax": "ax_imu", "ay": "ay_imu", "steer": "delta", "motor_current": "Iq"}
-    pairs |= {"vx_ref": "v_x", "vy_ref": "v_y", "yaw_rate_ref": "r"}
-    for channel, column in pairs.items():
-        np.testing.assert_allclose(recording[channel], run[column], rtol=1e-14, atol=0)
-    np.testing.assert_allclose(recording["motor_speed"] * 0.05, run["omega_wheels"], rtol=1e-14)
-    np.testing.assert_allclose(recording.time, run.iloc[:, 0], atol=1e-9)
-
-
-@pytest.mark.parametrize("file", TUM)
-def test_tum_files_hold_125_rows_a_second_in_si_units(data_root: Path, file: str) -> None:
-    recording = source_of("tum", data_root).read(file)
-    table = pd.read_csv(data_root / "tum" / f"{file}.csv")
-    assert len(recording) == len(table) == TUM[file]
-    assert (recording.rate_hz, recording.kind) == (125.0, "simulated")
-    np.testing.assert_allclose(recording["brake_pressure_front"], table["pBrakeF_bar"] * 1e5, rtol=1e-14)
-    np.testing.assert_allclose(recording["vy_ref"], table["vy_mps"], rtol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -110,19 +70,6 @@ def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_take
     fast = drift["vx_ref"] > 0.5
     assert 50.0 < np.degrees(np.abs(drift["sideslip_ref"][fast])).max() < 65.0
     assert not [f for one in (recording, drift) for f in checks_of_recording(one) if f.level == "error"]
-
-
-def follows(recording: Recording) -> str:
-    return next((f.level for f in checks_of_recording(recording) if f.channel == "vy_ref" and "follows" in f.message), "none")
-
-
-@pytest.mark.parametrize(("dataset", "compared"), [("f1tenth", 9), ("tum", 3)])
-def test_references_agree_with_the_inertial_sensors_wherever_a_run_is_long_enough(data_root: Path, dataset: str, compared: int) -> None:
-    recordings = list(source_of(dataset, data_root).recordings())
-    assert not [f for recording in recordings for f in checks_of_recording(recording) if f.level == "error" or f.check == "sign"]
-    long = [recording for recording in recordings if recording.duration > 14.5]
-    assert len(long) == compared
-    assert {follows(recording) for recording in long} == {"note"}
 
 
 def test_the_column_slip_angle_is_the_front_axles_and_not_the_sideslip(data_root: Path) -> None:

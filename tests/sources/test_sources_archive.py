@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import random
 import stat
 import tempfile
 import zipfile
@@ -12,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.errors import DataError, VehestError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.archive import unpacked
 
@@ -55,11 +53,6 @@ def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> Non
         found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
         assert found == CONTENT
     assert not folder.exists()
-
-
-def test_names_with_backslashes_or_dots_in_the_middle_are_paths_inside(tmp_path: Path) -> None:
-    with unpacked(packed(tmp_path, {"bag\\a..b": b"1", "./bag/./c": b"2"})) as folder:
-        assert sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()) == ["bag/a..b", "bag/c"]
 
 
 @pytest.mark.parametrize(
@@ -122,44 +115,6 @@ def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
     assert "is encrypted" in refusal(file)
 
 
-def test_whatever_is_flipped_in_an_archive_is_refused_or_harmless(tmp_path: Path) -> None:
-    """Three hundred archives with three random bytes each: no other exception, and no other content under a known name."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in CONTENT.items():
-            archive.writestr(name, data)
-    good = buffer.getvalue()
-    generator = random.Random(1)
-    file = tmp_path / "bag.zip"
-    refusals = []
-    for _ in range(300):
-        raw = bytearray(good)
-        for _ in range(3):
-            raw[generator.randrange(len(raw))] = generator.randrange(256)
-        file.write_bytes(raw)
-        try:
-            with unpacked(file, most_bytes=10**7) as folder:
-                for path in folder.rglob("*"):
-                    name = path.relative_to(folder).as_posix()
-                    assert path.is_dir() or name not in CONTENT or path.read_bytes() == CONTENT[name]
-        except (DataError, MissingError) as error:
-            refusals.append(str(error))
-    assert len(refusals) > 150
-    assert not any("\n" in refused for refused in refusals)
-
-
-@pytest.mark.parametrize(
-    "content", [{"bag": b"1", "bag/a": b"2"}, {"bag/a": b"1", "bag/./a": b"2"}, {"x" * 300: b"1"}, {"a/" * 3000 + "b": b"1"}]
-)
-def test_paths_that_no_disk_takes_are_refused(tmp_path: Path, content: dict[str, bytes]) -> None:
-    assert "cannot be unpacked" in refusal(packed(tmp_path, content))
-
-
-def test_a_missing_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
-    assert "set TMPDIR" in refusal(packed(tmp_path, CONTENT), MissingError)
-
-
 def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path: Path) -> None:
     file = packed(tmp_path, {"zeros": bytes(80 * 2**20)})
     assert "would unpack to more than 250 times its size" in refusal(file)
@@ -169,10 +124,3 @@ def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path: Path) -> 
     file = packed(tmp_path, {f"{k:0100d}": b"" for k in range(200)})
     with use_limits(Limits(text_bytes=10_000)):
         assert "holds a list of entries of" in refusal(file)
-
-
-@pytest.mark.parametrize("left", [0, 200, -10])
-def test_a_truncated_archive_is_refused(tmp_path: Path, left: int) -> None:
-    file = packed(tmp_path, CONTENT)
-    file.write_bytes(file.read_bytes()[:left])
-    assert "not a sound zip archive" in refusal(file)

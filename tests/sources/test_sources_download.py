@@ -6,8 +6,6 @@ import fcntl
 import hashlib
 import os
 import resource
-import shutil
-import signal
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -179,41 +177,6 @@ def test_what_is_there_is_not_fetched_again_and_the_record_stays_as_it_is(server
     assert len(server.asked) == 1
 
 
-def test_what_lies_there_unrecorded_is_recorded_on_first_sight(server: Server, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(b"by hand")
-    assert fetch(download(server, tmp_path)) == [Outcome("a.csv", "recorded", sha256(b"by hand"), 7)]
-    assert_only(tmp_path, b"by hand")
-    assert server.asked == []
-
-
-def test_several_files_share_a_record_that_keeps_its_other_lines(server: Server, tmp_path: Path) -> None:
-    other = f"# made by hand\nold.csv {'A' * 64}"
-    (tmp_path / CHECKSUMS).write_text(other)
-    server.contents["b drive.csv"] = b"second"
-    fetch(download(server, tmp_path, "a.csv", "b drive.csv"))
-    assert (tmp_path / CHECKSUMS).read_text() == f"{other}\na.csv {sha256(BYTES)}\n'b drive.csv' {sha256(b'second')}\n"
-    assert (tmp_path / "b drive.csv").read_bytes() == b"second"
-    assert server.asked[1][0] == "/b%20drive.csv"
-    assert [outcome.what for outcome in fetch(download(server, tmp_path, "a.csv", "b drive.csv"))] == ["matched", "matched"]
-
-
-def test_an_empty_file_is_no_data(server: Server, tmp_path: Path) -> None:
-    server.contents["a.csv"] = b""
-    assert "sends an empty file" in refusal(download(server, tmp_path), MissingError)
-    (tmp_path / "a.csv").touch()
-    server.contents["a.csv"] = BYTES
-    fetch(download(server, tmp_path))
-    assert_only(tmp_path)
-
-
-def test_progress_is_told_from_where_it_goes_on_to_the_end(server: Server, tmp_path: Path) -> None:
-    server.breaks = [4 * CHUNK]
-    told: list[tuple[str, int, int | None]] = []
-    list(download(server, tmp_path).fetch(lambda name, done, total: told.append((name, done, total))))
-    assert {(name, total) for name, _, total in told} == {("a.csv", SIZE)}
-    assert [done for _, done, _ in told] == [*range(CHUNK, SIZE, CHUNK), SIZE]
-
-
 # --- breaks ------------------------------------------------------------------------------------------------------------------------
 
 
@@ -238,17 +201,6 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
     assert_only(tmp_path)
 
 
-@pytest.mark.parametrize("more", [BYTES[4 * CHUNK :], BYTES])
-def test_a_part_as_long_as_the_file_or_longer_is_dropped(server: Server, tmp_path: Path, more: bytes) -> None:
-    server.breaks = [4 * CHUNK] + [0] * ATTEMPTS
-    refusal(download(server, tmp_path), MissingError)
-    with open(tmp_path / UNDER_WAY / "a.csv.part", "ab") as part:
-        part.write(more)
-    server.breaks = []
-    fetch(download(server, tmp_path))
-    assert_only(tmp_path)
-
-
 @pytest.mark.parametrize("modified", [None, "Sat, 22 Feb 2014 10:00:00 GMT"])
 def test_a_server_without_ranges_starts_over(server: Server, tmp_path: Path, modified: str | None) -> None:
     server.ranges, server.etag, server.modified = False, None, modified
@@ -256,14 +208,6 @@ def test_a_server_without_ranges_starts_over(server: Server, tmp_path: Path, mod
     (outcome,) = fetch(download(server, tmp_path))
     assert (outcome.resumed_at, server.sent) == (0, [200_000, SIZE])
     assert (server.asked[1][1] is None) == (modified is None)
-    assert_only(tmp_path)
-
-
-def test_without_a_strong_etag_the_date_says_whether_the_file_is_the_same(server: Server, tmp_path: Path) -> None:
-    server.etag, server.modified = 'W/"weak"', "Sat, 22 Feb 2014 10:00:00 GMT"
-    server.breaks = [4 * CHUNK]
-    fetch(download(server, tmp_path))
-    assert server.asked[1] == ("/a.csv", f"bytes={4 * CHUNK}-", server.modified)
     assert_only(tmp_path)
 
 
@@ -275,20 +219,6 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
     fetch(download(server, tmp_path))
     assert_only(tmp_path, other)
     assert server.asked[1][2] == '"one"'
-
-
-def test_a_connection_that_falls_silent_is_given_up_and_gone_on_with(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(resuming, "READ", 0.2)
-    server.stall.set()
-    server.breaks = [4 * CHUNK]
-    (outcome,) = fetch(download(server, tmp_path))
-    assert outcome.resumed_at == 4 * CHUNK
-    assert_only(tmp_path)
-    server.breaks = [0] * ATTEMPTS
-    server.contents["b.csv"] = BYTES
-    assert "timed out" in refusal(download(server, tmp_path, "b.csv"), MissingError)
 
 
 def test_a_server_without_a_trusted_connection_is_one_line_and_not_tried_again(server: Server, tmp_path: Path) -> None:
@@ -337,21 +267,11 @@ def test_a_file_that_was_changed_on_disk_is_reported_and_not_touched(server: Ser
         download(server, tmp_path).missing()
 
 
-def test_a_record_that_contradicts_the_declaration_is_refused(server: Server, tmp_path: Path) -> None:
-    (tmp_path / CHECKSUMS).write_text(f"a.csv {'a' * 64}\n")
-    assert "remove the one that is wrong" in refusal(download(server, tmp_path, known={"a.csv": "b" * 64}), DataError)
-
-
 @pytest.mark.parametrize("text", ["a.csv", "a.csv 123\n", "a.csv 'open\n", "one two three four\n", b"\xff\xfe\x00"])
 def test_a_damaged_record_is_refused(server: Server, tmp_path: Path, text: str | bytes) -> None:
     (tmp_path / CHECKSUMS).write_bytes(text if isinstance(text, bytes) else text.encode())
     assert CHECKSUMS in refusal(download(server, tmp_path), DataError)
     assert server.asked == []
-
-
-def test_a_pipe_is_no_record(server: Server, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / CHECKSUMS)
-    assert "is a pipe, not a file" in refusal(download(server, tmp_path), DataError)
 
 
 def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server: Server, tmp_path: Path) -> None:
@@ -372,15 +292,6 @@ def test_a_refusal_of_the_server_is_one_line_and_not_tried_again(server: Server,
     assert files(tmp_path) == {}
 
 
-@pytest.mark.parametrize(("status", "said"), [(503, "503 Service Unavailable"), (429, "429 Too Many")])
-def test_a_trouble_of_the_server_is_waited_out(server: Server, tmp_path: Path, status: int, said: str) -> None:
-    server.statuses = [status] * 5
-    assert said in refusal(download(server, tmp_path), MissingError)
-    server.statuses = [status, status]
-    fetch(download(server, tmp_path))
-    assert_only(tmp_path)
-
-
 def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server: Server, tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # files may not grow beyond
@@ -394,13 +305,6 @@ def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server: Server, tmp_pa
     assert_only(tmp_path)
 
 
-def test_a_folder_that_cannot_be_written_to_is_one_line(server: Server, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    assert "cannot write" in refusal(download(server, tmp_path / "file"), MissingError)
-    (tmp_path / "a.csv").mkdir()
-    assert "is a folder where a file belongs" in refusal(download(server, tmp_path), DataError)
-
-
 # --- what a data set may say -------------------------------------------------------------------------------------------------------
 
 TABULAR = {"name": "mine", "source": "tabular", "path": "there", "rate_hz": 10, "time": None}
@@ -412,28 +316,6 @@ def test_an_entry_says_address_files_and_checksums() -> None:
     what = download_of(open_source({**TABULAR, "download": entry}))
     assert (what.dataset, what.folder, what.files, what.sha256) == ("mine", Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
     assert what.address("b 1.csv") == "https://example.org/folder/b%201.csv"
-
-
-def test_without_a_list_the_source_says_what_its_recordings_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = open_source({**TABULAR, "download": {"url": "https://example.org"}})
-    with pytest.raises(ConfigurationError, match="files must list the names of files"):
-        download_of(source)
-    monkeypatch.setattr(source, "file_names", lambda: ["x.csv"])
-    assert download_of(source).files == ("x.csv",)
-
-
-@pytest.mark.parametrize(
-    ("name", "first", "last"),
-    [
-        ("revs_targa_2013", "yf219gg2055/20130222_01_01_03_grandsport.csv", "yf219gg2055/grandsport.csv"),
-        ("revs_targa_2014", "hd122pw0365/20140221_03_02_03_250lm.csv", "hd122pw0365/250lm.csv"),
-    ],
-)
-def test_the_revs_data_sets_that_are_shipped_name_their_files_in_the_repository(name: str, first: str, last: str) -> None:
-    conf = Path(__file__).parents[2] / "conf" / "dataset" / f"{name}.yaml"
-    what = download_of(open_source(yaml.safe_load(conf.read_text(encoding="utf-8").replace("${root}", "data"))))
-    addresses = [what.address(file).removeprefix("https://stacks.stanford.edu/file/") for file in what.files]
-    assert (addresses[0], addresses[-1], len(addresses), what.folder) == (first, last, 6, Path("data/revs"))
 
 
 @pytest.mark.parametrize(
@@ -464,12 +346,6 @@ def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry: object, said
     assert said in str(error.value)
     assert str(error.value).startswith(("data set 'mine': download", "data set 'mine': dataset.download"))
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("path", [None, "None/revs", "null", ""])
-def test_without_a_root_nothing_is_fetched(path: str | None) -> None:
-    with pytest.raises(MissingError, match="no data root is set; give root=FOLDER"):
-        download_of(open_source({**TABULAR, "path": path, "download": ENTRY}))
 
 
 # --- from the command line ---------------------------------------------------------------------------------------------------------
@@ -537,46 +413,3 @@ def test_a_dry_run_says_what_it_would_fetch_and_fetches_nothing(place: Place) ->
     assert lines(err) == [("would", "download", "two.csv"), ("would", "ingest", "mine")]
     assert f"from {place.server.url}/files/two.csv into data/mine" in err
     assert (files(place.folder), place.server.asked) == (before, [])
-
-
-def test_a_download_that_fails_is_one_line_and_makes_no_artefact(place: Place) -> None:
-    del place.server.contents["two.csv"]
-    code, out, err = place("ingest", "mine", "--download", "root=data")
-    assert (code, out) == (4, "")
-    assert err.splitlines()[-1].startswith(f"error: cannot fetch {place.server.url}/files/two.csv: the server answers 404 Not Found")
-    assert not (place.folder / "outputs").exists()
-
-    place.configure(files=["one.csv"], sha256={"one.csv": "0" * 64})
-    shutil.rmtree(place.folder / "data")
-    code, _, err = place("ingest", "mine", "--download", "root=data")
-    assert code == 3
-    assert len(err.splitlines()) == 1
-    assert not (place.folder / "data" / "mine" / "one.csv").exists()
-
-
-def test_ctrl_c_keeps_what_has_arrived_and_the_same_command_goes_on(place: Place) -> None:
-    server = place.server
-    server.contents["one.csv"] = BYTES * 100  # 30 MB: half of it is more than sockets hold
-    half = len(server.contents["one.csv"]) // 2
-    server.stall.set()
-    server.breaks = [half]
-
-    def interrupt() -> None:
-        if server.stalled.wait(10):
-            os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=interrupt)
-    thread.start()
-    code, _, err = place("ingest", "mine", "--download", "root=data")
-    thread.join()
-    assert code == 130
-    assert err == "error: stopped by SIGINT; finished artefacts are kept, the same command goes on\n"
-    under_way = place.folder / "data" / "mine" / UNDER_WAY
-    assert sorted(file.name for file in under_way.iterdir()) == ["one.csv.part", "one.csv.part.version"]
-    kept = (under_way / "one.csv.part").stat().st_size
-    assert 0 < kept <= half
-    code, _, err = place("ingest", "mine", "--download", "root=data", "+dataset.files=two.csv")  # the other one is no table
-    assert (code, lines(err)[-1]) == (0, ("done", "ingest", "mine"))
-    assert server.asked[1][1] == f"bytes={kept}-"
-    assert (place.folder / "data" / "mine" / "one.csv").read_bytes() == server.contents["one.csv"]
-    assert not under_way.exists()

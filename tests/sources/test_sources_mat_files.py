@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -57,34 +56,6 @@ def test_what_is_no_row_of_real_numbers_is_refused(tmp_path: Path, odd: object) 
     assert "'s.vxCG.value' is no row or column of real numbers" in refusal(tmp_path / "a.mat")
 
 
-def big_endian_file(path: Path, numbers: bytes = struct.pack(">HH3bx", 3, 1, 1, 2, 3)) -> None:
-    """x = [1 2 3], stored as whole numbers of one byte, written by a big-endian machine."""
-    flags = struct.pack(">IIII", 6, 8, 6, 0)
-    shape = struct.pack(">IIii", 5, 8, 1, 3)
-    body = flags + shape + struct.pack(">HHc3x", 1, 1, b"x") + numbers
-    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(">H", 0x0100) + b"MI" + struct.pack(">II", 14, len(body)) + body)
-
-
-def test_big_endian_files_are_read(tmp_path: Path) -> None:
-    big_endian_file(tmp_path / "a.mat")
-    assert "has no channel 'vxCG' (it has no structs)" in refusal(tmp_path / "a.mat")
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_a_damaged_file_ends_in_one_line(tmp_path: Path, compressed: bool) -> None:
-    content, generator = small_file(tmp_path / "a.mat", compressed), np.random.default_rng(0)
-    whole = read_mat_columns(tmp_path / "a.mat", ["vxCG"], TIME)
-    np.testing.assert_array_equal(whole.values["vxCG"], np.sin(STAMPS))
-    for share in (0.1, 0.5, 0.7):
-        (tmp_path / "cut.mat").write_bytes(content[: int(share * len(content))])
-        assert "cut.mat" in refusal(tmp_path / "cut.mat")
-    for _ in range(5):
-        damaged = bytearray(content)
-        damaged[128:] = bytes(generator.integers(0, 256, len(content) - 128, dtype=np.uint8))
-        (tmp_path / "bad.mat").write_bytes(damaged)
-        assert "bad.mat" in refusal(tmp_path / "bad.mat")
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [
@@ -109,8 +80,3 @@ def test_more_than_the_limits_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.mat").write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
     with use_limits(Limits(memory=300_000_000)):
         assert "takes more than" in refusal(tmp_path / "a.mat")
-
-
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.mat")
-    assert "is a pipe, not a file" in refusal(tmp_path / "a.mat")

@@ -92,18 +92,6 @@ def test_a_misspelt_pose_is_refused(tmp_path: Path, pose: dict[str, Any], said: 
         source(tmp_path, pose=POSE | pose)
 
 
-def test_a_channel_comes_from_a_column_or_from_the_pose(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="channel 'vx_ref' comes both from channels and from pose"):
-        source(tmp_path, channels={"vx_ref": {"column": "vx", "unit": "m/s"}}, pose=POSE)
-
-
-def test_a_missing_pose_names_its_row(tmp_path: Path) -> None:
-    table = circle()
-    table.loc[[40, 41], "px"] = np.nan
-    with pytest.raises(DataError, match=r"pose column 'px' holds 2 values that are no numbers, the first in row 41"):
-        read(table, tmp_path, pose=POSE)
-
-
 # Channels that are held between their samples
 
 
@@ -134,12 +122,6 @@ def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path
     plain = read(table, tmp_path, channels=HELD_CHANNELS)
     steps = plain["yaw_rate"][at] - truth[at]
     assert np.abs(steps).max() > 10 * bound
-
-
-def test_held_channels_that_never_change_are_refused(tmp_path: Path) -> None:
-    table, _ = held_table(delay_rows=4)
-    with pytest.raises(DataError, match="change in 0 rows; was their sensor connected"):
-        read(table.assign(r=0.0, sensor=0.0), tmp_path, channels=HELD_CHANNELS, held={"channels": ["yaw_rate"], "updated": "sensor"})
 
 
 @pytest.mark.parametrize(
@@ -181,12 +163,6 @@ def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
         source(tmp_path, drop_rows={"lap2": [1]}).ids()
 
 
-@pytest.mark.parametrize("row", [0, "b", "9-3", "0-3", "-3"])
-def test_what_is_no_row_is_refused(tmp_path: Path, row: object) -> None:
-    with pytest.raises(ConfigurationError, match="data row"):
-        source(tmp_path, drop_rows={"lap": [row]})
-
-
 def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
     for name in ("lap_1", "lap_2", "still"):
         circle(1.0).to_csv(tmp_path / f"{name}.csv", index=False)
@@ -196,11 +172,6 @@ def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
         source(tmp_path, exclude=["lap"]).ids()
     with pytest.raises(MissingError, match="exclude leaves none"):
         source(tmp_path, exclude=["*"]).ids()
-
-
-def test_runs_are_told_by_a_column_or_by_time_not_both(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="time_restarts needs a time column, and no column that counts runs"):
-        source(tmp_path, runs="run", time_restarts=True)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config, missing_keys
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, library_parameters, vehicle_from_configuration
@@ -69,14 +69,6 @@ def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed(
     assert not np.array_equal(other.read("b")["ay"], source.read("b")["ay"])
 
 
-def test_a_drive_without_a_seed_has_one_of_its_own_from_the_data_sets_seed_and_its_name() -> None:
-    drives = [drive("a"), drive("b")]
-    source = SimulatedSource(simulated(drives=drives, seed=1))
-    assert source.seed_of("a") != source.seed_of("b")
-    assert SimulatedSource(simulated(drives=drives[1:], seed=1)).seed_of("b") == source.seed_of("b"), "whatever other drives there are"
-    assert SimulatedSource(simulated(drives=drives, seed=2)).seed_of("b") != source.seed_of("b")
-
-
 def test_count_makes_as_many_drives_with_seeds_of_their_own() -> None:
     source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
     assert source.ids() == ["a_001", "a_002", "a_003"]
@@ -108,17 +100,6 @@ def test_cars_of_a_fleet_differ_from_drive_to_drive_within_the_stated_range() ->
         varied(vehicle, variations_from_config([{"parameters": ["tire.grip"], "factor": [1, 2]}]), 0)
 
 
-def test_tyres_of_both_axles_vary_and_what_is_named_twice_is_scaled_twice() -> None:
-    vehicle = vehicle_from_configuration(compose_config("ingest", ["dataset=sim_bmw"])["dataset"]["vehicle"])
-    vary = variations_from_config(
-        [{"parameters": ["tire.p_ky1", "tire_rear.p_ky1"], "factor": [0.5, 0.5]}, {"parameters": ["tire_rear.p_ky1"], "factor": [1.1, 1.1]}]
-    )
-    nominal, changed = compiled_parameters(vehicle), compiled_parameters(varied(vehicle, vary, 0))
-    assert changed.tire.p_ky1 == pytest.approx(0.5 * nominal.tire.p_ky1)
-    assert changed.tire_rear.p_ky1 == pytest.approx(0.55 * nominal.tire_rear.p_ky1)
-    assert changed.tire_rear.p_dy1 == nominal.tire_rear.p_dy1
-
-
 def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles() -> None:
     dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
     vehicle, vary = vehicle_from_configuration(dataset["vehicle"]), variations_from_config(dataset["vary"])
@@ -129,13 +110,6 @@ def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_
         assert np.std([getattr(car, axle).p_ky1 for car in cars]) > 0.5
         assert np.std([getattr(car, axle).p_dy1 for car in cars]) > 0.05
     assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), "the front axle lets go first, or about when the rear one does"
-
-
-def test_worn_tyres_of_the_truck_are_worn_at_both_axles() -> None:
-    vehicles = compose_config("ingest", ["dataset=sim_heavy"])["dataset"]["vehicles"]
-    nominal, worn = (compiled_parameters(vehicle_from_configuration(vehicles[name])) for name in ("nominal", "worn"))
-    for axle in ("tire", "tire_rear"):
-        assert getattr(worn, axle).p_ky1 / getattr(nominal, axle).p_ky1 == pytest.approx(0.85, abs=0.001)
 
 
 @pytest.mark.parametrize("kind", ["real", "measured"])
@@ -155,11 +129,6 @@ def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
     assert changed.yaw_rate.offset == levels.yaw_rate.offset
     assert changed.reference == levels.reference
     assert changed.yaw_rate.noise / levels.yaw_rate.noise != changed.ay.noise / levels.ay.noise
-
-
-def test_an_unknown_drive_is_missing_with_those_there_are() -> None:
-    with pytest.raises(MissingError, match=r"no drive 'c' \(it has a, b, …\)"):
-        open_source(simulated()).read("c")
 
 
 @pytest.mark.parametrize(
@@ -201,13 +170,6 @@ def test_a_misspelt_simulation_is_refused_in_one_line(changes: dict[str, object]
         SimulatedSource(simulated(**changes))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_a_simulation_without_a_vehicle_is_refused() -> None:
-    config = simulated()
-    del config["vehicle"]
-    with pytest.raises(ConfigurationError, match="needs a vehicle from conf/vehicle"):
-        SimulatedSource(config)
 
 
 @pytest.mark.parametrize(

@@ -65,20 +65,6 @@ def test_a_folder_of_text_files_is_a_recording(folder: Path) -> None:
     assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
 
 
-def test_inputs_are_the_files_that_are_read(folder: Path) -> None:
-    (folder / "lap" / "spam.txt").write_text("not read")
-    inputs = RevsSource(configuration(folder)).inputs()
-    assert inputs == {f"lap/{name}.txt": folder / "lap" / f"{name}.txt" for name in ("ayCG", "t", "vx")}
-
-
-@pytest.mark.parametrize("ending", ["\r\n", "\n\n", "   \n"])
-def test_line_endings_blank_lines_and_byte_order_marks_do_not_matter(folder: Path, ending: str) -> None:
-    expected = RevsSource(configuration(folder)).read("lap")["vx"]
-    lines = (folder / "lap" / "vx.txt").read_text().split()
-    (folder / "lap" / "vx.txt").write_bytes(("\ufeff" + ending.join(lines) + ending).encode())
-    np.testing.assert_array_equal(RevsSource(configuration(folder)).read("lap")["vx"], expected)
-
-
 def test_a_missing_or_empty_channel_file_is_named(folder: Path) -> None:
     (folder / "lap" / "vx.txt").unlink()
     assert "vx.txt" in refusal(folder, MissingError)
@@ -101,11 +87,6 @@ def test_text_among_numbers_is_found_with_its_row(folder: Path) -> None:
 def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
     np.savetxt(folder / "lap" / "vx.txt", np.zeros(N - 3))
     assert f"holds {N - 3} samples, the time file {N}" in refusal(folder)
-
-
-def test_several_numbers_a_line_are_refused(folder: Path) -> None:
-    np.savetxt(folder / "lap" / "vx.txt", np.zeros((N, 2)))
-    assert "column 'number' holds the text '0.000000000000000000e+00 0.0" in refusal(folder)
 
 
 @pytest.mark.parametrize(
@@ -133,13 +114,6 @@ def ferrari(data_root: Path) -> Recording:
     source = open_source(config)
     (recording,) = source.recordings()
     return recording
-
-
-def test_the_ferrari_was_recorded_for_550_seconds_at_100_hz(ferrari: Recording) -> None:
-    assert len(ferrari) == 55_001
-    assert ferrari.rate_hz == 100.0
-    assert ferrari.start_time == 149.99
-    assert ferrari.time[-1] == pytest.approx(699.99, abs=1e-9)
 
 
 def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari: Recording) -> None:

@@ -17,9 +17,8 @@ from scipy.io import savemat
 
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_mat, write_vehicle_parameters
 from vehest.cli import main
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.data.store import read_recording
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
@@ -120,19 +119,6 @@ def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root: Path, ma
     np.testing.assert_array_equal(both["handwheel"], 9.0 + 10.0 * np.arange(999))  # at 3.01 s the value of 3.0094 s holds
 
 
-def test_channels_that_begin_late_shorten_the_recording(root: Path, csv: Path, mat: Path) -> None:
-    drive, truth = smooth_drive(SECONDS)
-    write_csv(csv, drive, blank_rows={"yawRate": 500, "vyCG": 120})
-    recording = read(root)
-    assert recording.provenance["rows_dropped_at_the_head"] == 500
-    assert recording.start_time == 0.5
-    np.testing.assert_allclose(recording["yaw_rate"][::10], truth["yaw_rate"][500::10], **ONE_ROUNDING)
-    write_mat(mat, drive, late={"yawRate": 50, "vyCG": 12})
-    recording = read(root, layout="mat")
-    assert (recording.start_time, len(recording)) == (0.5, 350)
-    np.testing.assert_allclose(recording["vy_ref"], truth["vy_ref"][500::10], **ONE_ROUNDING)
-
-
 def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root: Path, csv: Path, mat: Path) -> None:
     drive, _ = smooth_drive(SECONDS)
     roll = np.array(drive.signals["rollAngle"])
@@ -147,35 +133,6 @@ def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root: Path, csv: 
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, gappy=["roll"])["roll"])), np.arange(2000, 2300))
     write_mat(mat, drive)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, layout="mat", gappy=["roll"])["roll"])), np.arange(200, 230))
-
-
-def as_mixed(content: bytes) -> bytes:
-    """Preamble in UTF-8, row of units in Latin-1."""
-    lines = content.split(b"\r\n")
-    lines[8] = lines[8].decode("latin-1").encode("utf-8")
-    return b"\r\n".join(lines)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        as_mixed,
-        lambda content: b"\xef\xbb\xbf" + content.decode("latin-1").encode("utf-8"),
-        lambda content: content.replace(b"\r\n", b"\n"),
-        lambda content: content.replace("°".encode("latin-1"), b"deg").replace("²".encode("latin-1"), b"^2"),
-        lambda content: content + b"\r\n\r\n",
-        lambda content: content.rstrip(b"\r\n"),
-    ],
-    ids=["mixed encodings", "UTF-8 with a byte order mark", "LF", "ASCII units", "blank lines at the end", "no line end"],
-)
-def test_encodings_and_line_ends_do_not_matter(root: Path, csv: Path, change: Callable[[bytes], bytes]) -> None:
-    write_csv(csv, smooth_drive(1.0)[0])
-    expected = read(root)
-    assert expected.provenance["preamble"][-1] == "Remark: made for tests, 25 °C"
-    csv.write_bytes(change(csv.read_bytes()))
-    recording = read(root)
-    for name in expected.channels:
-        np.testing.assert_array_equal(recording[name], expected[name])
 
 
 def test_provenance_tells_session_parameters_and_file(root: Path, csv: Path) -> None:
@@ -264,26 +221,6 @@ def test_a_malformed_csv_is_one_line_on_any_number_of_processors(root: Path, csv
     assert re.search(said, message), message
 
 
-def test_a_wrong_cell_deep_in_a_file_is_named_by_its_line_on_any_number_of_processors(root: Path, csv: Path) -> None:
-    write_csv(csv, smooth_drive(20.0, decimals=3)[0])  # several blocks of pyarrow
-    content = with_cell(19_000, "pitchRate", "x")(csv.read_bytes())
-    csv.write_bytes(with_cell(19_500, "vxCG", "y")(content))
-    processors = pa.cpu_count()
-    try:
-        for count in (1, 4):
-            pa.set_cpu_count(count)
-            assert "column 'pitchRate' holds the text 'x' in data row 18988" in refusal(root)
-    finally:
-        pa.set_cpu_count(processors)
-
-
-def test_a_column_that_is_blank_for_long_is_refused(root: Path, csv: Path) -> None:
-    write_csv(csv, smooth_drive(1.0)[0], blank_rows={"pitchAngle": 1000})
-    assert "column 'pitchAngle' is blank throughout" in refusal(root)
-    write_csv(csv, smooth_drive(1.0)[0], blank_rows={"pitchAngle": 600})
-    assert "column 'pitchAngle' is blank until 0.6 s, more than 50 % of the rows" in refusal(root)
-
-
 def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root: Path, csv: Path, one_second: bytes) -> None:
     csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
     assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refusal(root)
@@ -292,14 +229,6 @@ def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root: 
     assert len(read(root)) == 1000 - BLANK
     csv.write_bytes(with_cell(12, "yawRate", "turns")(one_second))  # says nothing that is known here
     assert len(read(root)) == 1000 - BLANK
-
-
-def test_another_number_of_lines_above_the_names_can_be_declared(root: Path, csv: Path) -> None:
-    write_csv(csv, smooth_drive(1.0)[0], preamble=PREAMBLE[:3])
-    assert "line 4 has it: set preamble_lines: 3" in refusal(root)
-    assert read(root, preamble_lines=3).provenance["preamble"] == list(PREAMBLE[:3])
-    write_csv(csv, smooth_drive(1.0)[0], preamble=[])
-    assert len(read(root, "dataset.preamble_lines=0")) == 1000 - BLANK
 
 
 def signal(values: NDArray[Any], rate: float = 100.0, start: float = 0.0) -> dict[str, NDArray[Any]]:
@@ -361,30 +290,6 @@ def test_a_malformed_table_of_vehicle_parameters_is_one_line(root: Path, csv: Pa
 # --- the data sets -----------------------------------------------------------------------------------------------------------------
 
 
-def test_the_data_sets_name_the_files_of_the_papers_table_1(root: Path) -> None:
-    files = {}
-    for dataset in ("revs_targa_2013", "revs_targa_2014"):
-        config = compose_config("ingest", [f"dataset={dataset}", f"root={root}"])["dataset"]
-        files[dataset] = open_source(config).file_names()
-    corvette = [f"2013022{name}_03_grandsport.csv" for name in ("2_01_01", "2_01_02", "2_02_01", "3_01_01", "3_01_02")]
-    ferrari = [f"201402{name}_03_250lm.csv" for name in ("21_03_02", "21_03_03", "21_04_01", "22_01_01", "22_02_01")]
-    assert files == {"revs_targa_2013": [*corvette, "grandsport.csv"], "revs_targa_2014": [*ferrari, "250lm.csv"]}
-
-
-def test_without_named_recordings_every_matching_file_is_one(root: Path) -> None:
-    for name in ("20130817_02_grandsport", "20130816_01_grandsport", "20130222_01_grandsport"):
-        write_csv(root / "revs" / f"{name}.csv", smooth_drive(0.2)[0])
-    write_vehicle_parameters(root / "revs" / "grandsport.csv")
-    monterey = source(root, dataset="revs_monterey_2013", recordings=None)
-    assert monterey.ids() == ["20130816_01_grandsport", "20130817_02_grandsport"]
-    assert set(monterey.inputs()) == {"20130816_01_grandsport.csv", "20130817_02_grandsport.csv", "grandsport.csv"}
-    assert [recording.id for recording in monterey.recordings()] == monterey.ids()
-    assert monterey.file_names() == []
-    assert len(source(root, dataset="revs_monterey_2013", recordings=None, files=None).ids()) == 3
-    with pytest.raises(MissingError, match=r"nothing in .* matches '201308\*_grandsport\.mat'"):
-        source(root, dataset="revs_monterey_2013", recordings=None, layout="mat").ids()
-
-
 def vehest(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of a command."""
     monkeypatch.setattr(sys, "argv", ["vehest", *arguments])
@@ -395,30 +300,3 @@ def vehest(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
         code = int(leave.code or 0)
     out, err = capsys.readouterr()
     return code, out, err
-
-
-@pytest.mark.parametrize("layout", ["csv", "mat"])
-def test_the_whole_data_set_is_ingested_and_checked(
-    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, layout: str
-) -> None:
-    monkeypatch.chdir(root)
-    names = source(root, recordings=compose_config("ingest", ["dataset=revs_targa_2014"])["dataset"]["recordings"]).ids()
-    drive, truth = smooth_drive(25.0, decimals=6)
-    for name in names:
-        {"csv": write_csv, "mat": write_mat}[layout](root / "revs" / f"{name}.{layout}", drive)
-    write_vehicle_parameters(root / "revs" / "250lm.csv")
-    arguments = ("revs_targa_2014", f"root={root}", f"dataset.layout={layout}")
-    code, _, err = vehest(capsys, monkeypatch, "ingest", *arguments, "output=made")
-    assert code == 0, err
-    stored = {file.stem: read_recording(file) for file in (root / "made" / "ingest").rglob("*.parquet")}
-    assert set(stored) == set(names)
-    for recording in stored.values():
-        expected = truth["vy_ref"][round(recording.start_time * 1000) :: round(1000 / recording.rate_hz)]
-        assert np.abs(recording["vy_ref"] - expected)[:: 10 if layout == "csv" else 1].max() < 0.01  # held for up to 10 ms
-        assert recording.provenance["vehicle_parameters"]["wheelbase"]["value"] == 2.4
-    code, out, err = vehest(capsys, monkeypatch, "data", "check", *arguments)
-    assert code == 0, out + err
-    lines = out.splitlines()
-    assert {line.split()[0] for line in lines} == {"note"}
-    assert sum("d(vy_ref)/dt follows ay - vx·yaw_rate" in line for line in lines) == 5
-    assert sum("is held in between" not in line for line in lines) == 5, "the CSV holds 100 Hz in rows of 1000 Hz; no more is said"

@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
-from place import run_vehest
-from vehest import api
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
@@ -123,23 +120,6 @@ def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path: Path, name: str, dtyp
     assert recording.rate_hz == 100.0
 
 
-def test_columns_units_and_signs_come_from_the_map(tmp_path: Path) -> None:
-    frame = pd.DataFrame({"stamp": np.arange(50) * 10, "Speed": np.arange(50.0), "AccY": np.linspace(-1, 1, 50), "Gyro": np.full(50, 9.0)})
-    frame.to_csv(tmp_path / "lap.csv", index=False)
-    columns = {
-        "vx": {"column": "Speed", "unit": "km/h"},
-        "vx_ref": {"column": "Speed", "unit": "mph"},
-        "ay": {"column": "AccY", "unit": "g", "sign": -1},
-        "yaw_rate": {"column": "Gyro", "unit": "deg/s"},
-    }
-    recording = read(tmp_path / "lap.csv", channels=columns, time={"column": "stamp", "unit": "ms"})
-    assert recording.rate_hz == 100.0
-    np.testing.assert_allclose(recording["vx"], frame["Speed"] / 3.6)
-    np.testing.assert_allclose(recording["vx_ref"], frame["Speed"] * 0.44704)
-    np.testing.assert_allclose(recording["ay"], -9.80665 * frame["AccY"])
-    np.testing.assert_allclose(recording["yaw_rate"], np.deg2rad(9.0))
-
-
 def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path: Path) -> None:
     body = "\n".join(f"{k / 100:.2f};{k * 0.5:.1f}" for k in range(20)).replace(".", ",")
     content = f"Messung vom 3. März\n\nZeit [s];Querbeschl. [m/s²]\n{body}\n".encode("latin-1")
@@ -156,35 +136,6 @@ def test_without_a_time_column_the_rate_is_given(tmp_path: Path) -> None:
     table().drop(columns="time").to_csv(tmp_path / "lap.csv", index=False)
     recording = read(tmp_path / "lap.csv", time=None, rate_hz=125)
     assert (recording.rate_hz, recording.start_time, len(recording)) == (125.0, 0.0, N)
-
-
-def test_a_jittering_clock_is_interpolated_where_that_is_asked_for(tmp_path: Path) -> None:
-    stamps = np.arange(N) / 100.0 + 2e-3 * np.random.default_rng(2).uniform(-1, 1, N)
-    pd.DataFrame({"time": stamps, "vx": 3.0 * stamps}).to_csv(tmp_path / "lap.csv", index=False)
-    assert "set clock: interpolate" in refusal(lambda: read(tmp_path / "lap.csv"))
-    recording = read(tmp_path / "lap.csv", clock="interpolate")
-    assert recording.rate_hz == 100.0
-    np.testing.assert_allclose(recording["vx"], 3.0 * recording.time, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "\ufeff" + HEADER + rows(9),
-        (HEADER + rows(9)).replace("\n", "\r\n"),
-        HEADER + rows(9) + "\n\n",
-        HEADER + rows(9).rstrip("\n"),
-        '"time","vx","ay"\n' + "".join(f'"{k / 100:.2f}","{k}","{2 * k}"\n' for k in range(9)),
-        HEADER + rows(9).replace(",", ", "),
-        HEADER + "".join(f"{k / 100:.2e},{k:+d},{2 * k:.3E}\n" for k in range(9)),
-    ],
-    ids=["byte order mark", "CRLF", "blank lines at the end", "no newline at the end", "quotes", "blanks", "exponents"],
-)
-def test_common_ways_of_writing_csv_read_alike(tmp_path: Path, content: str) -> None:
-    recording = read(written(tmp_path, content))
-    assert recording["vx"].tolist() == list(range(9))
-    assert recording["ay"].tolist() == list(range(0, 18, 2))
-    assert recording.rate_hz == 100.0
 
 
 def test_a_stored_recording_is_read_as_what_it_is(tmp_path: Path) -> None:
@@ -206,10 +157,6 @@ def test_recordings_are_the_stems_in_order(tmp_path: Path) -> None:
 
 
 # --- what cannot -------------------------------------------------------------------------------------------------------------------
-
-
-def test_a_pattern_that_matches_nothing_is_named(tmp_path: Path) -> None:
-    assert f"no file in '{tmp_path}' matches '*.csv'" in refusal(source(tmp_path, files="*.csv").ids, MissingError)
 
 
 def test_two_files_of_one_stem_are_refused(tmp_path: Path) -> None:
@@ -258,28 +205,6 @@ def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_
     assert f"'{file}'" in message
     for words in said:
         assert words in message
-
-
-@pytest.mark.parametrize(
-    ("column", "said"),
-    [
-        (pa.array(["a"] * 5), "column 'vx' is of type string"),
-        (pa.array([None] * 5), "column 'vx' is of type null"),
-        (pa.array([True] * 5), "column 'vx' is of type bool"),
-    ],
-)
-def test_a_parquet_column_that_holds_no_numbers_is_refused(tmp_path: Path, column: pa.Array, said: str) -> None:
-    pq.write_table(pa.table({"time": np.arange(5) / 10, "vx": column}), tmp_path / "lap.parquet")
-    message = refusal(lambda: read(tmp_path / "lap.parquet"))
-    assert said in message
-    assert "numbers are needed" in message
-
-
-def test_a_table_without_any_known_column_lists_what_it_has(tmp_path: Path) -> None:
-    file = written(tmp_path, "time,Speed\n0,1\n0.01,2\n")
-    message = refusal(lambda: read(file))
-    assert "it has time, Speed" in message
-    assert "declare the columns" in message
 
 
 @pytest.mark.parametrize(
@@ -334,17 +259,6 @@ def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None
     assert recordings[1].provenance["run"] == 3
 
 
-def test_time_may_jump_between_runs_but_not_within_one(tmp_path: Path) -> None:
-    file = written(
-        tmp_path, "time,vx,run_id\n" + "".join(f"{t:.2f},1,{run}\n" for run, t0 in ((0, 5.0), (1, 0.0)) for t in t0 + np.arange(9) / 100)
-    )
-    assert [recording.start_time for recording in source_of(file).recordings()] == [5.0, 0.0]
-    gap = written(tmp_path, "time,vx,run_id\n" + "".join(f"{t:.2f},1,{run}\n" for run in (0, 1) for t in (0.0, 0.01, 0.02, 0.5, 0.51)))
-    message = refusal(lambda: source_of(gap).read("lap_run_1"))
-    assert f"'{gap}', run 1" in message
-    assert "1 gaps" in message
-
-
 @pytest.mark.parametrize(
     ("runs", "said"),
     [
@@ -365,12 +279,6 @@ def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
     assert len(source_of(runs_csv(tmp_path, [4] * 9)).read_file(tmp_path / "lap.csv")) == 9
     message = refusal(lambda: source_of(runs_csv(tmp_path, [4] * 9 + [5] * 9)).read_file(tmp_path / "lap.csv"))
     assert "holds 2 runs (4, 5); keep the rows of one" in message
-
-
-def test_a_factor_brings_a_column_to_its_declared_unit(tmp_path: Path) -> None:
-    file = written(tmp_path, "time,rim\n" + "".join(f"{row / 100:.2f},{row}\n" for row in range(9)))
-    columns = {"motor_speed": {"column": "rim", "factor": 20.0, "unit": "rad/s"}}
-    np.testing.assert_array_equal(read(file, channels=columns)["motor_speed"], 20.0 * np.arange(9))
 
 
 # --- what asks for too much ------------------------------------------------------------------------------------------------------------
@@ -401,21 +309,6 @@ def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path: Pat
     torn = written(tmp_path, bomb.read_bytes()[:-100], "torn.csv.gz")
     with use_limits(Limits(expansion=10_000)):
         assert "cannot be read" in refusal(lambda: read(torn))
-
-
-def test_a_limit_is_raised_on_the_command_line_and_from_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = written(tmp_path, "time,vx\n" + "".join(f"{k / 100:.2f},{k % 7}\n" for k in range(50)))
-    few = "limits.samples=10"
-    for command in (("data", "check"), ("data", "show"), ("data", "align", "-e", "delay"), ("estimate",)):
-        words = [*command[:2], str(file), few, *command[2:]]
-        code, out, err = run_vehest(capsys, *words)
-        assert code == 3
-        assert "has 50 rows, more than the limit of 10" in out + err
-    with pytest.raises(DataError, match="more than the limit of 10"):
-        api.read_recording(file, [few])
-    assert len(api.read_recording(file)) == 50
-    with pytest.raises(ConfigurationError, match=r"limits\.samples must be a whole number"):
-        api.read_recording(file, ["limits.samples=many"])
 
 
 def test_a_held_value_that_stays_is_no_ramp() -> None:
