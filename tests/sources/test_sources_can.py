@@ -142,14 +142,9 @@ SPEED = {"vx": {"column": "Speed", "unit": "m/s"}}
     ("dbc", "said"),
     [
         (one("Speed", 'SG_ Speed : 0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000), "impossible length: BO_ 291 Speed: 4000000000"),
-        (one("Speed", 'SG_ Speed : 0|60000@1+ (1,0) [0|0] "" Car'), "impossible length"),
-        (one("Speed", 'SG_ Speed : 64000|8@1+ (1,0) [0|0] "" Car'), "impossible length"),
         (one("Speed", 'SG_ Speed : 60|8@1+ (1,0) [0|0] "" Car'), "cannot be decoded"),
         (one("Speed", 'SG_ Speed : 0|16@1+ (1e999,0) [0|0] "" Car'), "has the scale inf"),
-        (one("Speed", 'SG_ Speed : 0|16@1+ (0,0) [0|0] "" Car'), "has the scale 0"),
         (one("Speed", "SG_ Speed : soon"), "cannot be read as a DBC"),
-        ("BO_ 99999999999999 Speed: 8 Car\n", "cannot be read as a DBC"),
-        ("VERSION", "cannot be read as a DBC"),
         ("", "is empty"),
     ],
 )
@@ -177,18 +172,12 @@ def blf_with(content: bytes, method: int = 0) -> bytes:
     ("suffix", "change", "said"),
     [
         (".blf", lambda content: content[:-20], "is truncated"),
-        (".blf", lambda content: content[:100], "is truncated"),
-        (".blf", lambda _: b"LOGG" + struct.pack("<L", 8) + bytes(200), "is damaged"),
         (".blf", lambda _: b"MDF     " + bytes(200), "Unexpected file format"),
         (".blf", lambda _: blf_with(struct.pack("<4sHHLL", b"LOBJ", 16, 1, 2**32 - 1, 1) + bytes(100)), "holds no frame"),
         (".blf", lambda _: blf_with(bytes(600 * 2**20), 2), "Could not find next object|MB of memory"),
-        (".blf", lambda _: blf_with(b"nothing that begins an object"), "Could not find next object"),
-        (".blf", lambda _: blf_with(b"")[:144], "holds no frame"),
         (".asc", lambda content: content[: content.rindex(b"Rx") + 12], "a frame of message .* holds"),
         (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "is damaged .*zzz"),
-        (".asc", lambda _: bytes(range(256)) * 40, "holds no frame"),
         (".log", lambda content: content[:-4] + b"\n(1e9) vcan0 120#0", "is damaged|holds 1 of the 8"),
-        (".log", lambda content: content.replace(b"(17", b"(nan17", 1), "is damaged"),
         (".log", lambda content: b"(inf) vcan0 120#0000000000000000\n" + content, "is stamped inf s"),
     ],
 )

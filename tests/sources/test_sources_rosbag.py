@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 import shutil
 import sqlite3
 import sys
@@ -296,15 +295,6 @@ def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
     )
 
 
-def test_turning_and_moving_the_rigid_body_is_undone(folder: Path) -> None:
-    """The car's axes are 10° left of the body's, the reference point is 0.2 m ahead of and 0.1 m left of the body's origin."""
-    recording = read(folder, pose={"topic": "body", "yaw": np.radians(10.0), "lever_x": 0.2, "lever_y": 0.1})
-    gain, turn = filter_gain(YAW_RATE), np.exp(-1j * np.radians(10.0))
-    expected = gain * (VX + 1j * VY) * turn + 1j * YAW_RATE * (0.2 + 0.1j)
-    np.testing.assert_allclose(inside(recording, "vx_ref"), expected.real, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(inside(recording, "vy_ref"), expected.imag, rtol=0, atol=1e-6)
-
-
 # --- clocks ------------------------------------------------------------------------------------------------------------------------
 
 
@@ -333,7 +323,7 @@ def test_samples_taken_evenly_and_stamped_late_come_back(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
+@pytest.mark.parametrize("share", [0.3, 0.999])
 def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) -> None:
     bag = write_bag(tmp_path, drive(1.0), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
@@ -341,24 +331,6 @@ def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) 
     message = refusal(tmp_path, DataError if share else MissingError)
     assert "truncated" in message or "is empty" in message or "is damaged" in message
     assert "lap" in message
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (None, "has no metadata.yaml"),
-        ("", "is empty"),
-        ("a: [", "Could not load YAML"),
-        ("{}", "A metadata key is missing"),
-        ("rosbag2_bagfile_information: {version: 99}", "version 99 not supported"),
-    ],
-)
-def test_a_bag_without_sound_metadata_is_refused(folder: Path, content: str | None, said: str) -> None:
-    metadata = folder / "lap" / "metadata.yaml"
-    metadata.unlink()
-    if content is not None:
-        metadata.write_text(content)
-    assert said in refusal(folder, MissingError if content == "" else DataError)
 
 
 def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) -> None:
@@ -390,18 +362,6 @@ def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
     assert len(read(bags, topics=topic_options("motor", max_gap=0.12))) == 295
 
 
-def test_links_that_lead_nowhere_or_in_circles_and_pipes_are_refused(folder: Path) -> None:
-    data = folder / "lap" / "lap.db3"
-    data.unlink()
-    data.symlink_to(folder / "nowhere.db3")
-    assert "there is no file" in refusal(folder, MissingError)
-    data.unlink()
-    data.symlink_to(data)
-    assert "there is no file" in refusal(folder, MissingError)
-    os.mkfifo(folder / "lap_2.zip")
-    assert "there is no file" in refusal(folder, MissingError, files="*.zip")
-
-
 # --- bags that nobody vouches for --------------------------------------------------------------------------------------------------
 
 
@@ -422,12 +382,9 @@ ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SEL
     ("statements", "said"),
     [
         (["DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"], "missing tables"),
-        (["ALTER TABLE topics RENAME TO t", f"CREATE VIEW topics AS {ENDLESS}"], "missing tables"),
         (["UPDATE messages SET data = 'text' WHERE id = 5"], "is damaged"),
         (["UPDATE messages SET timestamp = -1 WHERE id = 5"], "at no time there is"),
-        (["UPDATE messages SET timestamp = 1.5 WHERE id = 5"], "is damaged"),
         (["UPDATE messages SET data = zeroblob(100000000) WHERE id = 5"], "is damaged"),
-        (["UPDATE message_definitions SET encoding = 'exe'"], "is damaged ('exe')"),
         (["UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"], "is damaged"),
     ],
 )
@@ -498,30 +455,17 @@ def test_bags_that_ros_compressed_are_read_up_to_the_limits(folder: Path, mode: 
     ("changes", "said"),
     [
         ({"rate_hz": 0}, "rate_hz: input should be greater than 0"),
-        ({"rate_hz": "fast"}, "rate_hz must be a number"),
         ({"start": 2, "stop": 1}, "stop must be above start, 2"),
         ({"files": "/etc/*"}, "must be a pattern inside path"),
-        ({"files": 3}, "dataset.files must be text"),
-        ({"topics": [1]}, "dataset.topics must be a mapping"),
-        ({"topics": {}}, "topic 'imu' is not one of topics: none"),
         ({"topics": topic_options("imu", stamp="header")}, "topics.imu.stamp is not an option"),
-        ({"topics": topic_options("imu", stamps="sent")}, "stamps 'sent' is not one of: header, received"),
         ({"topics": topic_options("imu", rate_hz=None)}, "a uniform clock needs"),
         ({"topics": topic_options("motor", average=0.01)}, "a moving average needs"),
         ({"topics": topic_options("body", average=0.02)}, "orientations cannot be averaged"),
         ({"topics": topic_options("motor", topic="/imu")}, "lists '/imu' twice"),
         ({"channels": {"vx": {"topic": "motor", "field": "motor.rpm", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
-        ({"channels": {"speed": CHANNELS["vx"]}}, "channel 'speed' is not known"),
-        ({"channels": {"vx": {"topic": "motor", "unit": "m/s"}}}, "channels.vx.field is missing"),
-        ({"channels": {"vx": CHANNELS["vx"] | {"sign": 2}}}, "sign '2' is not one of: 1, -1"),
-        ({"channels": {"vx": CHANNELS["vx"] | {"offset": "none"}}}, "offset must be a number"),
         ({"channels": {"vx_ref": CHANNELS["vx"]}}, "'vx_ref' comes both from channels and from pose"),
         ({"channels": {}, "pose": None}, "neither channels nor a pose"),
-        ({"pose": {"topic": "body", "window": 8}}, "window must be an odd number"),
         ({"pose": {"topic": "body", "up": "x"}}, "up 'x' is not one of: y, z"),
-        ({"pose": {"topic": "body", "channels": ["vx"]}}, "channels must be a list of vx_ref"),
-        ({"pose": {"topic": "body", "yaw": "left"}}, "yaw must be a number"),
-        ({"pose": {"topic": "head"}}, "topic 'head' is not one of topics"),
         ({"speed": 3}, "has no option 'speed'"),
         # what only the message types can tell
         (
@@ -529,11 +473,8 @@ def test_bags_that_ros_compressed_are_read_up_to_the_limits(folder: Path, mode: 
             "'car_msgs/msg/Motor' has no field 'speed' (it has rpm, currents",
         ),
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
-        ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor"}}}, "is not a number"),
-        ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.currents"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),
         ({"messages": {}}, "is neither a standard one nor declared"),
-        ({"messages": {"car_msgs/msg/MotorStamped": "Motor motor"}}, "type 'car_msgs/msg/Motor' of field 'motor' is not declared"),
         ({"messages": {"car_msgs/msg/Motor": "64float rpm"}}, "layout of message type 'car_msgs/msg/Motor' cannot be read"),
         ({"messages": LAYOUTS | {"std_msgs/msg/Float64": "float32 data"}}, "already present with different definition"),
     ],

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
-from place import Place
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
@@ -73,12 +71,9 @@ def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_pa
     ("old", "new", "message"),
     [
         (b"[data]", b"[rows]", r"has no section \[data\]"),
-        (b"[column names]", b"[names]", r"has no column 'time' \(it has \)"),
         (b" Y_Accel ", b" X_Accel ", "has 2 columns called 'X_Accel'"),
-        (b" Y_Accel ", b" Other ", "has no column 'Y_Accel'"),
         (b"053 104751.450", b"053 109951.450", "is no clock time hhmmss"),
         (b"053 104751.450", b"053 x", "column 'time' holds the text 'x' in data row 101"),
-        (b"053 104751.450", b"053 999999.450", "is no clock time hhmmss"),
         (b"053 104751.450 ", b"053 ", r"Row #101: Expected 18 columns, got 17"),
     ],
 )
@@ -105,19 +100,6 @@ def test_what_makes_no_sense_is_refused(tmp_path: Path) -> None:
             read(tmp_path, **more)
     with pytest.raises(MissingError, match="has no recording 'other'"):
         open_source(dataset(tmp_path)).read("other")
-
-
-def test_a_log_is_checked_and_estimated_from_its_file(place: Place) -> None:
-    write_log(place.folder / "lap.vbo")
-    described = dataset(place.folder / "raw") | {"title": "Logs", "kind": "real"}
-    (place.folder / "conf" / "dataset" / "logs.yaml").write_text(yaml.safe_dump(described))
-    code, _, err = place("estimate", "lap.vbo", "dataset=logs", "-o", "out.csv")
-    assert code == 0, err
-    assert (place.folder / "out.csv").is_file()
-    assert place("data", "check", "lap.vbo", "dataset=logs")[0] == 0
-    code, line = place.refused("estimate", "lap.vbo")
-    assert code == 2
-    assert "copy the data set 'vbo' to conf/dataset/NAME.yaml" in line
 
 
 @pytest.mark.skipif(not REAL.is_file(), reason="needs VEHEST_DATA with vbox/standstill.VBO")
