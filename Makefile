@@ -80,6 +80,7 @@ test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for t
 
 golden: $(INSTALLED) ## record the numbers that the golden tests compare, after a version was raised
 	PYTHONPATH=tests:tests/sources $(BIN)/python tests/golden/golden_numbers.py
+	PYTHONPATH=tests:tests/sources $(BIN)/python tests/golden/golden_readings.py
 
 pilots: $(INSTALLED) ## every study on small budgets, its tables in build/pilots (PILOTS=FOLDER, STUDIES="ksnn trust"); needs VEHEST_DATA
 	nice $(BIN)/python tests/pilots/pilots.py $(STUDIES) --out $(PILOTS) --jobs $(JOBS)

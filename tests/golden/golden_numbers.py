@@ -59,7 +59,7 @@ class Subject:
         parts = self.numbers()
         return {
             "versions": dict(self.versions),
-            "digests": {part: _digest(arrays) for part, arrays in parts.items()},
+            "digests": {part: digest_of(arrays) for part, arrays in parts.items()},
             "values": {part: {name: _values(array) for name, array in arrays.items()} for part, arrays in parts.items()},
         }
 
@@ -108,13 +108,14 @@ def moved(name: str, recorded: Mapping[str, Any], now: Mapping[str, Any], tolera
     return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
 
 
-def _digest(arrays: Arrays) -> str:
+def digest_of(arrays: Arrays, digits: int = DIGITS) -> str:
+    """Digest of numbers, each rounded to so many digits of its array's largest."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         numbers = np.asarray(array, np.float64)
         largest = np.max(np.abs(numbers[np.isfinite(numbers)]), initial=0.0)
         if largest > 0:
-            numbers = np.round(numbers / 10.0 ** np.ceil(np.log10(largest)), DIGITS) + 0.0
+            numbers = np.round(numbers / 10.0 ** np.ceil(np.log10(largest)), digits) + 0.0
         digest.update(f"{name} {numbers.shape} ".encode() + numbers.tobytes())
     return digest.hexdigest()[:16]
 

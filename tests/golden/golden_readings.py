@@ -1,0 +1,51 @@
+"""What is recorded of every real recording as its source reads it; `make golden` records anew where VEHEST_DATA is set."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from golden_numbers import digest_of, this_machine
+from vehest.run.config import compose_config
+from vehest.sources.base import open_source
+
+FILE = Path(__file__).with_name("readings.json")
+DIGITS = 12
+NAMES = (
+    "av21 dart dart_as_f1tenth f1tenth f1tenth_as_full_size f1tenth_bag ferrari_250lm "
+    "ferrari_250lm_unlabelled roboracer saloon_standstill tum"
+)
+VBOX = ("vbo", "dataset.path=${root}/vbox", "dataset.clock=interpolate")
+READINGS: dict[str, tuple[str, ...]] = {name: (name,) for name in NAMES.split()} | {"vbox": VBOX}  # data set, and what else is set
+
+
+def read(name: str, root: str) -> dict[str, Any]:
+    """Recording -> rate [Hz], start time [s], and for each channel a digest of its samples and their root mean square."""
+    dataset, *otherwise = READINGS[name]
+    config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *otherwise])["dataset"]
+    found = {}
+    for recording in open_source(config).recordings():
+        channels = {}
+        for channel, samples in recording.channels.items():
+            mean_square = np.mean(np.square(samples[np.isfinite(samples)]))
+            channels[channel] = [digest_of({channel: samples}, DIGITS)[:8], float(f"{np.sqrt(mean_square):.12g}")]
+        found[recording.id] = {"rate_hz": recording.rate_hz, "start_time": recording.start_time, "channels": channels}
+    return found
+
+
+def main() -> None:
+    """Record the readings on this machine."""
+    root = os.environ.get("VEHEST_DATA")
+    if not root:
+        sys.exit("readings: VEHEST_DATA is not set, nothing recorded")
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(read(name, root), separators=(',', ':'))}" for name in READINGS)
+    FILE.write_text(f'{{"machine": {json.dumps(this_machine())},\n"readings": {{\n{lines}\n}}}}\n', encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,35 @@
+"""Real recordings are read as recorded: every sample to 12 digits, on another machine each channel's root mean square to 1e-9."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from golden_numbers import FIXED, this_machine
+from golden_readings import FILE, READINGS, read
+
+RECORDED = json.loads(FILE.read_text(encoding="utf-8"))
+
+
+def test_every_reading_is_recorded() -> None:
+    assert set(RECORDED["readings"]) == set(READINGS), "run `make golden`"
+
+
+@pytest.mark.parametrize("name", READINGS)
+def test_real_recordings_are_read_as_recorded(data_root: Path, name: str) -> None:
+    recorded, now = RECORDED["readings"][name], read(name, str(data_root))
+    assert list(now) == list(recorded)
+    for recording, expected in recorded.items():
+        if RECORDED["machine"] == this_machine():
+            same = now[recording] == expected
+        else:
+            same = _numbers(now[recording]) == pytest.approx(_numbers(expected), rel=FIXED, abs=FIXED)
+        assert same, f"{recording} moved: raise the version of its source if that is meant, then run `make golden`"
+
+
+def _numbers(found: dict[str, Any]) -> dict[str, float]:
+    """All but the digests."""
+    sizes = {channel: size for channel, (_, size) in found["channels"].items()}
+    return {"rate_hz": found["rate_hz"], "start_time": found["start_time"]} | sizes

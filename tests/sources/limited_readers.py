@@ -1,0 +1,47 @@
+"""Functions that a limited process calls as readers: one that answers, and one for each way of ending otherwise."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vehest.data.errors import MissingError
+from vehest.data.limits import current_limits
+from vehest.sources.limited import Arrays
+
+Answer = tuple[Arrays, dict[str, Any]]
+
+
+def answers(file: Path, factor: float) -> Answer:
+    """Numbers of the file, times a factor."""
+    print("what a library prints is no answer")
+    return {"vx": factor * np.fromfile(file), "n": np.arange(3)}, {"limit": current_limits().samples}
+
+
+def hangs(file: Path) -> Answer:
+    while True:
+        pass
+
+
+def takes_memory(file: Path) -> Answer:
+    return {"vx": np.ones(250_000_000)}, {}
+
+
+def crashes(file: Path) -> Answer:
+    os.abort()
+
+
+def writes(file: Path) -> Answer:
+    file.with_name("written").write_text("x")
+    return {}, {}
+
+
+def misses(file: Path) -> Answer:
+    raise MissingError(f"'{file}' needs another one")
+
+
+def fails(file: Path) -> Answer:
+    raise KeyError("vx\x1b[2J\nsecond line")

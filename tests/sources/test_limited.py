@@ -1,0 +1,57 @@
+"""Reading in a process of its own: what comes back, and one line naming the file however it ends."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.limits import Limits, use_limits
+from vehest.sources.limited import read_limited
+
+VALUES = np.array([0.1, np.nan, -np.inf, 1e-310])
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    VALUES.tofile(tmp_path / "lap.bin")
+    return tmp_path / "lap.bin"
+
+
+def test_arrays_and_summary_come_back_and_limits_go_along(file: Path) -> None:
+    with use_limits(Limits(samples=77)):
+        reading = read_limited("limited_readers:answers", file, factor=2.0)
+    np.testing.assert_array_equal(reading.arrays["vx"], 2.0 * VALUES)
+    np.testing.assert_array_equal(reading.arrays["n"], [0, 1, 2])
+    assert reading.summary == {"limit": 77}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits neither memory nor processor time")
+@pytest.mark.parametrize(
+    ("function", "kind", "said"),
+    [
+        ("hangs", DataError, "takes more than 2 s to read, too long for its size"),
+        ("takes_memory", DataError, "MB of memory; if that is meant, raise it: limits.memory=NUMBER"),
+        ("crashes", DataError, "is damaged: reading it ends with status -6"),
+        ("writes", DataError, "is damaged"),
+        ("misses", MissingError, "needs another one"),
+        ("fails", DataError, "make it again"),
+    ],
+)
+def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
+    file: Path, monkeypatch: pytest.MonkeyPatch, function: str, kind: type[VehestError], said: str
+) -> None:
+    monkeypatch.setattr("vehest.sources.limited.SECONDS", 2.0)
+    with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
+        read_limited(f"limited_readers:{function}", file)
+    assert type(error.value) is kind
+    message = str(error.value)
+    assert message.startswith(f"'{file}'")
+    assert said in message
+    assert message.isprintable()
+    assert file.read_bytes() == VALUES.tobytes()
+    assert [path.name for path in file.parent.iterdir() if path.stat().st_size and path != file] == []
