@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from golden_numbers import digest_of, this_machine
+
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 

@@ -88,12 +88,7 @@ def objects_of_a_blf(case: Case) -> Command:
 
 LINES = (
     ("BO_ 288 IMU: 8", "BO_ 288 IMU: 4000000000"), ("BO_ 288 IMU: 8", "BO_ 288 IMU: 0"), ("BO_ 288", "BO_ 99999999999"),
-    ("7|16@0-", "7|4000@0-"), ("7|16@0-", "99999|16@0-"), ("7|16@0-", "7|0@0-"), ("7|16@0-", "7|16@7-"), ("(0.005,0)", "(1e999,0)"),
-    ("(0.005,0)", "(0,0)"), ("(0.005,0)", "(nan,0)"), ("(0.005,0)", "(__import__('os'),0)"), ("[-163|163]", "[" + "9" * 90 + "|1]"),
     ("SG_ YawRate :", "SG_ YawRate m0 :"), ("SG_ YawRate :", "SG_ YawRate M :"), ("SG_ YawRate :", "SG_ " + "Y" * 500 + " :"),
-    ("CM_", 'CM_ "' + "\\" * 5000), ("VERSION", "SIG_VALTYPE_ 288 YawRate : 1;\nVERSION"),
-    ("VERSION", "SG_MUL_VAL_ 288 YawRate Counter 0-9;"),
-    ("deg/s", "rad/s"), ("BO_ ", "BO_\t"), ("SG_ AccLat", "SG_ YawRate"), ("\n", "\r\n"), ("VERSION", "\x00" * 3000), ("8 Gateway", "8"),
 )  # fmt: skip
 
 

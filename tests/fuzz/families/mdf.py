@@ -69,7 +69,6 @@ def mdf(folder: Path) -> None:
         ("v4dz", "4.10", {"compression": 2}),
         ("v42", "4.20", {"compression": 1}),
         ("v3", "3.30", {}),
-        ("v2", "2.14", {}),
     ):
         _write(folder / "files" / name, _signals(), version, **options)
     linear, pairs = {"a": 0.5, "b": 1.0}, {"raw_0": 0, "phys_0": 5.0, "raw_1": 50, "phys_1": 90.0, "interpolation": True}
@@ -92,7 +91,7 @@ def _reads(case: Case) -> Command:
     return Command(("data", str(case.idea("check", "show")), "measured") if case.rng.random() < 0.6 else ("ingest", "measured"))
 
 
-KINDS = ("v4", "v4dz", "v42", "v3", "v2", "v4_linear", "v4_table", "v4_rational", "v3_linear", "v3_table", "v3_rational")
+KINDS = ("v4", "v4dz", "v42", "v3", "v4_linear", "v4_table", "v4_rational", "v3_table")
 
 
 @generator("mdf", weight=6)
@@ -110,18 +109,10 @@ PAYLOADS = (
     f"open('{CANARY}','w')",
     "().__class__.__base__.__subclasses__()",
     "9**9**9**9",
-    "exec('1')",
-    "eval('1')",
     "X1+__import__('sly').x",
     "[x for x in range(10**9)]",
-    "lambda: 1",
-    "X1.__class__",
-    "sin(X1)+cos(X2)/0",
     "factorial(10**6)",
     "(" * 30 + "X1" + ")" * 30,
-    "print(1)",
-    "1e400*X1",
-    "X1 if X1 else 1",
     "'a'*10**9",
     "X1;import os",
     "\x1b[2J",
@@ -156,36 +147,20 @@ def _blocks(content: bytes) -> list[tuple[int, bytes, int, int]]:
 
 
 @generator("mdf", weight=6)
-def links(case: Case) -> Command:
-    """A link leads back, to another kind of block, into the middle of nowhere, or behind the end."""
-    file = _place(case, case.rng.choice(["v4", "v4dz", "v4_table", "v4_rational", "v4_formula"] if not case.honest else ["v4"]))
-    if not case.honest:
-        content = bytearray(file.read_bytes())
-        blocks = [block for block in _blocks(content) if block[3]]
-        for _ in range(case.rng.choice([1, 1, 2])):
-            at, _kind, _length, count = case.rng.choice(blocks)
-            target = case.rng.choice(
-                [at, case.rng.choice(blocks)[0], case.rng.choice(blocks)[0], 0, 64, len(content), 2**62, case.rng.randrange(len(content))]
-            )
-            struct.pack_into("<Q", content, at + 24 + 8 * case.rng.randrange(count), target)
-        file.write_bytes(content)
-    return _reads(case)
-
-
-@generator("mdf", weight=3)
 def fields_of_blocks(case: Case) -> Command:
-    """A number in a block becomes another: lengths, counts, types, flags, offsets of bits."""
+    """A number in a block becomes another: links, lengths, counts, types, flags, offsets of bits."""
     file = _place(case, case.rng.choice(KINDS))
     if not case.honest:
         content = bytearray(file.read_bytes())
-        if content[:3] == b"MDF" and _blocks(content):
-            wanted = [b"##CN", b"##CG", b"##DG", b"##DZ", b"##DT", b"##CC", b"##HD", b"##DL", b"##HL", b"##SI", b"##TX"]
-            blocks = [block for block in _blocks(content) if block[1] in wanted]
+        blocks, value = _blocks(content), case.rng.choice([0, 1, 255, 2**15, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1, len(content)])
+        if blocks:
             at, _kind, length, count = case.rng.choice(blocks)
-            body = case.rng.choice([at + 8, at + 16, at + 24 + 8 * count + case.rng.randrange(max(1, min(64, length - 24 - 8 * count)))])
+            body = case.rng.choice(
+                [at + 8, at + 16, at + 24 + 8 * case.rng.randrange(count + 1), at + case.rng.randrange(24, max(25, length))]
+            )
+            value = case.rng.choice([value, case.rng.choice(blocks)[0], at])
         else:
             body = case.rng.randrange(64, min(2000, len(content)))
-        value = case.rng.choice([0, 1, 255, 2**15, 2**31, 2**32 - 1, 2**40, 2**63, 2**64 - 1])
         width = case.rng.choice([1, 2, 4, 8])
         content[body : body + width] = (value % 2 ** (8 * width)).to_bytes(width, "little")
         file.write_bytes(content)
@@ -194,7 +169,7 @@ def fields_of_blocks(case: Case) -> Command:
 
 @generator("mdf", weight=2)
 def packed_blocks(case: Case) -> Command:
-    """A packed block unpacks to much more, or to less, than it says."""
+    """A packed block unpacks to much more than the file holds."""
     file = _place(case, "v4dz")
     if not case.honest:
         content = bytearray(file.read_bytes())
@@ -202,20 +177,15 @@ def packed_blocks(case: Case) -> Command:
         packer = zlib.compressobj(9)
         size = case.rng.choice([10, 100, 500]) * 2**20
         packed = b"".join(packer.compress(bytes(2**20)) for _ in range(size // 2**20)) + packer.flush()
-        if case.rng.random() < 0.3:
-            packed = spoil_bytes(packed, case.rng)
-        said = case.rng.choice([size, size, 2**40, 100, 0])
-        head = struct.pack("<4sIQQ", b"##DZ", 0, 48 + len(packed), 0) + struct.pack("<2sBBIQQ", b"DT", 0, 0, 0, said, len(packed))
+        head = struct.pack("<4sIQQ", b"##DZ", 0, 48 + len(packed), 0) + struct.pack("<2sBBIQQ", b"DT", 0, 0, 0, size, len(packed))
         moved = len(content) + (-len(content) % 8)
         content += bytes(moved - len(content)) + head + packed
-        for place, _kind, _length, count in _blocks(bytes(content[:moved])):
+        for place, kind, _length, count in _blocks(bytes(content[:moved])):
             for link in range(count):
                 if struct.unpack_from("<Q", content, place + 24 + 8 * link)[0] == at:
                     struct.pack_into("<Q", content, place + 24 + 8 * link, moved)
-        if case.rng.random() < 0.6:  # and as many records as would fit
-            for place, kind, _length, count in _blocks(bytes(content[:moved])):
-                if kind == b"##CG":
-                    struct.pack_into("<Q", content, place + 24 + 8 * count + 8, size // 32)
+            if kind == b"##CG":  # as many records as would fit
+                struct.pack_into("<Q", content, place + 24 + 8 * count + 8, size // 32)
         file.write_bytes(content)
     return _reads(case)
 
@@ -228,32 +198,18 @@ def contents_of_mdf(case: Case) -> Command:
     file = _place(case, "v4")
     if case.honest:
         return _reads(case)
-    n, rng = len(TIME), case.rng
-    stamps = [
-        np.where(np.arange(n) == 99, 1e9, TIME),
-        TIME[::-1],
-        np.zeros(n),
-        np.full(n, np.nan),
-        TIME * 1e12,
-        TIME * 1e-12,
-        TIME + 1e17,
-        np.append(TIME[:-1], 1e300),
-    ]
+    n = len(TIME)
+    stamps = [np.where(np.arange(n) == 99, 1e9, TIME), TIME[::-1], np.zeros(n), np.full(n, np.nan), TIME * 1e12, TIME + 1e17]
+    name = case.rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "") or "x"
+    rest = _signals()[1:]
     ideas: list[Any] = [
         *(lambda t=t: [asammdf.Signal(np.ones(n), t, name=name) for name in "vra"] for t in stamps),
-        lambda: [asammdf.Signal(np.array([b"text"] * n), TIME, name="v", encoding="utf-8"), *_signals()[1:]],
-        lambda: [asammdf.Signal(np.zeros(n, dtype=[("v", "(3,)<f8")]), TIME, name="v"), *_signals()[1:]],
-        lambda: [asammdf.Signal(np.full(n, np.nan), TIME, name="v"), *_signals()[1:]],
-        lambda: [asammdf.Signal(np.full(n, 2**63, "u8"), TIME, name="v"), *_signals()[1:]],
-        lambda: [
-            asammdf.Signal(np.ones(n), TIME, name="v", unit=rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "")),
-            *_signals()[1:],
-        ],
-        lambda: [asammdf.Signal(np.ones(n), TIME, name=rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "") or "x"), *_signals()[1:]],
+        lambda: [asammdf.Signal(np.array([b"text"] * n), TIME, name="v", encoding="utf-8"), *rest],
+        lambda: [asammdf.Signal(np.zeros(n, dtype=[("v", "(3,)<f8")]), TIME, name="v"), *rest],
+        lambda: [asammdf.Signal(np.full(n, np.nan), TIME, name="v"), *rest],
+        lambda: [asammdf.Signal(np.ones(n), TIME, name="v", unit=name), asammdf.Signal(np.ones(n), TIME, name=name), *rest],
         lambda: _signals({"a": 1e308, "b": 1e308}),
-        lambda: _signals({"P1": 0.0, "P2": 1.0, "P3": 0.0, "P4": 0.0, "P5": 0.0, "P6": 0.0}),
         lambda: _signals({"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"\x1b[31m", "default": b"?"}),
-        lambda: [*_signals(), *(asammdf.Signal(np.ones(n), TIME, name=f"s{k}") for k in range(400))],
         lambda: _signals() + _signals(),
     ]
     _write(file, ideas[case.visit % len(ideas)]())

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from fuzz.case import Case, Command, generator
-from fuzz.honest import lap, table
+from fuzz.honest import lap
 from fuzz.mutations import NAMES, spoil_bytes
 
 CELLS = (
@@ -18,7 +16,6 @@ CELLS = (
     "None", "true", '"', '""', "'", "\x00", "\x1b[31m", "=1+1", "99999999999999999999999", "1" * 5000, " ", "\t1", "1 2", "N/A", "#REF!",
     "😀", "\ufeff1",
 )  # fmt: skip
-ENCODINGS = ("utf-16", "utf-32", "latin-1", "utf-7", "cp037", "utf-16-be", "utf-8-sig", "shift_jis")
 
 
 def _text(frame: pd.DataFrame, **options: object) -> str:
@@ -62,29 +59,16 @@ def structure(case: Case) -> Command:
     at, rng = case.rng.randrange(len(rows)), case.rng
     spoilt = [
         lambda: head,
-        lambda: head + "\n",
         lambda: "",
-        lambda: "\n\n\n",
-        lambda: "\n".join(rows),
         lambda: text.replace(",", ";"),
         lambda: text.replace(".", ","),
-        lambda: text.replace("\n", "\r"),
-        lambda: text.replace("\n", "\n\n"),
-        lambda: text + text,
         lambda: "\n".join([head, *rows[:at], rows[at] + ",7", *rows[at:]]),
         lambda: "\n".join([head, *rows[:at], rows[at][:7], *rows[at:]]),
-        lambda: text.rstrip("\n") + ",",
         lambda: f"{head},vx\n" + "\n".join(f"{row},1" for row in rows),
-        lambda: f"{head},\n" + "\n".join(f"{row}," for row in rows),
         lambda: head.replace("vx", rng.choice(NAMES)) + "\n" + "\n".join(rows),
-        lambda: head.replace("time", "Time") + "\n" + "\n".join(rows),
         lambda: head.replace("vx", '"vx') + "\n" + "\n".join(rows),
-        lambda: "# remark\n" + text,
         lambda: ",".join(f"c{k}" for k in range(20_000)) + "\n" + ",".join("1" for _ in range(20_000)) + "\n",
         lambda: "time,vx\n" + "0," + "1" * 3_000_000 + "\n",
-        lambda: "time,vx\n" + "\n".join(f"{k / 100}," for k in range(500)),
-        lambda: "time\n" + "\n".join(str(k / 100) for k in range(500)),
-        lambda: "time,vx\n0,1\n",
         lambda: "time,vx\n0,1\n0.1,1\n",
         lambda: "\x1b[2J,vx,\x07\n0,1,2\n",
         lambda: "\x00" * 5000,
@@ -103,17 +87,11 @@ def clocks(time: np.ndarray, case: Case) -> np.ndarray:
         lambda: np.where(np.arange(n) == at, np.inf, time),
         lambda: np.zeros(n),
         lambda: time[::-1].copy(),
-        lambda: np.where(np.arange(n) == at, time[at - 1], time),
         lambda: time + case.numbers.normal(0, 0.01, n),
         lambda: np.sort(time + case.numbers.uniform(0, 0.02, n)),
-        lambda: time * 1e-12,
         lambda: time * 1e12,
         lambda: time + 1e17,
-        lambda: time - 1e9,
         lambda: np.where(np.arange(n) > at, time + rng.choice([1.0, 3600.0, 1e7]), time),
-        lambda: np.where(np.arange(n) > at, time + 1e-9, time),
-        lambda: np.full(n, np.nan),
-        lambda: np.concatenate([[0.0, 1e-9], time[2:]]),
         lambda: np.geomspace(1e-12, 1e12, n),
     ]
     return np.asarray(spoilt[case.visit % len(spoilt)](), dtype=float)
@@ -144,73 +122,3 @@ def magnitudes(case: Case) -> Command:
     frame.to_csv(case.place / "lap.csv", index=False)
     accept = [] if case.honest else ["dataset.accept=[impossible,stuck,saturated,nan,gaps]"] * case.rng.randrange(2)
     return _commands(case, "lap.csv", *accept)
-
-
-@generator()
-def encodings(case: Case) -> Command:
-    text = _text(lap(case.visit, 20.0))
-    written = "utf-8" if case.honest else case.rng.choice(ENCODINGS)
-    told = [] if case.honest else case.rng.choice([[], [f"dataset.encoding={case.rng.choice(ENCODINGS)}"], ["dataset.encoding=idna"]])
-    case.write("lap.csv", text.encode(written))
-    return _commands(case, "lap.csv", *told)
-
-
-@generator()
-def lengths(case: Case) -> Command:
-    n = 1000 if case.honest else int(str(case.idea(2, 3, 29, 200_000, 600_000)))
-    frame = pd.DataFrame({"time": np.arange(n) / 100, "vx": 20.0 + np.sin(np.arange(n) / 70), "yaw_rate": 0.1, "ay": 2.0, "ax": 0.1})
-    frame["yaw_rate"] += 0.01 * np.sin(np.arange(n) / 50)
-    frame["ay"] += 0.2 * np.sin(np.arange(n) / 50)
-    frame["ax"] += 0.2 * np.cos(np.arange(n) / 50)
-    frame.round(5).to_csv(case.place / "lap.csv", index=False)
-    command = _commands(case, "lap.csv")
-    needs_reference = "align" in command.argv  # which these tables do not have
-    return Command(("data", "check", "lap.csv")) if case.honest and needs_reference else command
-
-
-def declared(frame: pd.DataFrame, spoil: Sequence[str]) -> str:
-    """A table as text, with spoilt options of how it is written."""
-    stream = io.StringIO()
-    frame.to_csv(stream, index=False, sep=";" if "sep" in spoil else ",", decimal="," if "decimal" in spoil else ".")
-    return stream.getvalue()
-
-
-@generator("drives", weight=2)
-def tables_of_a_data_set(case: Case) -> Command:
-    case.copy("drives")
-    file = case.place / "raw" / f"{case.rng.choice(['one', 'two', 'three'])}.csv"
-    if not case.honest:
-        how = case.rng.randrange(4)
-        if how == 0:
-            file.write_bytes(spoil_bytes(file.read_bytes(), case.rng))
-        elif how == 1:
-            frame = table(1)
-            frame["Time"] = clocks(frame["Time"].to_numpy(), case)
-            frame.to_csv(file, index=False)
-        elif how == 2:
-            file.rename(
-                file.with_name(f"{case.rng.choice(['a b', 'ä', '-x', 'a=b', 'x' * 200, 'a,b', '[b]', '${root}', '.x', 'a~b'])}.csv")
-            )
-        else:
-            file.write_text(declared(table(2), case.rng.choice([("sep",), ("decimal",), ("sep", "decimal")])))
-    if case.rng.random() < 0.5:
-        return Command(("ingest", "mine", "--quiet"))
-    return Command(("downsample", "mine", f"rate_hz={case.rng.choice([20, 10, 7.3])}"))
-
-
-@generator("drives")
-def runs_of_a_table(case: Case) -> Command:
-    case.copy("drives")
-    frame = table(1)
-    n = len(frame)
-    runs = np.repeat([1, 2, 3], n // 3).astype(float)
-    frame = frame.iloc[: len(runs)].assign(Run=runs)
-    frame["Time"] = np.concatenate([np.arange(n // 3) / 50.0] * 3)
-    if not case.honest:
-        values: list[object] = frame["Run"].tolist()
-        values[case.rng.randrange(len(values))] = case.idea("nan", "1e400", 1.5, "a", -1, 1e18, 10**30, "")
-        frame["Run"] = values
-    frame.to_csv(case.place / "raw" / "one.csv", index=False)
-    for name in ("two", "three"):
-        (case.place / "raw" / f"{name}.csv").unlink()
-    return Command(("ingest", "mine", "+dataset.runs=Run"))
