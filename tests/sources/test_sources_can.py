@@ -17,7 +17,6 @@ from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
-cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
 
 from can_drive import DBC, SIGNALS, Written, write_log  # noqa: E402
 
@@ -64,30 +63,6 @@ def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path: Path,
     for name, step in STEPS.items():  # frames of the second message come 0.4 ms late: the slope times that
         slack = 0.0005 * np.abs(np.gradient(sent[name], 0.01)).max()
         np.testing.assert_allclose(got[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
-
-
-def test_multiplexed_signals_come_from_the_frames_that_carry_them(tmp_path: Path) -> None:
-    dbc = one("Wheels", 'SG_ Page M : 0|8@1+ (1,0) [0|0] "" Car') + "".join(
-        f' SG_ {name} {mark} : {start}|16@1+ (0.01,0) [0|0] "m/s" Car\n'
-        for name, mark, start in (("Left", "m0", 8), ("Right", "m1", 8), ("Always", "", 32))
-    )
-    database = cantools.database.load_string(dbc, "dbc")
-    frames = []
-    for k in range(400):
-        page = k % 3  # the third page holds neither
-        values = {"Page": page % 2, "Always": 10 + 0.01 * k} | ({"Left": 5 + 0.01 * k} if page % 2 == 0 else {"Right": 7 + 0.01 * k})
-        data = bytearray(database.encode_message("Wheels", values))
-        data[0] = page
-        frames.append((k / 300, 291, bytes(data)))
-    channels = {
-        "vx": {"column": "Left", "unit": "m/s"},
-        "vx_ref": {"column": "Wheels.Right", "unit": "m/s"},
-        "vy_ref": {"column": "Always", "unit": "m/s"},
-    }
-    got = read(log(tmp_path, frames, dbc=dbc), channels=channels, rate_hz=100, accept=["aliasing"])
-    np.testing.assert_allclose(got["vx"], 5 + 3 * got.time, atol=0.006)
-    np.testing.assert_allclose(got["vx_ref"], 7 + 3 * got.time, atol=0.006)
-    np.testing.assert_allclose(got["vy_ref"], 10 + 3 * got.time, atol=0.006)
 
 
 def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path: Path) -> None:

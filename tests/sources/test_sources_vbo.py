@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.vbo import read_log
-
-REAL = Path(os.environ.get("VEHEST_DATA", "")) / "vbox" / "standstill.VBO"
 
 
 def read(folder: Path, **more: object) -> Recording:
@@ -100,20 +97,3 @@ def test_what_makes_no_sense_is_refused(tmp_path: Path) -> None:
             read(tmp_path, **more)
     with pytest.raises(MissingError, match="has no recording 'other'"):
         open_source(dataset(tmp_path)).read("other")
-
-
-@pytest.mark.skipif(not REAL.is_file(), reason="needs VEHEST_DATA with vbox/standstill.VBO")
-def test_the_log_of_a_real_logger_is_read() -> None:
-    log = read_log(REAL)
-    assert len(log.columns) == 75
-    assert log.offsets["CoG"] == (0.84, 0.30)
-    assert {name: log.units[name] for name in ("SWA", "VehSpdLgt", "YawRate", "Lat._Vel.", "Head_imu2")} == {
-        "SWA": "rad",
-        "VehSpdLgt": "m/s",
-        "YawRate": "°/s",
-        "Lat._Vel.": "km/h",
-        "Head_imu2": "°",
-    }
-    assert log.n_dropped == 1
-    assert np.allclose(np.diff(log.seconds), 0.01, atol=1e-6)
-    assert np.abs(log.columns["velocity"]).max() < 1.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -163,29 +162,6 @@ def fields_of_blocks(case: Case) -> Command:
             body = case.rng.randrange(64, min(2000, len(content)))
         width = case.rng.choice([1, 2, 4, 8])
         content[body : body + width] = (value % 2 ** (8 * width)).to_bytes(width, "little")
-        file.write_bytes(content)
-    return _reads(case)
-
-
-@generator("mdf", weight=2)
-def packed_blocks(case: Case) -> Command:
-    """A packed block unpacks to much more than the file holds."""
-    file = _place(case, "v4dz")
-    if not case.honest:
-        content = bytearray(file.read_bytes())
-        (at, *_rest), *_more = [block for block in _blocks(content) if block[1] == b"##DZ"]
-        packer = zlib.compressobj(9)
-        size = case.rng.choice([10, 100, 500]) * 2**20
-        packed = b"".join(packer.compress(bytes(2**20)) for _ in range(size // 2**20)) + packer.flush()
-        head = struct.pack("<4sIQQ", b"##DZ", 0, 48 + len(packed), 0) + struct.pack("<2sBBIQQ", b"DT", 0, 0, 0, size, len(packed))
-        moved = len(content) + (-len(content) % 8)
-        content += bytes(moved - len(content)) + head + packed
-        for place, kind, _length, count in _blocks(bytes(content[:moved])):
-            for link in range(count):
-                if struct.unpack_from("<Q", content, place + 24 + 8 * link)[0] == at:
-                    struct.pack_into("<Q", content, place + 24 + 8 * link, moved)
-            if kind == b"##CG":  # as many records as would fit
-                struct.pack_into("<Q", content, place + 24 + 8 * count + 8, size // 32)
         file.write_bytes(content)
     return _reads(case)
 

@@ -51,14 +51,15 @@ def _csv(case: Case) -> Path:
     return case.place / "raw" / "revs" / f"{NAME}.csv"
 
 
-@generator("revs", weight=2)
-def bytes_of_csv(case: Case) -> Command:
-    file = _csv(case)
+@generator("revs", weight=6)
+def bytes_of_files(case: Case) -> Command:
+    """Bytes of the official CSV, of the MAT file, plain or packed, and of the vehicle's parameters."""
+    file, layout = case.rng.choice([(_csv(case), "csv"), (_mat(case), "mat"), (_csv(case).with_name("250lm.csv"), "csv")])
     if not case.honest:
         content = file.read_bytes()
-        at = len(content) if case.rng.random() < 0.5 else 2000
+        at = case.rng.choice([len(content), 300, 2000])
         file.write_bytes(spoil_bytes(content[:at], case.rng) + content[at:])
-    return _ingest(case)
+    return _ingest(case, f"dataset.layout={layout}")
 
 
 @generator("revs", weight=2)
@@ -91,23 +92,13 @@ def _ingest_mat(case: Case, *overrides: str) -> Command:
     return _ingest(case, "dataset.layout=mat", *overrides)
 
 
-@generator("revs", weight=4)
-def bytes_of_mat(case: Case) -> Command:
-    file = _mat(case)
-    if not case.honest:
-        content = file.read_bytes()
-        at = case.rng.choice([len(content), 300, 1000])
-        file.write_bytes(spoil_bytes(content[:at], case.rng) + content[at:])
-    return _ingest_mat(case)
-
-
 def _element(kind: int, body: bytes) -> bytes:
     return struct.pack("<II", kind, len(body)) + body + bytes(-len(body) % 8)
 
 
 @generator("revs", weight=2)
 def made_up_mat(case: Case) -> Command:
-    """Files written by hand: bombs, nesting, dimensions that multiply to more than there is."""
+    """Files written by hand: bombs, dimensions that multiply to more than there is, thousands of elements."""
     file = _mat(case)
     if case.honest:
         return _ingest_mat(case)
@@ -117,32 +108,20 @@ def made_up_mat(case: Case) -> Command:
     def matrix(rows: int, columns: int, data: bytes, name: bytes = b"x") -> bytes:
         return _element(14, flags + _element(5, struct.pack("<ii", rows, columns)) + _element(1, name) + _element(9, data))
 
-    def nested(depth: int) -> bytes:
-        body = matrix(1, 1, bytes(8), b"")
-        for _ in range(depth):
-            body = _element(14, _element(6, struct.pack("<II", 1, 0)) + _element(5, struct.pack("<ii", 1, 1)) + _element(1, b"") + body)
-        return body
-
-    def packed(body: bytes) -> bytes:
-        short = zlib.compress(body, 9)
-        return struct.pack("<II", 15, len(short)) + short
-
     def bomb(megabytes: int) -> bytes:
         packer = zlib.compressobj(9)
         size = megabytes * 2**20
+        head = struct.pack("<II", 14, size + 56) + flags + _element(5, struct.pack("<ii", size // 8, 1)) + _element(1, b"x")
         parts = [
-            packer.compress(struct.pack("<II", 14, size + 56) + flags + _element(5, struct.pack("<ii", size // 8, 1)) + _element(1, b"x"))
+            packer.compress(head + struct.pack("<II", 9, size)),
+            *(packer.compress(bytes(2**20)) for _ in range(megabytes)),
+            packer.flush(),
         ]
-        parts += (
-            [packer.compress(struct.pack("<II", 9, size))] + [packer.compress(bytes(2**20)) for _ in range(megabytes)] + [packer.flush()]
-        )
         short = b"".join(parts)
         return struct.pack("<II", 15, len(short)) + short
 
     ideas = [
         lambda: bomb(int(case.rng.choice([100, 600, 1500]))),
-        lambda: nested(20_000),
-        lambda: packed(nested(20_000)),
         lambda: matrix(2**31 - 1, 2**31 - 1, bytes(8)),
         lambda: matrix(1, 1, bytes(8), b"\x1b[2J"),
         lambda: struct.pack("<II", 14, 2**32 - 1) + bytes(100),
@@ -161,15 +140,12 @@ def contents_of_mat(case: Case) -> Command:
         return _ingest_mat(case)
     drive, _ = smooth_drive(SECONDS)
     rng, names = case.rng, list(drive.signals)
-    structs = {
-        name: {
-            "value": drive.signals[name][:, None],
-            "time": (np.arange(len(drive.signals[name])) * SECONDS / len(drive.signals[name]))[:, None],
-        }
-        for name in names
+    structs: dict[str, dict[str, object]] = {
+        one: {"value": values[:, None], "time": (np.arange(len(values)) * SECONDS / len(values))[:, None]}
+        for one, values in drive.signals.items()
     }
     name, part = rng.choice([one for one in names if "CG" in one or one == "handwheelAngle"]), rng.choice(["value", "time"])
-    n = len(structs[name]["time"])
+    n = len(drive.signals[name])
     values = [
         np.zeros((n, 2)), np.zeros((n, 1)) * 1j, np.array(["a"] * n), np.array([], float), np.full((n, 1), np.nan), np.full((n, 1), np.inf),
         np.zeros((n + 1, 1)), np.arange(n)[::-1, None] / 100, np.where(np.arange(n) == n // 2, 1e9, np.arange(n) / 100.0)[:, None], "text",
@@ -177,11 +153,7 @@ def contents_of_mat(case: Case) -> Command:
         1e300 * np.arange(n)[:, None],
     ]  # fmt: skip
     structs[name][part] = values[case.visit % len(values)]
-    savemat(
-        file,
-        {"insData": structs, "driverData": {one: structs.pop(one) for one in names if one == "handwheelAngle"}, "tireData": {}},
-        oned_as="column",
-    )
+    savemat(file, {"insData": structs}, oned_as="column")
     return _ingest_mat(case, *rng.choice([[], ["dataset.rate_hz=1000"], ["dataset.rate_hz=1e12"], ["dataset.clock=interpolate"]]))
 
 
@@ -194,15 +166,11 @@ def text_files(case: Case) -> Command:
         lines, rng = file.read_text().splitlines(), case.rng
         ideas = [
             lambda: file.write_bytes(spoil_bytes(file.read_bytes(), rng)),
-            lambda: file.write_text(
-                "\n".join([*lines, rng.choice(["nan", "inf", "1e400", "a", "1 2", "0x10", "\x1b[2J", "1_0", "9" * 5000])])
-            ),
+            lambda: file.write_text("\n".join([*lines, rng.choice(["nan", "1e400", "a", "1 2", "\x1b[2J", "9" * 5000])])),
             lambda: (file.unlink(), os.mkfifo(file)),
             lambda: (file.unlink(), file.symlink_to("/dev/zero")),
             lambda: file.write_text("\n".join([lines[0], str(float(lines[1]) + 1e9), *lines[2:]])),
             lambda: file.write_text("0\n" * 3_000_000),
         ]
         ideas[case.visit % len(ideas)]()
-    return Command(
-        ("data", "check", "text") if case.rng.random() < 0.5 else ("ingest", "text", *case.rng.choice([[], ["dataset.clock=interpolate"]]))
-    )
+    return Command(("data", "check", "text") if case.rng.random() < 0.5 else ("ingest", "text"))
