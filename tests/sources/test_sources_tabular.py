@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 import pytest
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
@@ -65,38 +64,6 @@ def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
 
 
 # --- what a data set derives -------------------------------------------------------------------------------------------------------
-
-
-def test_a_log_with_wheel_speeds_and_a_sideslip_angle_gets_the_channels_that_it_lacks(tmp_path: Path) -> None:
-    """A steady left turn: the angle was measured 2 m ahead of the centre of gravity, where v is larger by 2·r."""
-    speed, yaw_rate, vy, ahead = 20.0, 0.4, -0.5, 2.0
-    shown = np.degrees(np.arctan2(vy + ahead * yaw_rate, speed))
-    frame = pd.DataFrame({"time": np.arange(N) / 100.0, "RL": np.full(N, speed / 0.3), "RR": np.full(N, speed / 0.3)})
-    frame["yaw"], frame["slip"], frame["wheel"] = yaw_rate, shown, 32.0
-    frame.to_csv(tmp_path / "lap.csv", index=False)
-    columns = {
-        "wheel_speed_rl": {"column": "RL", "unit": "rad/s"},
-        "wheel_speed_rr": {"column": "RR", "unit": "rad/s"},
-        "yaw_rate": {"column": "yaw", "unit": "rad/s"},
-        "handwheel": {"column": "wheel", "unit": "deg"},
-        "sideslip_ref": {"column": "slip", "unit": "deg"},
-    }
-    transforms = [
-        {"name": "speed_from_wheels", "wheel_radius": 0.3},
-        {"name": "acceleration_from_speed"},
-        {"name": "steering_ratio", "ratio": 16},
-        {"name": "velocity_from_sideslip"},
-    ]
-    point = {"x": ahead, "y": 0.0}
-    recording = read(tmp_path / "lap.csv", channels=columns, transforms=transforms, reference_point=point, imu_point="unknown")
-    np.testing.assert_allclose(recording["vx"], speed)
-    np.testing.assert_allclose(recording["ax"], 0.0, atol=1e-12)
-    np.testing.assert_allclose(recording["steer"], np.deg2rad(2.0))
-    np.testing.assert_allclose(recording["vy_ref"], vy)
-    np.testing.assert_allclose(recording["sideslip_ref"], np.arctan2(vy, speed))
-    told = recording.provenance["derived"]
-    assert (told["reference_point"], told["imu_point"], told["moved_to_centre_of_gravity"]) == (point, "unknown", True)
-    assert [entry["name"] for entry in told["transforms"]] == [entry["name"] for entry in transforms]
 
 
 # --- what can be read --------------------------------------------------------------------------------------------------------------
@@ -181,16 +148,8 @@ BAD_TABLES = {
 }
 
 
-@pytest.fixture(params=[1, 4])
-def processors(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = pa.cpu_count()
-    pa.set_cpu_count(request.param)
-    yield request.param
-    pa.set_cpu_count(before)
-
-
 @pytest.mark.parametrize("fault", BAD_TABLES)
-def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path: Path, fault: str, processors: int) -> None:
+def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path: Path, fault: str) -> None:
     content, said = BAD_TABLES[fault]
     file = written(tmp_path, content)
     columns = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ay", "unit": "m/s²"}}

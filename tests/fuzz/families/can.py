@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import yaml
@@ -57,32 +55,6 @@ def bytes_of_a_log(case: Case) -> Command:
             log.write_bytes(content[: 4 * 2**20])
         else:
             log.write_bytes(content[:at] + spoil_bytes(content[at:], case.rng))
-    return _reads(case, log)
-
-
-@generator("can", weight=2)
-def objects_of_a_blf(case: Case) -> Command:
-    """Lengths, kinds, versions, ways of packing; contents that unpack to much more."""
-    case.copy("can/blf", "raw")
-    log = case.place / "raw" / "drive.blf"
-    if not case.honest:
-        content = bytearray(log.read_bytes())
-        value = case.rng.choice([0, 1, 15, 16, 31, 32, 2**16, 2**20 + 1, 2**31, 2**32 - 1])
-        idea = case.visit % 4
-        if idea == 0:
-            struct.pack_into("<L", content, case.rng.choice([4, 144 + 4, 144 + 8, 144 + 12, 144 + 16]), value)
-        else:
-            inner = zlib.decompress(bytes(content[144 + 32 :]))
-            if idea == 1:
-                inner = bytearray(inner)
-                struct.pack_into("<L", inner, case.rng.choice([4, 8, 12, 48 + 4, 48 + 8]), value)
-            elif idea == 2:
-                inner = bytes(case.rng.choice([10, 60, 300]) * 2**20)
-            else:
-                inner = struct.pack("<4sHHLL", b"LOBJ", 16, 9, value, 1) + bytes(case.rng.choice([0, 40, 400]))
-            packed = zlib.compress(bytes(inner))
-            content[144:] = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 32 + len(packed), 10) + struct.pack("<H6xL4x", 2, len(inner)) + packed
-        log.write_bytes(content)
     return _reads(case, log)
 
 

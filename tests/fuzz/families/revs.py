@@ -8,7 +8,6 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-from scipy.io import savemat
 
 from fuzz.case import Case, Command, generator, template
 from fuzz.honest import write_yaml
@@ -130,31 +129,6 @@ def made_up_mat(case: Case) -> Command:
     ]
     file.write_bytes(head + ideas[case.visit % len(ideas)]())
     return _ingest_mat(case)
-
-
-@generator("revs", weight=2)
-def contents_of_mat(case: Case) -> Command:
-    """Structs as SciPy writes them, with other shapes, types and clocks than the official ones."""
-    file = _mat(case)
-    if case.honest:
-        return _ingest_mat(case)
-    drive, _ = smooth_drive(SECONDS)
-    rng, names = case.rng, list(drive.signals)
-    structs: dict[str, dict[str, object]] = {
-        one: {"value": values[:, None], "time": (np.arange(len(values)) * SECONDS / len(values))[:, None]}
-        for one, values in drive.signals.items()
-    }
-    name, part = rng.choice([one for one in names if "CG" in one or one == "handwheelAngle"]), rng.choice(["value", "time"])
-    n = len(drive.signals[name])
-    values = [
-        np.zeros((n, 2)), np.zeros((n, 1)) * 1j, np.array(["a"] * n), np.array([], float), np.full((n, 1), np.nan), np.full((n, 1), np.inf),
-        np.zeros((n + 1, 1)), np.arange(n)[::-1, None] / 100, np.where(np.arange(n) == n // 2, 1e9, np.arange(n) / 100.0)[:, None], "text",
-        np.arange(n, dtype="u1")[:, None], {"deeper": {"value": 1.0}}, np.ones((n, 1), bool), np.arange(n)[:, None] * 1e-12,
-        1e300 * np.arange(n)[:, None],
-    ]  # fmt: skip
-    structs[name][part] = values[case.visit % len(values)]
-    savemat(file, {"insData": structs}, oned_as="column")
-    return _ingest_mat(case, *rng.choice([[], ["dataset.rate_hz=1000"], ["dataset.rate_hz=1e12"], ["dataset.clock=interpolate"]]))
 
 
 @generator("revs", weight=2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sqlite3
 import stat
-import struct
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -84,32 +83,6 @@ def statements(case: Case) -> Command:
         connection = sqlite3.connect(bag / "lap.db3")
         with suppress(sqlite3.IntegrityError):
             connection.executescript(STATEMENTS[case.visit % len(STATEMENTS)])
-        connection.commit()
-        connection.close()
-    return _reads(case)
-
-
-@generator("bags", weight=3)
-def messages(case: Case) -> Command:
-    """Serialised messages whose lengths, numbers or stamps lie."""
-    bag = _bag(case)
-    if not case.honest:
-        connection, rng = sqlite3.connect(bag / "lap.db3"), case.rng
-        topics = [row[0] for row in connection.execute("SELECT id FROM topics")]
-        topic = rng.choice(topics)
-        rows = connection.execute("SELECT id, data FROM messages WHERE topic_id = ?", (topic,)).fetchall()
-        for number, data in rows if rng.random() < 0.3 else [rng.choice(rows)]:
-            spoilt = bytearray(data)
-            how = rng.randrange(3)
-            if how == 0:  # the length of a sequence or text
-                at = rng.randrange(4, max(5, len(spoilt) - 4)) // 4 * 4
-                struct.pack_into("<I", spoilt, min(at, len(spoilt) - 4), rng.choice([0, 2**31 - 1, 2**32 - 1, 2**30, 1_000_000]))
-            elif how == 1:
-                spoilt = bytearray(spoil_bytes(bytes(spoilt), rng))
-            else:
-                at = max(4, len(spoilt) - 8)
-                spoilt[at:] = struct.pack("<d", rng.choice([float("nan"), float("inf"), 1e308, -1e300]))
-            connection.execute("UPDATE messages SET data = ? WHERE id = ?", (bytes(spoilt), number))
         connection.commit()
         connection.close()
     return _reads(case)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pandas as pd
 
 from fuzz.case import Case, Command, generator
 from fuzz.honest import lap
-from fuzz.mutations import NAMES, spoil_bytes
+from fuzz.mutations import spoil_bytes
 
 CELLS = (
     "", "nan", "NaN", "inf", "-inf", "1e400", "-1e400", "1e308", "1e-400", "0x10", "1_000", "1,5", "1;5", "१२", "1e", "--1", "+-1",
@@ -52,31 +50,6 @@ def cells(case: Case) -> Command:
     return _commands(case, "lap.csv")
 
 
-@generator(weight=2)
-def structure(case: Case) -> Command:
-    text = _text(lap(case.visit, 20.0))
-    head, *rows = text.splitlines()
-    at, rng = case.rng.randrange(len(rows)), case.rng
-    spoilt = [
-        lambda: head,
-        lambda: "",
-        lambda: text.replace(",", ";"),
-        lambda: text.replace(".", ","),
-        lambda: "\n".join([head, *rows[:at], rows[at] + ",7", *rows[at:]]),
-        lambda: "\n".join([head, *rows[:at], rows[at][:7], *rows[at:]]),
-        lambda: f"{head},vx\n" + "\n".join(f"{row},1" for row in rows),
-        lambda: head.replace("vx", rng.choice(NAMES)) + "\n" + "\n".join(rows),
-        lambda: head.replace("vx", '"vx') + "\n" + "\n".join(rows),
-        lambda: ",".join(f"c{k}" for k in range(20_000)) + "\n" + ",".join("1" for _ in range(20_000)) + "\n",
-        lambda: "time,vx\n" + "0," + "1" * 3_000_000 + "\n",
-        lambda: "time,vx\n0,1\n0.1,1\n",
-        lambda: "\x1b[2J,vx,\x07\n0,1,2\n",
-        lambda: "\x00" * 5000,
-    ]
-    case.write("lap.csv", text if case.honest else spoilt[case.visit % len(spoilt)]())
-    return _commands(case, "lap.csv")
-
-
 def clocks(time: np.ndarray, case: Case) -> np.ndarray:
     """A clock that no recording should have."""
     n, at, rng = len(time), case.rng.randrange(1, len(time) - 1), case.rng
@@ -105,20 +78,3 @@ def time_stamps(case: Case) -> Command:
     frame.to_csv(case.place / "lap.csv", index=False)
     clock = case.rng.choice(["strict", "interpolate", "interpolate"])
     return _commands(case, "lap.csv", f"dataset.clock={clock}")
-
-
-@generator(weight=2)
-def magnitudes(case: Case) -> Command:
-    frame = lap(case.visit, 20.0)
-    if not case.honest:
-        names = [name for name in frame if name != "time"]
-        for name in case.rng.sample(names, case.rng.choice([1, 2, len(names)])):
-            n, factor = len(frame), case.rng.choice([0.0, 1e-300, 1e-30, 1e9, 1e150, 1e300, math.inf, math.nan, -1.0])
-            part = slice(0, case.rng.choice([1, n // 2, n]))
-            values = frame[name].to_numpy(copy=True)
-            with np.errstate(all="ignore"):
-                values[part] = values[part] * factor
-            frame[name] = values
-    frame.to_csv(case.place / "lap.csv", index=False)
-    accept = [] if case.honest else ["dataset.accept=[impossible,stuck,saturated,nan,gaps]"] * case.rng.randrange(2)
-    return _commands(case, "lap.csv", *accept)
