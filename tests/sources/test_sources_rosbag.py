@@ -413,7 +413,7 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
     zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
     expected, data, metadata = read(folder), folder / "lap" / "lap.db3", folder / "lap" / "metadata.yaml"
     about = yaml.safe_load(metadata.read_text())
-    told = {"compression_format": "zstd", "compression_mode": "file", "relative_file_paths": ["lap.db3.zstd"]}
+    told: dict[str, Any] = {"compression_format": "zstd", "compression_mode": "file", "relative_file_paths": ["lap.db3.zstd"]}
     about["rosbag2_bagfile_information"] |= told
     metadata.write_text(yaml.safe_dump(about))
     content = data.read_bytes()

@@ -15,7 +15,6 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError, Vehe
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
-from vehest.sources.sample_and_hold import between_samples, with_repeats
 from vehest.sources.tabular import TabularSource
 
 TIME = {"column": "time", "unit": "s"}
@@ -251,11 +250,3 @@ def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path: Pat
         assert "limits.memory=NUMBER" in refusal(lambda: read(bomb))
     torn = written(tmp_path, bomb.read_bytes()[:-100], "torn.csv.gz")
     assert "cannot be read" in refusal(lambda: read(torn))
-
-
-def test_a_held_value_that_stays_is_no_ramp() -> None:
-    """10 Hz held at 100 Hz: at rest until 8 s, then rising; without a column that tells of updates, rest stays rest."""
-    times = np.concatenate([[0.5, 0.6, 0.7, 0.8, 0.9, 1.0], np.arange(8.0, 10.0, 0.1)])
-    samples = np.concatenate([[5.0, 4.0, 3.0, 2.0, 1.0, 0.0], np.arange(20) + 1.0])
-    grid = np.array([1.5, 4.5, 7.8, 8.0, 8.05])
-    np.testing.assert_allclose(between_samples(*with_repeats(samples, times), 0.0, grid), [0.0, 0.0, 0.0, 1.0, 1.5], atol=1e-9)
