@@ -154,9 +154,6 @@ def test_a_file_arrives_byte_for_byte_and_is_recorded_as_pooch_and_sha256sum_wou
     assert server.asked == [("/a.csv", None, None)]
 
 
-# --- breaks ------------------------------------------------------------------------------------------------------------------------
-
-
 def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(server: Server, tmp_path: Path) -> None:
     server.breaks = [CHUNK + 7] * (ATTEMPTS + 2)
     (outcome,) = fetch(download(server, tmp_path))
@@ -211,9 +208,6 @@ def test_two_processes_do_not_fetch_into_one_folder(server: Server, tmp_path: Pa
     os.close(descriptor)
     fetch(download(server, tmp_path))
     assert_only(tmp_path)
-
-
-# --- wrong bytes -------------------------------------------------------------------------------------------------------------------
 
 
 def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server: Server, tmp_path: Path) -> None:
@@ -282,8 +276,6 @@ def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server: Server, tmp_pa
     assert_only(tmp_path)
 
 
-# --- what a data set may say -------------------------------------------------------------------------------------------------------
-
 TABULAR = {"name": "mine", "source": "tabular", "path": "there", "rate_hz": 10, "time": None}
 ENTRY = {"url": "https://example.org/folder", "files": ["a.csv"]}
 
@@ -319,8 +311,6 @@ def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry: object, said
     assert str(error.value).startswith(("data set 'mine': download", "data set 'mine': dataset.download"))
     assert "\n" not in str(error.value)
 
-
-# --- from the command line ---------------------------------------------------------------------------------------------------------
 
 DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(
     f"{k / 100:.2f},{20 + np.sin(k / 90):.6f},{0.3 * np.sin(k / 70):.6f},{6 * np.sin(k / 70):.5f},{np.cos(k / 90) / 9:.5f}\n"

@@ -103,9 +103,6 @@ def tidy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     assert {file.name for file in here.iterdir()} <= {"conf", "outputs"}
 
 
-# --- one clock ---------------------------------------------------------------------------------------------------------------------
-
-
 def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive: Path) -> None:
     recording = read(drive, vehicle="kart", citation="me")
     assert (recording.rate_hz, recording.start_time, recording.vehicle) == (100.0, 0.52, "kart")  # ticks count from the measurement's start
@@ -145,9 +142,6 @@ def test_a_signal_faster_than_the_raster_is_not_folded_into_it(drive: Path) -> N
     message = refusal(drive, rate_hz=50)
     assert "signal 'VehSpd' of group 0 'Powertrain', for channel 'vx', comes at 100 Hz, faster than the raster of 50 Hz" in message
     assert read(drive, rate_hz=50, accept=["aliasing"]).rate_hz == 50.0
-
-
-# --- signals and groups ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_name_in_several_groups_needs_its_group(drive: Path) -> None:
@@ -205,9 +199,6 @@ def test_other_versions_of_the_format_are_read(tmp_path: Path, drive: Path, vers
         np.testing.assert_allclose(recording[name], samples, rtol=1e-9, atol=1e-9)
 
 
-# --- units -------------------------------------------------------------------------------------------------------------------------
-
-
 def test_a_unit_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
     file = one(tmp_path / "a.mf4", FAST, FAST, "km/h")
     message = refusal(file, channels=ONE)
@@ -231,9 +222,6 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
 )
 def test_spellings_are_known_where_they_mean_one_thing(text: str, plain: str | None) -> None:
     assert plain_unit(text) == plain
-
-
-# --- times and gaps ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -286,9 +274,6 @@ def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_pa
     measured = np.flatnonzero(~np.isnan(recording["vx_ref"]))
     np.testing.assert_array_equal(measured, 100 * np.arange(1, 15))
     np.testing.assert_array_equal(recording["vx_ref"][measured], slow)
-
-
-# --- files that cannot be read -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

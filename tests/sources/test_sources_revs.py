@@ -105,9 +105,6 @@ def test_a_misspelt_data_set_is_refused(folder: Path, changes: dict[str, object]
     assert said in str(error.value)
 
 
-# --- the real recording ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def ferrari(data_root: Path) -> Recording:
     config = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))

@@ -60,9 +60,6 @@ def mat(root: Path) -> Path:
     return root / "revs" / f"{NAME}.mat"
 
 
-# --- what is read ------------------------------------------------------------------------------------------------------------------
-
-
 def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay(root: Path, csv: Path) -> None:
     drive, truth = smooth_drive(SECONDS, start_time=12.5)
     write_csv(csv, drive, blank_rows=BLANK)
@@ -131,9 +128,6 @@ def test_provenance_tells_session_parameters_and_file(root: Path, csv: Path) -> 
     assert provenance["vehicle_parameters"]["handwheelAngle"] == {"value": [-90.0, 0.0, 90.0], "unit": "°"}
     (root / "revs" / "250lm.csv").unlink()
     assert "vehicle_parameters" not in read(root).provenance
-
-
-# --- what is refused ---------------------------------------------------------------------------------------------------------------
 
 
 def with_cell(line: int, column: str, text: str) -> Callable[[bytes], bytes]:

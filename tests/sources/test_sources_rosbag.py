@@ -58,9 +58,6 @@ CHANNELS = {
 }
 
 
-# --- writing bags ------------------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Topic:
     """Messages of one topic: when they were taken, stamped and received [s after START_NS], and their fields."""
@@ -218,9 +215,6 @@ def filter_gain(pulsation: float, window: int = WINDOW, rate_hz: float = 100.0) 
     return float((k * np.sin(pulsation * k / rate_hz)).sum() / (k**2).sum() * rate_hz / pulsation)
 
 
-# --- what comes back ---------------------------------------------------------------------------------------------------------------
-
-
 def inside(recording: Recording, name: str) -> NDArray[np.float64]:
     """Samples that no end of the filter touches."""
     return recording[name][WINDOW:-WINDOW]
@@ -292,9 +286,6 @@ def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
     np.testing.assert_allclose(averaged["ax"], -2.0 * averaged.time, rtol=0, atol=1e-8)  # a line stays the line: no delay
 
 
-# --- clocks ------------------------------------------------------------------------------------------------------------------------
-
-
 def polled(times: NDArray[np.float64], period: float) -> NDArray[np.float64]:
     """Stamps of software that looks at its sensor now and then."""
     return np.ceil(times / period) * period
@@ -311,9 +302,6 @@ def test_samples_taken_evenly_and_stamped_late_come_back(tmp_path: Path) -> None
     np.testing.assert_allclose(inside(even, "vy_ref"), gain * VY, rtol=0, atol=1e-4)
     assert np.std(inside(stamped, "vx_ref")) > 0.01
     assert even.provenance["topics"]["/body"]["jitter_ms"] == pytest.approx(2.77 / np.sqrt(12), abs=0.1)
-
-
-# --- malformed bags ----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
@@ -354,9 +342,6 @@ def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
     bags = write_bag(tmp_path, topics).parent
     assert "topic '/motor': a gap of 0.11 s after 0.99 s, the longest of 1; cut the range out" in refusal(bags)
     assert len(read(bags, topics=topic_options("motor", max_gap=0.12))) == 295
-
-
-# --- bags that nobody vouches for --------------------------------------------------------------------------------------------------
 
 
 def with_database(folder: Path, *statements: str) -> Path:
@@ -423,9 +408,6 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
     assert "raise unpacked_limit" in refusal(folder, unpacked_limit=1e-5)
 
 
-# --- declarations ------------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -456,9 +438,6 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
 )
 def test_a_misspelt_declaration_is_refused(folder: Path, changes: dict[str, Any], said: str) -> None:
     assert said in refusal(folder, ConfigurationError, **changes)
-
-
-# --- the real bag ------------------------------------------------------------------------------------------------------------------
 
 
 def real_configuration(root: Path) -> dict[str, Any]:

@@ -62,12 +62,6 @@ def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
         np.testing.assert_array_equal(samples, frame[name].to_numpy())
 
 
-# --- what a data set derives -------------------------------------------------------------------------------------------------------
-
-
-# --- what can be read --------------------------------------------------------------------------------------------------------------
-
-
 def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
     table().to_csv(tmp_path / "lap.csv", index=False)
     recording = read(tmp_path / "lap.csv", vehicle="kart", kind="real", citation="me")
@@ -120,9 +114,6 @@ def test_recordings_are_the_stems_in_order(tmp_path: Path) -> None:
     assert list(found.inputs()) == ["a.csv", "b.csv"]
     assert [recording.id for recording in found.recordings()] == ["a", "b"]
     assert "has no recording 'c' (it has a, b)" in refusal(lambda: found.read("c"), MissingError)
-
-
-# --- what cannot -------------------------------------------------------------------------------------------------------------------
 
 
 def test_two_files_of_one_stem_are_refused(tmp_path: Path) -> None:
@@ -179,9 +170,6 @@ def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path: Path, 
     assert "data set 'mine'" in message
 
 
-# --- several runs in a table -----------------------------------------------------------------------------------------------------------
-
-
 def runs_csv(tmp_path: Path, runs: list[object]) -> Path:
     """A row a run number, 100 Hz, vx counting the rows."""
     lines = [f"{row / 100:.2f},{row},{run}" for row, run in enumerate(runs)]
@@ -220,9 +208,6 @@ def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
     assert len(source_of(runs_csv(tmp_path, [4] * 9)).read_file(tmp_path / "lap.csv")) == 9
     message = refusal(lambda: source_of(runs_csv(tmp_path, [4] * 9 + [5] * 9)).read_file(tmp_path / "lap.csv"))
     assert "holds 2 runs (4, 5); keep the rows of one" in message
-
-
-# --- what asks for too much ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
