@@ -141,6 +141,18 @@ def test_a_table_of_texts_is_read_where_no_sample_meets_a_text(tmp_path: Path) -
     assert "signal 'v' of group 0 'Only' holds text" in refusal(written(tmp_path / "b.mf4", raw, table))
 
 
+@pytest.mark.parametrize("version", ["4.10", "3.30"])
+def test_a_conversion_that_leads_elsewhere_is_not_left_out(tmp_path: Path, version: str) -> None:
+    file = written(tmp_path / "a.mf4", conversion={"a": 2.0, "b": 1.0}, version=version)
+    with asammdf.MDF(file) as measurement:
+        at = measurement.groups[0].channels[1].address
+    content = bytearray(file.read_bytes())
+    link, layout = (at + 24 + 4 * 8, "<Q") if version == "4.10" else (at + 8, "<I")
+    struct.pack_into(layout, content, link, at)  # the channel itself
+    file.write_bytes(content)
+    assert "signal 'v' of group 0 'Only' has a conversion that cannot be read; the file is damaged" in refusal(file)
+
+
 # --- limits ------------------------------------------------------------------------------------------------------------------------
 
 

@@ -229,6 +229,8 @@ def _require_number(measurement: Any, group: int, index: int, where: str) -> Non
     channel, dependencies = described.channels[index], described.channel_dependencies[index]
     if dependencies:
         raise DataError(f"{where} holds an array or structure; numbers are needed: name another signal")
+    if channel.conversion_addr and channel.conversion is None:  # asammdf would give the raw numbers
+        raise DataError(f"{where} has a conversion that cannot be read; the file is damaged")
     if measurement.version >= "4":
         virtual = channel.channel_type in (v4.CHANNEL_TYPE_VIRTUAL, v4.CHANNEL_TYPE_VIRTUAL_MASTER)
         end = 0 if virtual else 8 * channel.byte_offset + channel.bit_offset + channel.bit_count
