@@ -28,7 +28,8 @@ def install_examples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     configurations = Path("conf") / "estimator"
     configurations.mkdir(parents=True, exist_ok=True)
     for name in NAMES:
-        shutil.copy(EXAMPLES / f"{name}.py", folder)
+        for file in (*EXAMPLES.glob(f"{name}.py"), *EXAMPLES.glob(f"{name}.c.j2")):
+            shutil.copy(file, folder)
         shutil.copy(EXAMPLES / f"{name}.yaml", configurations)
     monkeypatch.syspath_prepend(str(folder))
     forget_examples()

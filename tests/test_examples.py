@@ -231,5 +231,5 @@ def test_ekf_goes_on_where_nothing_was_measured(examples):
     steps = [stepper.step({channel: drive[channel][k] for channel in model.channels})["vy"] for k in range(len(drive))]
     assert np.isfinite(batch["vy"]).all()
     assert np.abs(np.array(steps) - batch["vy"]).max() <= 1e-9
-    with pytest.raises(DataError, match="'steer' is NaN, which estimator 'saturating_ekf' cannot skip"):
+    with pytest.raises(DataError, match="'steer' is nan, which estimator 'saturating_ekf' cannot take"):
         stepper.step({"vx": 20.0, "steer": np.nan, "ay": 0.0, "yaw_rate": 0.0})

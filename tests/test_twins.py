@@ -87,7 +87,7 @@ def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Fo
         spoilt = with_gaps if gate is None else with_outliers
         samples = rational_drive(STEPS / 20.0, seed=1).stack(estimator.channels)
         samples[:, [0, 2]] = spoilt(torch.as_tensor(samples[:, [0, 2]])).numpy()
-        first = Gaussian(*map(torch.as_tensor, estimator.start(samples[0])))
+        first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
         y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
         readable = extended_filter(estimator.nonlinear_model(), y, u, first, gate=gate).steps.filtered
         compiled = estimator.filter_samples(samples, gate=gate)

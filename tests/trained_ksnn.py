@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from vehest.estimators.ksnn import KinematicsStructuredNetwork, Ksnn, KsnnSettings
+from vehest.estimators.ksnn import KinematicsStructuredNetwork, Ksnn
 
 
 def ksnn_with_weights(n_local=3, n_hidden=0, bias=False, seed=0, window=30, yaw_rate_max=0.6) -> Ksnn:
     """A KS-NN in float64 with γ about 0.95, β about 0.8 and feedback that matters."""
-    settings = KsnnSettings(n_local=n_local, n_hidden=n_hidden, bias=bias, window=window)
+    settings = Ksnn.settings_type(n_local=n_local, n_hidden=n_hidden, bias=bias, window=window)
     network = KinematicsStructuredNetwork(settings, yaw_rate_max).double()
     generator = torch.Generator().manual_seed(seed)
     centre_and_spread = {

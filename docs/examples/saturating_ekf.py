@@ -8,26 +8,18 @@ are a_y and ω; forward Euler. Filter: Jazwinski 1970, Chapter 8, as `vehest.fil
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 
 import numpy as np
 from numba import njit
 
 from vehest.constants import GRAVITY
-from vehest.estimators.base import EstimatorSettings, FitRecord
-from vehest.estimators.recursive import RecursiveEstimator
+from vehest.estimators.base import FitRecord
+from vehest.estimators.declared import fitted, setting
+from vehest.estimators.recursive import Recursive
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
 from vehest.filters.gaussian import Gaussian
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
-
-
-@dataclass(frozen=True)
-class SaturatingSettings(EstimatorSettings):
-    """The car, its friction, and the standard deviations of the accelerometer's and the gyro's noise [m/s², rad/s]."""
-
-    car: SingleTrackParameters = FERRARI_250LM
-    friction: float = 1.0
-    deviations: tuple[float, float] = (0.3, 0.01)
 
 
 @njit
@@ -55,17 +47,21 @@ def observation(state, inputs, p):
     return np.array([accelerations(state, inputs, p)[0], state[1]])
 
 
-class SaturatingEkf(RecursiveEstimator):
+class SaturatingEkf(Recursive):
     """Process noise is what the model leaves unexplained of the training recordings' motion from one sample to the next."""
 
     name, title = "saturating_ekf", "EKF with saturating axles"
     channels, skippable = ("vx", "steer", "ay", "yaw_rate"), ("ay", "yaw_rate")
-    numbers, settings_type = ("variance_vy", "variance_yaw_rate"), SaturatingSettings
+    variance_vy: float = fitted("variance of a step of the lateral velocity", unit="m²/s²")
+    variance_yaw_rate: float = fitted("variance of a step of the yaw rate", unit="rad²/s²")
+    car: SingleTrackParameters = setting(FERRARI_250LM, "the car")
+    friction: float = setting(1.0, "friction of its tyres", positive=True)
+    deviations: tuple[float, float] = setting((0.3, 0.01), "of the accelerometer's and the gyro's noise", unit="m/s², rad/s")
 
     def model(self):
         """The compiled model with these settings."""
-        parameters = np.array([*astuple(self.settings.car), self.settings.friction, 1.0 / self.settings.rate_hz])
-        noises = np.diag(list(self.values.values())), np.diag(np.square(self.settings.deviations))
+        parameters = np.array([*astuple(self.car), self.friction, 1.0 / self.rate_hz])
+        noises = np.diag(list(self.values.values())), np.diag(np.square(self.deviations))
         return CompiledModel(transition, observation, parameters, *noises)
 
     def first_state(self, sample, given):
@@ -80,8 +76,8 @@ class SaturatingEkf(RecursiveEstimator):
         rows[-1, 2:] = np.nan
         return {"vy": vy, "yaw_rate": yaw_rate}, (Gaussian(filtered.mean[-1], filtered.covariance[-1]), rows[-1:])
 
-    def fitted(self, data, training, context):
+    def find_numbers(self, data, training, context):
         """Mean squares of what the model leaves unexplained of a step."""
         p, drives = self.model().parameters, [(r.stack(("vy_ref", "yaw_rate")), r.stack(("vx", "steer"))) for r in data.train]
         left = [x[k + 1] - transition(x[k], u[k], p)[0] for x, u in drives for k in range(len(x) - 1)]
-        return dict(zip(self.numbers, np.nanmean(np.square(left), axis=0).tolist(), strict=True)), FitRecord()
+        return dict(zip(self.values, np.nanmean(np.square(left), axis=0).tolist(), strict=True)), FitRecord()

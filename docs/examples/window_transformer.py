@@ -3,38 +3,18 @@
 Embedding and learnt positions, encoder layers of torch's own, and a read-out of the last sample's encoding (Vaswani et al., NeurIPS 2017).
 """
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator, WindowedSettings
-
-
-@dataclass(frozen=True)
-class TransformerSettings(WindowedSettings):
-    """Sizes, and how much training drops out."""
-
-    width: int = 16
-    heads: int = 2
-    layers: int = 1
-    dropout: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if min(self.width, self.heads, self.layers) < 1 or self.width % self.heads:
-            raise ConfigurationError("estimator.width, heads and layers must be at least 1, and width a multiple of heads")
-        if not 0.0 <= self.dropout < 1.0:
-            raise ConfigurationError(f"estimator.dropout must lie between 0 and 1, not at {self.dropout}")
+from vehest.estimators.declared import setting
+from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 
 
 class TransformerNetwork(StandardisedNetwork):
     """Standardised windows (B, N, C) to the lateral velocity one step after them, (B,) [m/s]."""
 
-    def __init__(self, settings: TransformerSettings, n_channels: int) -> None:
+    def __init__(self, settings, n_channels: int) -> None:
         super().__init__(n_channels)
         width, heads, dropout = settings.width, settings.heads, settings.dropout
         self.embed = nn.Linear(n_channels, width)
@@ -54,9 +34,16 @@ class WindowTransformer(WindowedEstimator):
     """The network as an estimator; training, members, estimating, running online and saving come with `WindowedEstimator`."""
 
     name, title = "window_transformer", "Transformer"
-    settings_type = TransformerSettings
-    settings: TransformerSettings
+    width: int = setting(16, "of the encoding of a sample", least=1)
+    heads: int = setting(2, "of the attention; width is a multiple of it", least=1)
+    layers: int = setting(1, "encoder layers", least=1)
+    dropout: float = setting(0.0, "share of activations that training drops", least=0.0, below=1.0)
 
-    def empty_network(self) -> TransformerNetwork:
+    def check(self) -> None:
+        """Each head sees as much as the others."""
+        if self.width % self.heads:
+            raise ConfigurationError("estimator.width must be a multiple of estimator.heads")
+
+    def new_network(self) -> TransformerNetwork:
         """A network as it is built."""
         return TransformerNetwork(self.settings, len(self.channels))

@@ -175,11 +175,11 @@ def test_registry_knows_names():
     ("name", "config", "message"),
     [
         ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
-        ("ksnn", {"n_hidden": -1}, "n_hidden must not be negative"),
+        ("ksnn", {"n_hidden": -1}, "n_hidden must be at least 0"),
         ("ksnn", {"window": 0}, "window must be at least 1"),
         ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
         ("lstm", {"rate_hz": 0}, "rate_hz must be positive"),
-        ("luenberger", {"gain": 3}, "gain is not an option"),
+        ("luenberger", {"gains": 3}, "gains is not an option"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(name, config, message):
@@ -190,9 +190,9 @@ def test_settings_that_make_no_sense_are_refused(name, config, message):
 def test_activations_partition_unity_and_end_with_the_last_model():
     import torch
 
-    from vehest.estimators.ksnn import KinematicsStructuredNetwork, KsnnSettings
+    from vehest.estimators.ksnn import KinematicsStructuredNetwork, Ksnn
 
-    network = KinematicsStructuredNetwork(KsnnSettings(n_local=3), yaw_rate_max=0.6)
+    network = KinematicsStructuredNetwork(Ksnn.settings_type(n_local=3), yaw_rate_max=0.6)
     phi = network.activations(torch.tensor([0.0, 0.15, -0.3, 0.6, 2.0]))
     assert torch.allclose(phi.sum(-1), torch.ones(5))
     assert torch.allclose(phi[0], torch.tensor([1.0, 0.0, 0.0]))

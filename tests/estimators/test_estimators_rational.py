@@ -14,7 +14,7 @@ from rational_drive import CURVES, NOISE, changed, rational_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter, RationalSettings
+from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import extended_filter
@@ -80,7 +80,7 @@ def test_every_kind_of_tyre_comes_back_from_its_file(tyres, drive, tmp_path):
     save_model(estimator, tmp_path / tyres)
     back = load_model(tmp_path / tyres)
     assert isinstance(back, RationalFilter)
-    assert np.array_equal(back.curves, estimator.curves)
+    assert np.array_equal(back.axle_curves, estimator.axle_curves)
     assert np.array_equal(back.estimate([drive])[0]["vy"], estimator.estimate([drive])[0]["vy"])
 
 
@@ -88,7 +88,7 @@ def test_every_kind_of_tyre_comes_back_from_its_file(tyres, drive, tmp_path):
 def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
     """One prediction of a covariance without noise is A P Aᵀ, that of a known state Δt σ² B Bᵀ."""
     estimator = rational(tyres)
-    track, n = estimator.track(), 4 + len(estimator.settings.adapted)
+    track, n = estimator.track(), 4 + len(estimator.adapted)
     generator = np.random.default_rng(0)
     for sample in (np.array([np.nan, 22.0, np.nan, 0.11]), np.array([np.nan, 9.0, np.nan, -0.3])):
         root = 0.01 * generator.standard_normal((n, n))
@@ -98,8 +98,10 @@ def test_compiled_jacobians_are_those_of_automatic_differentiation(tyres):
         steering = torch.func.jacrev(track.transition, 1)(state, inputs)[:, 1].numpy()
         wander = np.diag([0.0] * 4 + [0.05**2] * (n - 4))
         rows = np.stack([sample, sample])
-        silent = estimator.filter_samples(rows, Gaussian(mean, root @ root.T), dict.fromkeys(LEVELS, 0.0)).last
-        noisy = estimator.filter_samples(rows, Gaussian(mean, np.zeros((n, n))), dict(zip(LEVELS, (0.1, 0.1, 0.2, 0.05), strict=True))).last
+        silent = estimator.filter_samples(rows, Gaussian(mean, root @ root.T), levels=dict.fromkeys(LEVELS, 0.0)).last
+        noisy = estimator.filter_samples(
+            rows, Gaussian(mean, np.zeros((n, n))), levels=dict(zip(LEVELS, (0.1, 0.1, 0.2, 0.05), strict=True))
+        ).last
         assert np.allclose(silent.mean, track.transition(state, inputs), rtol=1e-12)
         assert np.allclose(silent.covariance, slope @ root @ root.T @ slope.T, rtol=1e-9, atol=1e-15)
         assert np.allclose(noisy.covariance, track.step * (0.04 * np.outer(steering, steering) + wander), rtol=1e-9, atol=1e-15)
@@ -111,7 +113,7 @@ def test_compiled_filter_is_the_extended_filter_of_the_same_model(config, drive)
     estimator, gappy = rational(**config), with_gaps(drive).cut(4.0, 8.0)
     samples = gappy.stack(estimator.channels)
     ours = estimator.filter_samples(samples)
-    first = estimator.start(samples[0])
+    first = estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
     theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).steps
     assert np.abs(ours.mean - theirs.filtered.mean.numpy()).max() < 1e-9
@@ -129,7 +131,7 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     count = round(30.0 * estimator.settings.rate_hz)
     samples = np.full((count, 4), np.nan)
     samples[:, 1], samples[:, 3] = 25.0, 0.02
-    ours, first = estimator.filter_samples(samples), estimator.start(samples[0])
+    ours, first = estimator.filter_samples(samples), estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
     theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).steps.filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
@@ -146,7 +148,7 @@ def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_
     """A limit of 1.5° on a drive that goes beyond: there the car rolls again, and tyres are what they were."""
     estimator, short = rational(tyres, largest_sideslip=np.radians(1.5)), drive.cut(0.0, 12.0)
     samples = short.stack(estimator.channels)
-    ours, first = estimator.filter_samples(samples), estimator.start(samples[0])
+    ours, first = estimator.filter_samples(samples), estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
     theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).steps.filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
@@ -340,7 +342,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_start_as_uncertain_a
     alone, both = (estimator_class("rational_ekf").from_config({"curves": {"deviation": spread}}) for spread in (None, 0.2))
     alone.fit(FitData([train], []), NoiseTuningSettings(method="data"))
     both.fit(FitData([train, worn], []), NoiseTuningSettings(method="data", curves_from="*4"))
-    assert np.array_equal(alone.curves, both.curves)
+    assert np.array_equal(alone.axle_curves, both.axle_curves)
     np.testing.assert_allclose(both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12)
     with pytest.raises(ConfigurationError, match=r"curves_from 'fit_\*' matches no training recording \(rational4\)"):
         both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
@@ -351,7 +353,7 @@ def test_levels_of_the_unscented_filter_are_found_through_the_extended_one():
     fitted = [estimator_class("rational_ekf").from_config({"filter": kind}) for kind in ("extended", "unscented")]
     for estimator in fitted:
         estimator.fit(FitData([train], []), NoiseTuningSettings(grid=1, max_evaluations=5))
-    assert fitted[0].levels == fitted[1].levels
+    assert fitted[0].values == fitted[1].values
     assert fitted[1].settings.filter == "unscented"
 
 
@@ -385,7 +387,7 @@ def test_levels_that_optuna_finds_lie_in_the_box_and_get_better_with_trials():
     assert [record.metrics["evaluations"] for record in records] == [3, 25]
     assert records[1].metrics["best_train_loss"] <= records[0].metrics["best_train_loss"]
     low, high = BOXES["ay"]
-    assert 10.0**low <= many.levels["ay"] / many.levels["yaw_rate"] <= 10.0**high
+    assert 10.0**low <= many.values["ay"] / many.values["yaw_rate"] <= 10.0**high
 
 
 @pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs optuna: pip install 'vehest[tuning]'")
@@ -406,7 +408,7 @@ def test_a_drive_without_a_reference_is_one_clear_error(drive):
         ({"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
         ({"filter": "particle"}, "filter 'particle' is not one of: extended, unscented"),
         ({"bound": 1.0}, "bound must be more than 1"),
-        ({"adapt_above": -1.0}, "adapt_above must not be negative"),
+        ({"adapt_above": -1.0}, "adapt_above must be at least 0"),
         ({"largest_sideslip": 1.6}, r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6"),
         ({"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
         ({"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
@@ -420,5 +422,5 @@ def test_settings_that_make_no_sense_are_refused(config, message):
 
 def test_configuration_file_states_the_defaults():
     config = compose_config("train", ["estimator=rational_ekf"])
-    assert estimator_class("rational_ekf").from_config(config["estimator"]).settings == RationalSettings()
+    assert estimator_class("rational_ekf").from_config(config["estimator"]).settings == RationalFilter.settings_type()
     assert {name: value for name, value in config["training"].items() if name != "name"} == vars(NoiseTuningSettings())

@@ -16,26 +16,25 @@ from vehest.estimators.gru import Gru
 from vehest.estimators.kernels.activation import rational_tanh
 from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
 from vehest.estimators.kernels.threads import over_members
-from vehest.estimators.ksnn import Ksnn, KsnnSettings
+from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.lstm import Lstm
-from vehest.estimators.networks.recurrent import RecurrentSettings
 from vehest.run import group
 from vehest.training.members import FlatParameters, predict_members
 
 STRUCTURES = [
-    Ksnn(KsnnSettings(n_local=1, n_hidden=0, bias=True)),
-    Ksnn(KsnnSettings(n_local=2, n_hidden=0, bias=False)),
-    Ksnn(KsnnSettings(n_local=5, n_hidden=3, bias=True)),
-    Ksnn(KsnnSettings(n_local=3, n_hidden=2, bias=False)),
-    Gru(RecurrentSettings(n_states=5)),
-    Lstm(RecurrentSettings(n_states=4)),
+    Ksnn(Ksnn.settings_type(n_local=1, n_hidden=0, bias=True)),
+    Ksnn(Ksnn.settings_type(n_local=2, n_hidden=0, bias=False)),
+    Ksnn(Ksnn.settings_type(n_local=5, n_hidden=3, bias=True)),
+    Ksnn(Ksnn.settings_type(n_local=3, n_hidden=2, bias=False)),
+    Gru(Gru.settings_type(n_states=5)),
+    Lstm(Lstm.settings_type(n_states=4)),
 ]
 
 
 def _problem(estimator, dtype, members=3, batch=70):
     """Parameters of several members, windows of each, and the series; batch is no multiple of the lanes."""
     drive = planar_drive()
-    network = estimator.new_network([drive]).to(dtype)
+    network = estimator.network_for([drive]).to(dtype)
     windows = windows_of([drive], estimator.channels, "vy_ref", 30)
     layout = FlatParameters(network)
     rows = []
@@ -67,7 +66,7 @@ def test_compiled_recursion_equals_plain_one_in_value_and_gradient(estimator, dt
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_threads_do_not_change_a_bit_of_the_ksnn(dtype):
-    value_and_gradient = _problem(Ksnn(KsnnSettings(n_local=3, n_hidden=2, bias=True)), dtype, members=5)
+    value_and_gradient = _problem(Ksnn(Ksnn.settings_type(n_local=3, n_hidden=2, bias=True)), dtype, members=5)
     alone = value_and_gradient(True)
     before = torch.get_num_threads()
     try:
@@ -98,9 +97,9 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
 
 def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
     """Yaw rates at centres, between them and beyond the last one; the lanes of a block are in different local models."""
-    estimator = Ksnn(KsnnSettings(n_local=4, n_hidden=2, bias=True))
+    estimator = Ksnn(Ksnn.settings_type(n_local=4, n_hidden=2, bias=True))
     drive = planar_drive()
-    network = estimator.new_network([drive]).double()
+    network = estimator.network_for([drive]).double()
     network.reset(torch.Generator().manual_seed(0))
     network.yaw_rate_max.fill_(0.3)
     series = torch.as_tensor(drive.stack(estimator.channels))
@@ -116,9 +115,9 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
 
 
 def test_gradient_of_the_ksnn_equals_finite_differences():
-    estimator = Ksnn(KsnnSettings(n_local=3, n_hidden=1, bias=True))
+    estimator = Ksnn(Ksnn.settings_type(n_local=3, n_hidden=1, bias=True))
     drive = planar_drive(10.0)
-    network = estimator.new_network([drive]).double()
+    network = estimator.network_for([drive]).double()
     network.reset(torch.Generator().manual_seed(1))
     layout = FlatParameters(network)
     windows = windows_of([drive], estimator.channels, "vy_ref", 30)
@@ -131,7 +130,7 @@ def test_gradient_of_the_ksnn_equals_finite_differences():
 
 def test_gru_equals_the_library_gru():
     states = 5
-    network = Gru(RecurrentSettings(n_states=states)).empty_network().double()
+    network = Gru(Gru.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
     with torch.no_grad():
         network.gate_bias.copy_(torch.randn(3, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
@@ -147,7 +146,7 @@ def test_gru_equals_the_library_gru():
 
 def test_lstm_equals_the_library_lstm():
     states = 6
-    network = Lstm(RecurrentSettings(n_states=states)).empty_network().double()
+    network = Lstm(Lstm.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
     with torch.no_grad():
         network.gate_bias.copy_(torch.randn(4, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))

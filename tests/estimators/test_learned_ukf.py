@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
-from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf, LearnedUkfSettings
+from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf
 from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
@@ -257,11 +257,11 @@ def test_a_drive_without_what_it_learns_from_is_one_clear_error() -> None:
 
 def test_a_sample_that_is_infinite_is_refused_and_one_that_is_incomplete_too() -> None:
     stepper = trained().online()
-    sample = dict.fromkeys(SENSORS, 0.5)
-    with pytest.raises(DataError, match="infinite value"):
+    sample = dict.fromkeys((*SENSORS, "vx"), 0.5)
+    with pytest.raises(DataError, match="'ay' is inf"):
         stepper.step(sample | {"ay": np.inf})
     with pytest.raises(DataError, match="no channel 'ax'"):
-        stepper.step({"ay": 0.5})
+        stepper.step({"ay": 0.5, "vx": 0.5})
 
 
 @pytest.mark.parametrize(
@@ -271,7 +271,7 @@ def test_a_sample_that_is_infinite_is_refused_and_one_that_is_incomplete_too() -
         ({"noise": "none"}, "noise 'none' is not one of"),
         ({"friction": 0.0}, "friction must be positive"),
         ({"start_friction": 0.01}, "start_friction must lie above least_friction"),
-        ({"width": -1}, "width must not be negative"),
+        ({"width": -1}, "width must be at least 0"),
         ({"car": {"mass": 0.0}}, r"car\.mass must be positive"),
         ({"car": {"cg_to_rear_axle": 0.4}}, "less than the wheelbase"),
     ],
@@ -284,7 +284,7 @@ def test_settings_that_make_no_sense_are_refused(config: dict, message: str) -> 
 def test_it_is_registered_and_counts_its_parameters() -> None:
     """A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state."""
     made = estimator_class("learned_ukf").from_config({})
-    assert made.settings == LearnedUkfSettings()
+    assert made.settings == LearnedUkf.settings_type()
     network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
     assert made.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
     assert torch.get_default_dtype() == torch.float32

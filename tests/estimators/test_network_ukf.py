@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,11 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
+from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.ensemble_ukf import EnsembleSettings, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.track_filter import KNOWN, TrackFilter, error_over
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
 from vehest.training.context import FitContext
@@ -55,11 +56,19 @@ def estimator_of(name: str, **config: object) -> NetworkUkf:
     return estimator
 
 
+def filter_alone(estimator: NetworkUkf) -> DugoffUkf:
+    """The same filter without its network."""
+    own = {entry.name: getattr(estimator.settings, entry.name) for entry in fields(DugoffUkf.settings_type)}
+    alone = DugoffUkf(DugoffUkf.settings_type(**own))
+    alone.load_weights(DugoffUkf.weights(estimator))
+    return alone
+
+
 def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, EndToEnd]:
     """A network that is not trained yet, in double precision, and its training through the filter."""
     estimator = estimator_of("cnn_ukf", dropout=dropout)
     assert isinstance(estimator, CnnUkf)
-    raw = learnt_samples(DATA.train, estimator.inputs, estimator.name)
+    raw = learnt_samples(DATA.train, estimator.network_inputs, estimator.name)
     estimator.network.double().scale(*raw)
     estimator.network.reset([torch.Generator().manual_seed(0)])
     with torch.no_grad():
@@ -95,11 +104,11 @@ def test_a_word_counts_as_much_as_its_variance_says() -> None:
     wrong = drive["sideslip_ref"] + 0.02
 
     def filtered(variance: float) -> np.ndarray:
-        ((_, (mean, *_)),) = estimator.filtered([drive], [Word(wrong, np.full(len(drive), variance))])
-        return mean[0, :, 0]
+        ((_, steps),) = estimator.filtered([drive], pseudo=[PseudoMeasurement(wrong, np.full(len(drive), variance))])
+        return steps.filtered.mean[0, :, 0].numpy()
 
     np.testing.assert_allclose(np.arctan2(filtered(1e-10), drive["vx"])[5:], wrong[5:], atol=1e-4)
-    alone = estimator.model.estimate([drive.without_references()])[0]["vy"]
+    alone = filter_alone(estimator).estimate([drive.without_references()])[0]["vy"]
     np.testing.assert_allclose(filtered(1e6), alone, atol=1e-6)
 
 
@@ -110,16 +119,16 @@ def test_the_ensembles_variance_is_scaled_by_the_papers_formula() -> None:
 
 
 def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks() -> None:
-    inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").inputs)
+    inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").network_inputs)
     told = {}
     for kind in ("models", "mixture"):
         estimator = estimator_of("ensemble_ukf", variance=kind)
         assert isinstance(estimator, EnsembleUkf)
         estimator.network.scale(inputs, DATA.validation[0]["sideslip_ref"])
         estimator.network.reset([torch.Generator().manual_seed(member) for member in range(3)])
-        told[kind] = estimator.word(inputs)
+        told[kind] = estimator.pseudo_of(inputs)
     unit = float(estimator.network.unit)
-    said = unit * estimator.network.said(inputs)[..., 0]
+    said = unit * estimator.network.outputs(inputs)[..., 0]
     np.testing.assert_allclose(told["models"].sideslip, np.clip(said.mean(0), -1.5, 1.5), rtol=1e-12)
     np.testing.assert_allclose(told["models"].variance, said.var(0) + LEAST_VARIANCE, rtol=1e-9)
     assert (told["mixture"].variance > told["models"].variance).all()
@@ -135,8 +144,8 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
     assert [found["scaling_p1"], found["scaling_p2"]] == estimator.scaling.tolist() != [0.0, 1.0]
 
     def loss() -> float:
-        words = [estimator.word(recording.stack(estimator.inputs)) for recording in DATA.validation]
-        return estimator.mean_squared_error(DATA.validation, words, search.skip_seconds)
+        pseudo = estimator.pseudo_measurements(DATA.validation)
+        return estimator.mean_squared_error(DATA.validation, search.skip_seconds, pseudo=pseudo)
 
     assert loss() == pytest.approx(found["best_validation_loss"], rel=1e-9)
     estimator.scaling = np.array([0.0, 1.0])
@@ -146,7 +155,7 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
 def test_the_loss_of_pre_training_is_that_of_the_formulas() -> None:
     """Eqs. 5 and 6, with the distrust as a standard deviation."""
     estimator, _ = end_to_end()
-    samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.inputs, estimator.name))
+    samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.network_inputs, estimator.name))
     levels, rows = torch.tensor([2e-3, 3e-3], dtype=torch.float64), torch.tensor([[3, 500, 1000]])
     phase = estimator._pre_training(samples, samples, levels, EndToEndSettings())
     outputs = estimator.network(samples.inputs[rows])[0]
@@ -165,9 +174,10 @@ def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(
     recording = DATA.train[1]
     training.training = replace(training.training, steps=len(recording))
     batch = training.cut(torch.tensor([len(DATA.train[0])]), torch.tensor([5]))
-    word = estimator.word(recording.stack(estimator.inputs))
+    word = estimator.pseudo_of(recording.stack(estimator.network_inputs))
     start = {"vy": recording["vy_ref"][0], "yaw_rate": recording["yaw_rate"][0]}
-    ((_, (mean, *_)),) = estimator.filtered([recording], [word], [start])
+    ((_, steps),) = estimator.filtered([recording], [start], pseudo=[word])
+    mean = steps.filtered.mean.numpy()
     wanted = np.arctan2(recording["vy_ref"], recording["vx"])
     errors = [np.square(angle - wanted).mean() for angle in (word.sideslip, np.arctan2(mean[0, :, 0], recording["vx"]))]
     assert training.loss(batch).item() == pytest.approx(sum(errors), rel=1e-6)
@@ -178,14 +188,14 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     found = training.loss(batch)
-    expected_filter = TrackFilter(estimator.model.track(sees_sideslip=True), compiled=False)
+    expected_filter = TrackFilter(estimator.track(sees_sideslip=True), compiled=False)
     ours, training.filter = training.filter, expected_filter
     expected = training.loss(batch)
     assert found.item() == pytest.approx(expected.item(), rel=1e-10)
     for own, other in zip(gradients_of(estimator, found), gradients_of(estimator, expected), strict=True):
         torch.testing.assert_close(own, other, rtol=1e-6, atol=1e-9 * float(other.abs().max()))
     training.filter = ours
-    said = estimator.said(estimator.network(batch.inputs.reshape(1, -1, 17)).reshape(4, 30, 4))
+    said = estimator.output_of(estimator.network(batch.inputs.reshape(1, -1, 17)).reshape(4, 30, 4))
     assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
 
 
@@ -228,7 +238,7 @@ def test_pre_training_starts_process_noise_where_the_filter_has_it() -> None:
     estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=lambda: next(stopping, True)))  # before its first step
     assert isinstance(estimator, CnnUkf)
     estimator.network.get_parameter("weight_3").data.zero_()
-    word = estimator.word(DATA.validation[0].stack(estimator.inputs)[:3])
+    word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)[:3])
     np.testing.assert_allclose(np.sqrt(word.process), [[2e-3, 2e-3]] * 3, rtol=1e-4)
     np.testing.assert_allclose(word.variance, float(estimator.network.unit) ** 2 + LEAST_VARIANCE, rtol=1e-4)
 
@@ -265,23 +275,26 @@ def test_what_is_taken_away_is_the_same_at_every_sample(away: str, held: list[in
     assert isinstance(estimator, CnnUkf)
     estimator.fit(DATA, TRAININGS["cnn_ukf"])
     assert estimator.variant == f"full_no_{away}"
-    outputs = estimator.network.said(DATA.validation[0].stack(estimator.inputs))[0]
+    outputs = estimator.network.outputs(DATA.validation[0].stack(estimator.network_inputs))[0]
     changing = [output for output in range(4) if np.ptp(outputs[:, output]) > 0.0]
     assert changing == [output for output in range(4) if output not in held]
-    word = estimator.word(DATA.validation[0].stack(estimator.inputs))
+    word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs))
     if away == "adaptive_process":
         assert word.process is not None
         np.testing.assert_allclose(np.sqrt(word.process[0]), [LEVELS["process_vy"], LEVELS["process_yaw_rate"]], rtol=1e-5)
     elif away == "pseudo_measurement":
         np.testing.assert_allclose(word.variance, 1.0, rtol=1e-5)
-        alone = estimator.model.estimate([DATA.validation[0].without_references()])[0]["vy"]
+        alone = filter_alone(estimator).estimate([DATA.validation[0].without_references()])[0]["vy"]
         constant = word._replace(process=np.square([[LEVELS["process_vy"], LEVELS["process_yaw_rate"]]] * len(alone)))
-        ((_, (mean, *_)),) = estimator.filtered([DATA.validation[0]], [constant])
+        ((_, steps),) = estimator.filtered([DATA.validation[0]], pseudo=[constant])
+        mean = steps.filtered.mean.numpy()
         np.testing.assert_allclose(mean[0, :, 0], alone, atol=2e-3)
     else:
         other = estimator_of("cnn_ukf", **{away: False})
         other.fit(DATA, replace(TRAININGS["cnn_ukf"], pre_training=PhaseSettings(learning_rate=5e-3, max_epochs=2)))
-        assert other.word(DATA.validation[0].stack(estimator.inputs)).variance[0] != word.variance[0]  # one value, but a learnt one
+        assert (
+            other.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)).variance[0] != word.variance[0]
+        )  # one value, but a learnt one
 
 
 def test_a_loss_in_degrees_is_the_same_in_another_unit() -> None:
@@ -298,10 +311,13 @@ def test_one_recording_decides_less_where_recordings_count() -> None:
     assert error_over([quiet] * 9 + [wild], "recordings") == pytest.approx(0.29**2)
     assert error_over([quiet, (0.0, 0)], "recordings") == pytest.approx(0.01)
     estimator = estimator_of("cnn_ukf")
-    words = [Word(drive["sideslip_ref"] + off, np.full(len(drive), 1e-4)) for drive, off in zip(DATA.train, (0.0, 0.05), strict=True)]
+    pseudo = [
+        PseudoMeasurement(drive["sideslip_ref"] + off, np.full(len(drive), 1e-4))
+        for drive, off in zip(DATA.train, (0.0, 0.05), strict=True)
+    ]
     both, first, second = (
-        estimator.mean_squared_error(drives, own, over="recordings")
-        for drives, own in ((DATA.train, words), (DATA.train[:1], words[:1]), (DATA.train[1:], words[1:]))
+        estimator.mean_squared_error(drives, pseudo=own, over="recordings")
+        for drives, own in ((DATA.train, pseudo), (DATA.train[:1], pseudo[:1]), (DATA.train[1:], pseudo[1:]))
     )
     assert np.sqrt(both) == pytest.approx(0.5 * (np.sqrt(first) + np.sqrt(second)))
 

@@ -10,7 +10,7 @@ import torch
 
 from trained_ksnn import ksnn_with_weights
 from vehest.estimators.kernels.luenberger import observe
-from vehest.estimators.luenberger import Luenberger, LuenbergerSettings
+from vehest.estimators.luenberger import Luenberger
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity, luenberger_sensitivity
 
@@ -19,7 +19,7 @@ AY, AX = 2, 3
 
 
 def _luenberger(gain=7.0, threshold=0.05, rate_hz=100.0):
-    estimator = Luenberger(LuenbergerSettings(rate_hz=rate_hz))
+    estimator = Luenberger(Luenberger.settings_type(rate_hz=rate_hz))
     estimator.gain, estimator.threshold = gain, threshold
     return estimator
 

@@ -22,9 +22,8 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import write_estimate, write_recording
 from vehest.data.transforms import transform_from_config
 from vehest.estimators.base import Estimator, FitData
-from vehest.estimators.dugoff_ukf import DugoffUkf
+from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.network_ukf import Word
 from vehest.estimators.networks.sample_network import INPUTS
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
@@ -301,12 +300,12 @@ def test_what_networks_say_is_held_against_the_reference_of_the_same_time(
 ) -> None:
     prepared = Prepared(part)
 
-    def knowing(run: Run, drives: Sequence[Recording]) -> list[Word]:
+    def knowing(run: Run, drives: Sequence[Recording]) -> list[PseudoMeasurement]:
         whole = [prepared.recording("car", drive.id).cut(drive.start_time, drive.end_time + 0.005) for drive in drives]
         true = [np.arctan2(own["vy_ref"], own["vx"]) for own in whole]
-        return [Word(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true]
+        return [PseudoMeasurement(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true]
 
-    monkeypatch.setattr(networks, "words_of", knowing)
+    monkeypatch.setattr(networks, "pseudo_measurements_of", knowing)
     outputs = networks.outputs_of(runs[paper.CNN][0], prepared)
     for own in outputs:
         np.testing.assert_allclose(own.error, 0.0, atol=1e-9)

@@ -11,7 +11,7 @@ import pytest
 
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalSettings, TrackNoise
+from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, TrackNoise
 from vehest.report.document import Table
 from vehest.studies.artefacts import EvaluatedModel
 from vehest.vehicle.parameters import SingleTrackParameters
@@ -41,7 +41,9 @@ def short_drive(seconds: float = 60.0) -> Recording:
 @pytest.fixture(scope="module")
 def ratte() -> RationalFilter:
     curves = AxleCurves(0.013, 487e3, 0.0077, 622e3)
-    return RationalFilter(RationalSettings(car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003)))
+    return RationalFilter(
+        RationalFilter.settings_type(car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003))
+    )
 
 
 def test_every_fault_leaves_the_filter_finite(ratte: RationalFilter) -> None:

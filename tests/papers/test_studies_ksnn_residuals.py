@@ -10,7 +10,7 @@ import pytest
 from conftest import planar_drive
 from trained_ksnn import ksnn_with_weights
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.luenberger import Luenberger, LuenbergerSettings
+from vehest.estimators.luenberger import Luenberger
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, Table
 from vehest_papers.kit.spectra import periodogram
@@ -103,4 +103,4 @@ def test_activations_are_drawn_as_the_network_has_them():
 
 def test_estimator_without_local_models_is_refused():
     with pytest.raises(ConfigurationError, match="'luenberger' has no local models"):
-        activation(Trained(Luenberger(LuenbergerSettings()), "Luenberger", "nothing"))
+        activation(Trained(Luenberger(Luenberger.settings_type()), "Luenberger", "nothing"))

@@ -10,8 +10,7 @@ import pytest
 from trained_ksnn import ksnn_with_weights
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.lstm import Lstm
-from vehest.estimators.luenberger import Luenberger, LuenbergerSettings
-from vehest.estimators.networks.recurrent import RecurrentSettings
+from vehest.estimators.luenberger import Luenberger
 from vehest.report.document import Figure, Table
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity
@@ -20,7 +19,7 @@ from vehest_papers.ksnn.subjects import Trained
 
 
 def _luenberger(gain=7.0, threshold=0.02):
-    estimator = Luenberger(LuenbergerSettings(rate_hz=20.0))
+    estimator = Luenberger(Luenberger.settings_type(rate_hz=20.0))
     estimator.gain, estimator.threshold = gain, threshold
     return estimator
 
@@ -95,4 +94,4 @@ def test_nonlinear_network_is_shown_linearised_where_it_is_told_and_says_so(erro
 
 def test_other_estimators_are_refused():
     with pytest.raises(ConfigurationError, match="not of 'lstm'"):
-        sensitivity_of(Lstm(RecurrentSettings(n_states=2)), 0.2)
+        sensitivity_of(Lstm(Lstm.settings_type(n_states=2)), 0.2)

@@ -16,7 +16,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.store import read_estimate, write_estimate, write_recording
-from vehest.estimators.learned_ukf import LearnedUkf, LearnedUkfSettings
+from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
 from vehest.evaluation.significance import Interval
@@ -81,7 +81,7 @@ def recording(name: str, seconds: float = 3.2, seed: int = 0) -> Recording:
 
 def filter_of(seed: int = 0, **settings: object) -> LearnedUkf:
     """A filter with networks of random weights, not trained."""
-    estimator = LearnedUkf(LearnedUkfSettings(**{"width": 4, "scaled": False, **settings}))
+    estimator = LearnedUkf(LearnedUkf.settings_type(**{"width": 4, "scaled": False, **settings}))
     estimator.filter.reset(torch.Generator().manual_seed(seed))
     return estimator
 
@@ -156,7 +156,7 @@ def model(part: PartArtefacts, candidate: str, seed: int = 0) -> EvaluatedModel:
     + [(own, candidate) for candidate, own in CANDIDATES.items()],
 )
 def test_candidates_have_the_papers_names(settings, candidate):
-    estimator = LearnedUkf(LearnedUkfSettings(width=4, **settings))
+    estimator = LearnedUkf(LearnedUkf.settings_type(width=4, **settings))
     assert candidate_of(EvaluatedModel("learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path())) == candidate
 
 

@@ -13,7 +13,7 @@ from conftest import planar_drive
 from vehest.data.errors import ConfigurationError
 from vehest.data.windows import windows_of
 from vehest.estimators.base import FitData
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator, WindowedSettings
+from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 from vehest.training.context import FitContext
 from vehest.training.members import _ONE_BY_ONE
 from vehest.training.supervised import SupervisedSettings
@@ -83,12 +83,11 @@ def estimator_of(network, seed=0):
     class Plain(WindowedEstimator):
         name = "plain"
         title = "Plain"
-        settings_type = WindowedSettings
 
-        def empty_network(self) -> nn.Module:
+        def new_network(self) -> nn.Module:
             return network()
 
-    estimator = Plain(WindowedSettings(window=WINDOW))
+    estimator = Plain.from_config({"window": WINDOW})
     estimator.seed(seed)
     return estimator
 

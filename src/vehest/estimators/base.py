@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import Field, dataclass, field, make_dataclass
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
+from vehest.estimators.declared import Group, setting
 from vehest.training.context import FitContext
 
 
+def rate(default: float) -> Any:
+    """The setting ``rate_hz`` with another default [Hz]."""
+    return setting(default, "sampling rate it works at", unit="Hz", positive=True)
+
+
 @dataclass(frozen=True)
-class EstimatorSettings:
-    """What every estimator can be told.
+class EstimatorSettings(Group):
+    """Settings of every estimator."""
 
-    Args:
-        rate_hz: sampling rate it works at [Hz].
-    """
-
-    rate_hz: float = 100.0
-
-    def __post_init__(self) -> None:
-        if not self.rate_hz > 0:
-            raise ConfigurationError(f"estimator.rate_hz must be positive, not {self.rate_hz}")
+    rate_hz: float = rate(100.0)
 
 
 @dataclass(frozen=True)
@@ -78,15 +77,23 @@ class Stepper(ABC):
 class Estimator(ABC):
     """A method that estimates lateral velocity and sideslip from measured channels.
 
+    A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
+    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them.
+
     Attributes:
         name: name in conf/estimator and in the registry.
         title: name for people.
         channels: measured channels it reads.
-        settings_type: dataclass of its settings.
         training_type: dataclass of the settings of its fit.
+        learns_from: reference channels that its fit reads.
         skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
+        refuses: which measurements of a sample are errors: ``NaN`` where it is not skippable, ``infinite``.
         open_weights: weights that may stay NaN, because each recording tells them.
+        covariance_of: quantities that the covariances of `run` are of.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
+        slow_kernel: module of a compiled function ``_transition`` that takes tens of seconds to compile; empty: none.
+        notice: lines for whoever uses the method, such as a patent.
+        template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
         version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).
     """
@@ -94,16 +101,49 @@ class Estimator(ABC):
     name: ClassVar[str]
     title: ClassVar[str]
     channels: ClassVar[tuple[str, ...]]
-    settings_type: ClassVar[type[EstimatorSettings]]
+    settings_type: ClassVar[Any] = EstimatorSettings
     training_type: ClassVar[type]
+    learns_from: tuple[str, ...] = ("vy_ref",)
     skippable: ClassVar[tuple[str, ...]] = ()
+    refuses: ClassVar[tuple[str, ...]] = ()
     open_weights: ClassVar[tuple[str, ...]] = ()
+    covariance_of: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
+    slow_kernel: ClassVar[str] = ""
+    notice: ClassVar[tuple[str, ...]] = ()
+    template: ClassVar[str] = ""
     version: ClassVar[str] = "1"
 
-    def __init__(self, settings: EstimatorSettings) -> None:
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        own = {name: value for name, value in vars(cls).items() if isinstance(value, Field)}
+        of_bases = dict.fromkeys(base.settings_type for base in cls.__bases__ if issubclass(base, Estimator))
+        bases = [one for one in of_bases if not any(other is not one and issubclass(other, one) for other in of_bases)]
+        if not own and len(bases) == 1:
+            return
+        kinds = {name: f"{cls.__annotations__[name]}{' | None' if value.default is None else ''}" for name, value in own.items()}
+        described = [(name, kinds[name], value) for name, value in own.items()]
+        cls.settings_type = make_dataclass("settings_type", described, bases=tuple(bases), frozen=True)
+        cls.settings_type.__module__, cls.settings_type.__qualname__ = cls.__module__, f"{cls.__qualname__}.settings_type"
+        for name in own:
+            setattr(cls, name, property(attrgetter(f"settings.{name}")))
+
+    def __init__(self, settings: Any) -> None:
         self.settings = settings
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
+        self.check()
+
+    def check(self) -> None:  # noqa: B027 (most families have nothing to check)
+        """Check settings against each other.
+
+        Raises:
+            ConfigurationError: they do not fit.
+        """
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate it works at [Hz]."""
+        return float(self.settings.rate_hz)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:
@@ -144,10 +184,31 @@ class Estimator(ABC):
         """Title with what distinguishes this configuration, for people."""
         return self.title
 
+    @classmethod
+    def drawn(cls, variant: str) -> tuple[str, str, str] | None:
+        """Colour, dash and marker of its lines in figures; none: a colour that follows from its name."""
+        return None
+
     @property
     def batch_key(self) -> tuple[Any, ...]:
         """Estimators with equal keys may be fitted together as members."""
         return (self.name, self.settings)
+
+    def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
+        """Reference channels that a fit with these settings reads, of recordings with these channels."""
+        return self.learns_from
+
+    def unmatched(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
+        """Overrides that a fit needs because its settings name recordings by a pattern that none of these matches."""
+        return ()
+
+    def c_values(self) -> Mapping[str, Any]:
+        """Values that ``template`` needs of the fitted estimator.
+
+        Raises:
+            ConfigurationError: these settings have no C.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has a template and no method 'c_values'")
 
     @property
     @abstractmethod
@@ -216,6 +277,23 @@ class Estimator(ABC):
                 raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot skip")
         return recording.select(self.channels)
 
+    def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
+        """Values of ``channels`` at one instant, (C,).
+
+        Raises:
+            DataError: one is missing, or is refused.
+        """
+        try:
+            values = np.array([float(sample[name]) for name in self.channels])
+        except KeyError as error:
+            raise DataError(f"the sample has no channel {error}; it needs {', '.join(self.channels)}") from None
+        for name, value in zip(self.channels, values, strict=True):
+            if ("infinite" in self.refuses and np.isinf(value)) or (
+                "NaN" in self.refuses and np.isnan(value) and name not in self.skippable
+            ):
+                raise DataError(f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take")
+        return values
+
     def _wrapped(
         self,
         recording: Recording,
@@ -234,17 +312,50 @@ class Estimator(ABC):
         """Estimate checked recordings, each from its state; one after another, unless a method can do better."""
         return [self._estimate_one(recording, state) for recording, state in zip(recordings, states, strict=True)]
 
-    @abstractmethod
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        """Estimate one checked recording."""
+    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
+        """The state before the first sample; none where the method has no state.
 
-    @abstractmethod
+        Args:
+            sample: values of ``channels``, (C,).
+            given: what a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty otherwise.
+        """
+        return None
+
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
+        """Go on from a state.
+
+        Args:
+            samples: values of ``channels``, (T, C), T ≥ 1.
+            state: that before the first of them.
+
+        Returns:
+            Quantities of an `Estimate` at the time of each sample, (T,), ``vy`` [m/s] among them; perhaps ``covariance``, (T, n, n), of
+            ``covariance_of``, and ``innovations``, a function that returns ``nis`` and ``nis_dof``. And the state after the last sample.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no method 'run'")
+
+    def require_fitted(self) -> None:  # noqa: B027 (most networks are complete when they are made)
+        """Raises:
+        ConfigurationError: a number is neither given nor fitted.
+        """
+
+    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
+        self.require_fitted()
+        samples = recording.stack(self.channels)
+        found, _ = self.run(samples, self.first_state(samples[0], dict(initial_state or {})))
+        covariance, innovations = found.pop("covariance", None), found.pop("innovations", None)
+        if innovations is not None:
+            found["nis"], found["nis_dof"] = innovations()
+        return self._wrapped(recording, found.pop("vy"), covariance, self.covariance_of if covariance is not None else (), **found)
+
     def online(self) -> Stepper:
         """A stepper in its initial state.
 
         Raises:
-            ConfigurationError: the method is not causal.
+            ConfigurationError: it has not been fitted, or is not causal.
         """
+        self.require_fitted()
+        return RunStepper(self)
 
     @abstractmethod
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
@@ -257,6 +368,29 @@ class Estimator(ABC):
         Raises:
             DataError: a name or shape does not fit the settings.
         """
+
+
+class RunStepper(Stepper):
+    """An estimator that has `run`, one sample at a time."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        self._estimator = estimator
+        self._state: Any = None
+        self._started = False
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """Every quantity at the time of the sample, ``vy`` [m/s] among them; NaN in skippable channels was not measured."""
+        estimator = self._estimator
+        row = estimator.checked_sample(sample)
+        state = self._state if self._started else estimator.first_state(row, {})
+        found, self._state = estimator.run(row[None], state)
+        self._started = True
+        covariance, _ = found.pop("covariance", None), found.pop("innovations", None)
+        values = {name: float(quantity[0]) for name, quantity in found.items()}
+        if covariance is not None:
+            row_of_vy = estimator.covariance_of.index("vy")
+            values["vy_variance"] = float(covariance[0, row_of_vy, row_of_vy])
+        return values
 
 
 def required(sample: Mapping[str, float], channels: Sequence[str]) -> list[float]:

@@ -16,8 +16,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word, observation_noise
-from vehest.estimators.networks.sample_network import SampleNetwork, believed, learnt_samples
+from vehest.estimators.declared import setting
+from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
+from vehest.estimators.filtering.track_filter import TrackFilter
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
+from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
 from vehest.estimators.phase_records import record_of_phases
 from vehest.estimators.references import reference_sideslip
 from vehest.filters.gaussian import Gaussian
@@ -31,31 +34,6 @@ MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond wh
 SATURATED = 20.0  # of which the logistic function is 1
 DISTRUST, PROCESS = 1, [2, 3]  # which outputs they are
 MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops instead of going on without them
-
-
-@dataclass(frozen=True)
-class CnnUkfSettings(NetworkUkfSettings):
-    """Settings of the filter and of its network; the tyres are the smooth ones that gradients pass (Eq. 10).
-
-    Args:
-        curve: see `DugoffUkfSettings`.
-        hidden: see `NetworkUkfSettings`.
-        pseudo_measurement: whether the filter listens to the network's angle; otherwise σ_DD is held at its largest, 1 rad.
-        adaptive_distrust: whether σ_DD changes from sample to sample; otherwise one value is learnt.
-        adaptive_process: whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels.
-    """
-
-    curve: Literal["plain", "smooth"] = "smooth"
-    hidden: tuple[int, int] = (200, 100)
-    pseudo_measurement: bool = True
-    adaptive_distrust: bool = True
-    adaptive_process: bool = True
-
-    @property
-    def without(self) -> tuple[str, ...]:
-        """What of the method is taken away."""
-        parts = ("pseudo_measurement", "adaptive_distrust", "adaptive_process")
-        return tuple(name for name in parts if not getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -101,8 +79,8 @@ class EndToEndSettings:
             raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
 
 
-class Said(NamedTuple):
-    """What the network says of samples, differentiable, in double precision.
+class NetworkOutput(NamedTuple):
+    """The network's angle and noise of samples, differentiable, in double precision.
 
     Attributes:
         sideslip: β_DD (...) [rad].
@@ -155,45 +133,55 @@ class CnnUkf(NetworkUkf):
     estimation, IEEE Transactions on Vehicular Technology 73 (9), 2024, Section III.
     """
 
-    name = "cnn_ukf"
-    title = "UKF-informed network"
-    settings_type = CnnUkfSettings
+    name, title = "cnn_ukf", "UKF-informed network"
     training_type = EndToEndSettings
-    settings: CnnUkfSettings
+    curve: Literal["plain", "smooth"] = setting("smooth", "tyres of Eq. 9 (plain) or 10 (smooth), which gradients pass")
+    hidden: tuple[int, int] = setting((200, 100), "widths of the network's hidden layers")
+    pseudo_measurement: bool = setting(True, "whether the filter measures the angle; otherwise σ_DD is held at 1 rad")
+    adaptive_distrust: bool = setting(True, "whether σ_DD changes from sample to sample; otherwise one value is learnt")
+    adaptive_process: bool = setting(True, "whether σ_Vy and σ_ψ̇ do; otherwise they are held at the filter's levels")
 
-    def _new_network(self) -> SampleNetwork:
-        return SampleNetwork(len(self.inputs), self.settings.hidden, 4)
+    @property
+    def without(self) -> tuple[str, ...]:
+        """Parts of the method that are taken away."""
+        parts = ("pseudo_measurement", "adaptive_distrust", "adaptive_process")
+        return tuple(name for name in parts if not getattr(self, name))
+
+    def new_network(self) -> SampleNetwork:
+        """From a sample to an angle, its deviation and those of a step."""
+        return SampleNetwork(len(self.network_inputs), self.hidden, 4)
 
     @property
     def variant(self) -> str:
         """With the tyres, where they are not the smooth ones, and what is taken away."""
-        tyres = "" if self.settings.curve == "smooth" else "_plain"
-        return super().variant + tyres + "".join(f"_no_{name}" for name in self.settings.without)
+        tyres = "" if self.curve == "smooth" else "_plain"
+        return super().variant + tyres + "".join(f"_no_{name}" for name in self.without)
 
-    def said(self, outputs: Tensor) -> Said:
-        """What outputs of the network, (..., 4), say."""
+    def output_of(self, outputs: Tensor) -> NetworkOutput:
+        """Outputs of the network, (..., 4), as angle and noise."""
         shares = torch.sigmoid(outputs[..., 1:].double())
-        return Said(outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:])
+        return NetworkOutput(outputs[..., 0].double() * self.network.unit.double(), shares[..., 0], shares[..., 1:])
 
-    def word(self, inputs: FloatArray) -> Word:
+    def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
         """Angle, its variance and the process noise."""
-        said = self.said(torch.as_tensor(self.network.said(inputs)[0]))
-        return Word(believed(said.sideslip.numpy()), said.variance.numpy(), said.process.square().numpy())
+        found = self.output_of(torch.as_tensor(self.network.outputs(inputs)[0]))
+        return PseudoMeasurement(clip_sideslip(found.sideslip.numpy()), found.variance.numpy(), found.process.square().numpy())
 
-    def _fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
-        slow = self.settings.minimum_speed
-        raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
-        network = self.network = self._new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.settings.normalisation)
+    def fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
+        """Pre-training, then training through the filter."""
+        slow = self.minimum_speed
+        raw, judged = (learnt_samples(part, self.network_inputs, self.name, slow) for part in (data.train, data.validation))
+        network = self.network = self.new_network().to(getattr(torch, training.dtype))
+        network.scale(*raw, self.normalisation)
         network.reset([torch.Generator().manual_seed(self._seed)])
-        levels = torch.tensor([self.model.levels["process_vy"], self.model.levels["process_yaw_rate"]], dtype=torch.float64)
+        levels = torch.tensor([self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64)
         levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         handles = self._hold(network)
         train = network.samples(*raw)
-        driven = network.samples(*learnt_samples(data.train, self.inputs, self.name))  # sequences are cut from all that was driven
+        driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))  # sequences are cut from all that was driven
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
             self._pre_training(train, network.samples(*judged), levels, training),
@@ -204,9 +192,7 @@ class CnnUkf(NetworkUkf):
                 end_to_end.batches,
                 end_to_end.loss,
                 lambda: self.mean_squared_error(
-                    data.validation,
-                    [self.word(recording.stack(self.inputs)) for recording in data.validation],
-                    over=training.identification.error,
+                    data.validation, over=training.identification.error, pseudo=self.pseudo_measurements(data.validation)
                 ),
             ),
         ]
@@ -217,7 +203,7 @@ class CnnUkf(NetworkUkf):
 
     def _hold(self, network: SampleNetwork) -> list[RemovableHandle]:
         """Take heads away: what is held has no weights and no gradient, so that the network is of the usual shape and says constants."""
-        s = self.settings
+        s = self
         held_weights, held_biases = [], []
         if not (s.adaptive_distrust and s.pseudo_measurement):
             held_weights.append(DISTRUST)
@@ -240,13 +226,13 @@ class CnnUkf(NetworkUkf):
 
     def _pre_training(self, train: Samples, judged: Samples, levels: Tensor, training: EndToEndSettings) -> Phase:
         """The network alone: a likelihood of its angle and distrust, and process noise at the filter's levels (Eqs. 5 and 6)."""
-        network, dropout = self.network, self.settings.dropout
+        network, dropout = self.network, self.dropout
 
         def loss_of(outputs: Tensor, targets: Tensor) -> Tensor:
-            said = self.said(outputs)
-            error = said.sideslip - targets.double() * network.unit.double()
-            likelihood = 0.5 * (said.variance.log() + error.square() / said.variance).mean(-1)
-            return likelihood + (said.process - levels).square().sum(-1).mean(-1)
+            found = self.output_of(outputs)
+            error = found.sideslip - targets.double() * network.unit.double()
+            likelihood = 0.5 * (found.variance.log() + error.square() / found.variance).mean(-1)
+            return likelihood + (found.process - levels).square().sum(-1).mean(-1)
 
         def losses(draw: Draw) -> Tensor:
             return loss_of(network(train.inputs[draw.rows], draw.seeds, dropout), train.targets[draw.rows])
@@ -264,8 +250,8 @@ class EndToEnd:
 
     def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:
         self.estimator, self.samples, self.recordings, self.training = estimator, samples, recordings, training
-        self.filter = estimator.track_filter()
-        self.sensors = estimator.sensor_noise()[1]
+        self.filter = TrackFilter(estimator.track(sees_sideslip=True))
+        self.sensors = estimator.noise_covariances(estimator.levels)[1]
         self.lengths = [len(recording) for recording in recordings]
         self.offsets = np.concatenate([[0], np.cumsum(self.lengths)])
         if max(self.lengths) < training.steps:
@@ -275,7 +261,7 @@ class EndToEnd:
             )
         taken = [estimator.taken(recording.stack(estimator.channels)) for recording in recordings]
         self.measured, self.driven = (torch.as_tensor(np.concatenate(part)) for part in zip(*taken, strict=True))
-        self.trusted = torch.as_tensor(np.concatenate([estimator.trusts(part[0][:, 0]) for part in taken]))
+        self.trusted = torch.as_tensor(np.concatenate([estimator.trusts_forces(part[0][:, 0]) for part in taken]))
         self.sideslip = torch.as_tensor(np.concatenate([reference_sideslip(recording) for recording in recordings]))
         motion = [np.stack([recording["vy_ref"], recording["yaw_rate"]], 1) for recording in recordings]
         self.states = torch.as_tensor(np.concatenate(motion))
@@ -310,20 +296,20 @@ class EndToEnd:
         """
         estimator = self.estimator
         count, steps = batch.sideslip.shape
-        outputs = estimator.network(batch.inputs.reshape(1, count * steps, -1), batch.seeds, estimator.settings.dropout)
+        outputs = estimator.network(batch.inputs.reshape(1, count * steps, -1), batch.seeds, estimator.dropout)
         outputs = outputs.reshape(count, steps, -1).double()
         lost = torch.zeros(count, dtype=torch.bool)
         if outputs.requires_grad:
             outputs.register_hook(lambda gradient: self._cleaned(gradient, batch, lost))
-        said = estimator.said(outputs)
+        found = estimator.output_of(outputs)
         initial = Gaussian(batch.start, torch.tensor(START, dtype=torch.float64).square().diag())
-        measurements = torch.cat([batch.measured, said.sideslip.unsqueeze(-1)], -1)
-        process, noise = torch.diag_embed(said.process.square()), observation_noise(self.sensors, batch.trusted, said.variance)
+        measurements = torch.cat([batch.measured, found.sideslip.unsqueeze(-1)], -1)
+        process, noise = torch.diag_embed(found.process.square()), with_variance(self.sensors[batch.trusted.long()], found.variance)
         filtered = self.filter.filtered(measurements, batch.driven, process, noise, initial).steps.filtered
         sideslip = torch.atan2(filtered.mean[..., 0], batch.driven[..., 0])
         finite = torch.isfinite(filtered.covariance.detach().sum((-1, -2)) + filtered.mean.detach().sum(-1))
         lost |= self._account(~finite, batch, "covariance")
-        errors = [(batch.sideslip - angle)[~lost].square().mean() for angle in (said.sideslip, sideslip)]
+        errors = [(batch.sideslip - angle)[~lost].square().mean() for angle in (found.sideslip, sideslip)]
         return (errors[0] + errors[1]) * (math.degrees(1.0) ** 2 if self.training.loss_unit == "deg" else 1.0)
 
     def _cleaned(self, gradient: Tensor, batch: Cuts, lost: Tensor) -> Tensor:

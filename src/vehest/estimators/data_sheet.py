@@ -1,49 +1,18 @@
-"""Baseline: steady cornering of a single track from what a data sheet says of the car; nothing is learnt."""
+"""Baseline: steady cornering of a single track from a data sheet; nothing is learnt."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.base import EstimatorSettings
-from vehest.estimators.baseline import Baseline
+from vehest.estimators.declared import setting
+from vehest.estimators.recursive import Recursive
 
 
-@dataclass(frozen=True)
-class DataSheetSettings(EstimatorSettings):
-    """What is known of the car.
-
-    Args:
-        wheelbase: [m]; has to be given.
-        cg_to_rear_axle: distance of the centre of gravity from the rear axle [m]; half the wheelbase if none is given.
-        cornering_coefficient: cornering stiffness of the rear axle over its load [1/rad].
-
-    Raises:
-        ConfigurationError: no wheelbase, or a value out of range.
-    """
-
-    wheelbase: float | None = None
-    cg_to_rear_axle: float | None = None
-    cornering_coefficient: float = 10.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.wheelbase is None:
-            raise ConfigurationError("estimator 'data_sheet' needs your car's wheelbase: estimator.wheelbase=2.7 [m]")
-        for name in ("wheelbase", "cornering_coefficient"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"estimator.{name} must be positive, not {getattr(self, name)}")
-        if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
-            raise ConfigurationError(
-                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
-            )
-
-
-class DataSheet(Baseline):
+class DataSheet(Recursive):
     """v = r (l_r - u² / (c g)): the static map of a car on linear tyres whose stiffness is c times their load.
 
     From the steady cornering of a linear single track, v = r (l_r - m l_f u² / (l C_r)): the rear axle carries m g l_f / l, and with
@@ -51,18 +20,39 @@ class DataSheet(Baseline):
     Dynamics, 1995); 10 is assumed where nothing better is known.
     """
 
-    name = "data_sheet"
-    title = "Data sheet"
+    name, title = "data_sheet", "Data sheet"
     channels = ("vx", "yaw_rate")
-    settings_type = DataSheetSettings
-    settings: DataSheetSettings
+    ignores_initial_state = True
+    template = "static"
+    wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", positive=True)
+    cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: half the wheelbase", unit="m")
+    cornering_coefficient: float = setting(10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True)
 
-    def lateral_velocity(self, samples: Mapping[str, FloatArray], start: float = 0.0) -> FloatArray:
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: no wheelbase, or a centre of gravity outside of it.
+        """
+        if self.wheelbase is None:
+            raise ConfigurationError("estimator 'data_sheet' needs your car's wheelbase: estimator.wheelbase=2.7 [m]")
+        if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
+            raise ConfigurationError(
+                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+            )
+
+    @property
+    def rear(self) -> float:
+        """Distance of the centre of gravity from the rear axle [m]."""
+        return self.wheelbase / 2.0 if self.cg_to_rear_axle is None else self.cg_to_rear_axle
+
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """r (l_r - u² / (c g)) [m/s]."""
-        s = self.settings
-        assert s.wheelbase is not None
-        rear = s.wheelbase / 2.0 if s.cg_to_rear_axle is None else s.cg_to_rear_axle
-        return samples["yaw_rate"] * (rear - np.square(samples["vx"]) / (s.cornering_coefficient * GRAVITY))
+        vx, yaw_rate = samples.T
+        return {"vy": yaw_rate * (self.rear - np.square(vx) / (self.cornering_coefficient * GRAVITY))}, state
+
+    def c_values(self) -> dict[str, Any]:
+        """What the data sheet says."""
+        about = "Steady cornering of a linear single track from a data sheet."
+        return {"about": about, "rear": self.rear, "stiffness": self.cornering_coefficient * GRAVITY}
 
 
 ESTIMATOR = DataSheet

@@ -5,31 +5,55 @@ from __future__ import annotations
 import fnmatch
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vehest.constants import FloatArray
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper
+from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.declared import Group, setting
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
-from vehest.estimators.filtering.single_track import checked_sample, require_positive
-from vehest.estimators.filtering.track_filter import Over, TrackFilter, TrackStepper, error_over, groups_of, in_nonlinear_range, padded
+from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.filtering.track_filter import (
+    KAPPA,
+    ROLLING,
+    UNKNOWN,
+    Over,
+    TrackFilter,
+    error_over,
+    groups_of,
+    in_nonlinear_range,
+    padded,
+)
 from vehest.estimators.references import reference_sideslip
-from vehest.filters.gating import Gate, in_words, suffix
+from vehest.filters.definiteness import MARGIN
+from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
+from vehest.filters.sigma_points import symmetric_rule
+from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
-from vehest.vehicle.dugoff import BMW_545I, TRACK_STATES, DugoffAxle, DugoffTrack, LoadedCar
+from vehest.vehicle.dugoff import (
+    BMW_545I,
+    LARGEST_RATIO,
+    LEAST_COSINE,
+    LEAST_LOAD,
+    LEAST_SHARE,
+    TRACK_STATES,
+    DugoffAxle,
+    DugoffTrack,
+    LoadedCar,
+)
 
 Inputs = Literal["full", "imu"]
 WHEELS = {"fy_front": ("fy_fl", "fy_fr"), "fy_rear": ("fy_rl", "fy_rr")}
@@ -49,108 +73,59 @@ BAD = 1e6  # rad², instead of a cost that is not finite
 
 
 @dataclass(frozen=True)
-class TrackLevels:
-    """Standard deviations; those that are not given are found by the fit.
+class TrackLevels(Group):
+    """Standard deviations; those that are not given are found by the fit."""
 
-    Args:
-        process_vy: of the lateral velocity, over one sample's step [m/s].
-        process_yaw_rate: of the yaw rate, over one sample's step [rad/s].
-        force_factor: by which the forces' is larger where the car behaves linearly [1]; only with forces.
-        ay: of the accelerometer [m/s²].
-        yaw_rate: of the gyroscope [rad/s].
-        fy_front: of the front axle's lateral force [N].
-        fy_rear: of the rear axle's lateral force [N].
-    """
-
-    process_vy: float | None = None
-    process_yaw_rate: float | None = None
-    force_factor: float | None = None
-    ay: float | None = None
-    yaw_rate: float | None = None
-    fy_front: float | None = None
-    fy_rear: float | None = None
-
-    def __post_init__(self) -> None:
-        require_positive("estimator.noise", asdict(self))
+    group = "estimator.noise"
+    process_vy: float | None = setting(None, "of the lateral velocity, over one sample's step", unit="m/s", positive=True)
+    process_yaw_rate: float | None = setting(None, "of the yaw rate, over one sample's step", unit="rad/s", positive=True)
+    force_factor: float | None = setting(None, "by which the forces' is larger where the car behaves linearly", positive=True)
+    ay: float | None = setting(None, "of the accelerometer", unit="m/s²", positive=True)
+    yaw_rate: float | None = setting(None, "of the gyroscope", unit="rad/s", positive=True)
+    fy_front: float | None = setting(None, "of the front axle's lateral force", unit="N", positive=True)
+    fy_rear: float | None = setting(None, "of the rear axle's lateral force", unit="N", positive=True)
 
 
 LEVELS = tuple(entry.name for entry in fields(TrackLevels))
 
 
 @dataclass(frozen=True)
-class AxleTyres:
-    """Dugoff's parameters of both axles, all or none; where they are not given, the fit finds them.
+class AxleTyres(Group):
+    """Dugoff's parameters of both axles, all or none; where they are not given, the fit finds them."""
 
-    Args:
-        cornering_stiffness_front: of the front axle [N/rad].
-        friction_front: of its tyres where they hardly slide [1].
-        reduction_front: share of that which is lost per m/s of sliding [s/m].
-        cornering_stiffness_rear: of the rear axle [N/rad].
-        friction_rear: likewise.
-        reduction_rear: likewise.
-    """
-
-    cornering_stiffness_front: float | None = None
-    friction_front: float | None = None
-    reduction_front: float | None = None
-    cornering_stiffness_rear: float | None = None
-    friction_rear: float | None = None
-    reduction_rear: float | None = None
+    group = "estimator.tyres"
+    cornering_stiffness_front: float | None = setting(None, "of the front axle", unit="N/rad", positive=True)
+    friction_front: float | None = setting(None, "of its tyres where they hardly slide", positive=True)
+    reduction_front: float | None = setting(None, "share of that which is lost per m/s of sliding", unit="s/m")
+    cornering_stiffness_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
+    friction_rear: float | None = setting(None, "likewise", positive=True)
+    reduction_rear: float | None = setting(None, "likewise", unit="s/m")
 
     def __post_init__(self) -> None:
-        given = {name: value for name, value in asdict(self).items() if value is not None}
+        super().__post_init__()
+        given = [value for value in asdict(self).values() if value is not None]
         if given and len(given) < len(TYRES):
             raise ConfigurationError(f"estimator.tyres: give all of {', '.join(TYRES)}, or none of them")
-        require_positive("estimator.tyres", {name: value for name, value in given.items() if not name.startswith("reduction")})
 
 
 TYRES = tuple(entry.name for entry in fields(AxleTyres))
 
 
-@dataclass(frozen=True)
-class DugoffUkfSettings(EstimatorSettings):
-    """Settings of the filter.
+class PseudoMeasurement(NamedTuple):
+    """What a network adds to T samples.
 
-    Args:
-        inputs: ``full``: tyre forces are measured too; ``imu``: yaw rate and lateral acceleration alone, as on any car.
-        curve: ``plain`` (Eq. 9) or ``smooth`` (Eq. 10) tyres.
-        minimum_speed: speed below which wheels roll without slip, and nothing counts as measured [m/s].
-        nonlinear_from: |ay| from which the car behaves non-linearly, so that forces are trusted [m/s²].
-        linear_below: |ay| down to which it then stays so [m/s²].
-        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
-        correlated_samples: over how many samples the errors of what sensors measure are alike, by which the variance of each is taken
-            larger, since the filter takes them for independent; about ``rate_hz / (2 f)`` of white noise behind a low-pass of f Hz.
-        noise: levels of noise.
-        tyres: of both axles.
-        car: the car.
+    Attributes:
+        sideslip: β_DD, (T,) [rad].
+        variance: of the measurement that the filter takes it for, (T,) [rad²].
+        process: variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's own.
     """
 
-    rate_hz: float = 100.0
-    inputs: Inputs = "full"
-    curve: Literal["plain", "smooth"] = "plain"
-    minimum_speed: float = 3.0
-    nonlinear_from: float = 4.0
-    linear_below: float = 3.0
-    gate: float | None = None
-    correlated_samples: float = 1.0
-    noise: TrackLevels = TrackLevels()
-    tyres: AxleTyres = AxleTyres()
-    car: LoadedCar = BMW_545I
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, options in (("inputs", tuple(CHANNELS)), ("curve", ("plain", "smooth"))):
-            if getattr(self, name) not in options:
-                raise ConfigurationError(f"estimator.{name} '{getattr(self, name)}' is not one of: {', '.join(options)}")
-        positive = {"minimum_speed": self.minimum_speed, "gate": self.gate, "correlated_samples": self.correlated_samples}
-        require_positive("estimator", positive)
-        if not 0.0 <= self.linear_below <= self.nonlinear_from:
-            raise ConfigurationError(
-                f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
-            )
+    sideslip: FloatArray
+    variance: FloatArray
+    process: FloatArray | None = None
 
 
-class DugoffUkf(Estimator):
+class DugoffUkf(SigmaPointEstimator):
     """Unscented filter of lateral velocity and yaw rate over `DugoffTrack`.
 
     Measured are lateral acceleration, yaw rate and, if wanted, the lateral forces of both axles; forward speed, steering angle and
@@ -159,25 +134,54 @@ class DugoffUkf(Estimator):
     Source: Bertipaglia et al. 2024, Sections III-B and IV-C.
     """
 
-    name = "dugoff_ukf"
-    title = "UKF with Dugoff tyres"
-    settings_type = DugoffUkfSettings
-    training_type = IdentificationSettings
-    skippable = ("yaw_rate", "ay", *CHANNELS["full"][len(INERTIAL) :])
+    name, title = "dugoff_ukf", "UKF with Dugoff tyres"
+    training_type: ClassVar[type] = IdentificationSettings
+    template = "track_ukf"
+    refuses = ("NaN", "infinite")
+    skippable: ClassVar[tuple[str, ...]] = ("yaw_rate", "ay", *CHANNELS["full"][len(INERTIAL) :])
+    states = TRACK_STATES
+    covariance_of = TRACK_STATES
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
-    settings: DugoffUkfSettings
+    inputs: Inputs = setting("full", "full: tyre forces are measured too; imu: yaw rate and lateral acceleration alone, as on any car")
+    curve: Literal["plain", "smooth"] = setting("plain", "tyres of Eq. 9 (plain) or 10 (smooth)")
+    minimum_speed: float = setting(
+        3.0, "speed below which wheels roll without slip, and nothing counts as measured", unit="m/s", positive=True
+    )
+    nonlinear_from: float = setting(4.0, "|ay| from which the car behaves non-linearly, so that forces are trusted", unit="m/s²")
+    linear_below: float = setting(3.0, "|ay| down to which it then stays so", unit="m/s²", least=0.0)
+    gate: float | None = setting(
+        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
+    )
+    correlated_samples: float = setting(
+        1.0,
+        "samples over which errors of sensors are alike, by which their variance is larger; about rate_hz / (2 f) of white noise behind a "
+        "low-pass of f Hz",
+        positive=True,
+    )
+    noise: TrackLevels = setting(TrackLevels(), "levels of noise")
+    tyres: AxleTyres = setting(AxleTyres(), "of both axles")
+    car: LoadedCar = setting(BMW_545I, "parameters of the car")
 
-    def __init__(self, settings: DugoffUkfSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.channels = CHANNELS[settings.inputs]
-        self.tyres = np.array([_number(getattr(settings.tyres, name)) for name in TYRES])
+        self.channels = CHANNELS[self.inputs]
+        self.axle_tyres = np.array([_number(getattr(settings.tyres, name)) for name in TYRES])
         self.levels = {name: _number(getattr(settings.noise, name)) for name in self.level_names}
         self._seed = 0
+
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: thresholds of the non-linear range in the wrong order.
+        """
+        if not self.linear_below <= self.nonlinear_from:
+            raise ConfigurationError(
+                f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
+            )
 
     @property
     def level_names(self) -> tuple[str, ...]:
         """Levels of noise that these inputs need."""
-        return (*SEARCHED[self.settings.inputs], *SENSORS[self.settings.inputs])
+        return (*SEARCHED[self.inputs], *SENSORS[self.inputs])
 
     @property
     def variant(self) -> str:
@@ -188,7 +192,7 @@ class DugoffUkf(Estimator):
     @property
     def full_title(self) -> str:
         """Title with what is measured, and the gate."""
-        return f"{self.title}, {'with' if self.settings.inputs == 'full' else 'without'} tyre forces{in_words(self.settings.gate)}"
+        return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{in_words(self.gate)}"
 
     @property
     def learns(self) -> bool:
@@ -198,14 +202,19 @@ class DugoffUkf(Estimator):
     @property
     def n_parameters(self) -> int:
         """Tyre parameters and levels of noise that are not given."""
+        return self.n_identified
+
+    @property
+    def n_identified(self) -> int:
+        """Numbers that the identification of tyres and noise finds."""
         return len(TYRES) * (not self._tyres_given) + len(self._unknown(self.level_names))
 
     @property
     def _tyres_given(self) -> bool:
-        return self.settings.tyres.friction_front is not None
+        return self.tyres.friction_front is not None
 
     def _unknown(self, names: Sequence[str]) -> list[str]:
-        return [name for name in names if getattr(self.settings.noise, name) is None]
+        return [name for name in names if getattr(self.noise, name) is None]
 
     def seed(self, seed: int) -> None:
         """Seed of the genetic searches and of Optuna's trials."""
@@ -217,18 +226,19 @@ class DugoffUkf(Estimator):
         Raises:
             ConfigurationError: the tyres are neither given nor identified.
         """
-        if np.isnan(self.tyres).any():
+        if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres")
         s = self.settings
-        front, rear = (DugoffAxle(*self.tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6)))
+        front, rear = (DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6)))
         return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed, sees_sideslip)
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Identify tyres, read sensors' levels, find the process noise, each where it is not given; see `IdentificationSettings`."""
-        return [member._fit_one(data, training, context) for member in members if isinstance(member, DugoffUkf)]
+        return [member.identify(data, training, context) for member in members]
 
-    def _fit_one(self, data: FitData, training: IdentificationSettings, context: FitContext) -> FitRecord:
+    def identify(self, data: FitData, training: IdentificationSettings, context: FitContext) -> FitRecord:
+        """Fit tyres and levels."""
         started = time.monotonic()
         metrics: dict[str, float] = {"epochs": 0}
         history: dict[str, list[float]] = {}
@@ -236,7 +246,7 @@ class DugoffUkf(Estimator):
         if not self._tyres_given:
             metrics |= self._identify(data.train, training)
         self.levels |= self._sensor_levels(data.train)
-        searched = self._unknown(SEARCHED[self.settings.inputs])
+        searched = self._unknown(SEARCHED[self.inputs])
         if training.method == "data":
             self.levels |= {name: ASSUMED[name] for name in searched}
         elif searched:
@@ -247,7 +257,7 @@ class DugoffUkf(Estimator):
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
         if data.validation and all("vy_ref" in recording for recording in data.validation):
-            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds, over=training.error)
+            metrics["best_validation_loss"] = finite(self.mean_squared_error(data.validation, training.skip_seconds, over=training.error))
         metrics |= {f"noise_{name}": self.levels[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
@@ -271,18 +281,18 @@ class DugoffUkf(Estimator):
             restarts=training.restarts,
             generations=training.generations,
         )
-        self.tyres = np.array([getattr(axle, name) for axle in (fit.front, fit.rear) for name in DUGOFF_PARAMETERS])
+        self.axle_tyres = np.array([getattr(axle, name) for axle in (fit.front, fit.rear) for name in DUGOFF_PARAMETERS])
         spread = dict(zip((f"{name}_spread" for name in TYRES), fit.spread.ravel().tolist(), strict=True))
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
-        return {**dict(zip(TYRES, self.tyres.tolist(), strict=True)), **spread, **rms}
+        return {**dict(zip(TYRES, self.axle_tyres.tolist(), strict=True)), **spread, **rms}
 
     def _sensor_levels(self, recordings: Sequence[Recording]) -> dict[str, float]:
         """Standard deviations of what is measured at speed where the steering angle deviates least from a straight line."""
-        pieces = max(3, round(QUIET_SECONDS * self.settings.rate_hz))
+        pieces = max(3, round(QUIET_SECONDS * self.rate_hz))
         found = {}
-        for name in self._unknown(SENSORS[self.settings.inputs]):
+        for name in self._unknown(SENSORS[self.inputs]):
             series = [
-                np.where(recording["vx"] < self.settings.minimum_speed, np.nan, recording.stack(WHEELS.get(name, (name,))).sum(1))
+                np.where(recording["vx"] < self.minimum_speed, np.nan, recording.stack(WHEELS.get(name, (name,))).sum(1))
                 for recording in recordings
             ]
             try:
@@ -305,7 +315,7 @@ class DugoffUkf(Estimator):
 
         def cost(powers: FloatArray) -> float:
             levels = self.levels | dict(zip(searched, (10.0**powers).tolist(), strict=True))
-            return self._mean_squared_error(recordings, training.skip_seconds, levels, training.error)
+            return finite(self.mean_squared_error(recordings, training.skip_seconds, levels, training.error))
 
         limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
         boxes = [limits[name] for name in searched]
@@ -313,30 +323,30 @@ class DugoffUkf(Estimator):
             return staged_optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
 
-    def _mean_squared_error(
-        self, recordings: Sequence[Recording], skip_seconds: float, levels: Mapping[str, float] | None = None, over: Over = "samples"
+    def mean_squared_error(
+        self,
+        recordings: Sequence[Recording],
+        skip_seconds: float = 0.0,
+        levels: Mapping[str, float] | None = None,
+        over: Over = "samples",
+        pseudo: Sequence[PseudoMeasurement] | None = None,
     ) -> float:
         """Of sideslip [rad²], over samples fast enough for the model; see `error_over`."""
-        skip = round(skip_seconds * self.settings.rate_hz)
+        skip = round(skip_seconds * self.rate_hz)
         sums: list[tuple[float, int]] = []
-        for rows, steps in self._filtered(recordings, levels=levels):
+        for rows, steps in self.filtered(recordings, levels=levels, pseudo=pseudo):
             for row, states in zip(rows, steps.filtered.mean.numpy(), strict=True):
-                recording = recordings[row]
-                vx, reference = recording["vx"], reference_sideslip(recording)
+                vx, reference = recordings[row]["vx"], reference_sideslip(recordings[row])
                 error = np.arctan2(states[: len(vx), 0], vx) - reference
-                counted = (vx >= self.settings.minimum_speed) & np.isfinite(reference)
+                counted = (vx >= self.minimum_speed) & np.isfinite(reference)
                 counted[:skip] = False
                 sums.append((float(np.square(error[counted]).sum()), int(counted.sum())))
-        value = error_over(sums, over)
-        return value if math.isfinite(value) else BAD
-
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        return self._estimate_all([recording], [initial_state])[0]
+        return error_over(sums, over)
 
     def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
         """Recordings of similar length are filtered together."""
         estimates: dict[int, Estimate] = {}
-        for rows, steps in self._filtered(recordings, states, gate=self.gate()):
+        for rows, steps in self.filtered(recordings, states, gate=self.gate_in_use(), pseudo=self.pseudo_measurements(recordings)):
             mean, covariance = (part.numpy() for part in steps.filtered)
             nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1).numpy()
             dof = torch.as_tensor(steps.measured).sum(-1).double().numpy()
@@ -347,37 +357,53 @@ class DugoffUkf(Estimator):
                 estimates[row] = self._wrapped(recordings[row], vy, own, TRACK_STATES, **others)
         return [estimates[row] for row in range(len(recordings))]
 
-    def _filtered(
+    def pseudo_measurements(self, recordings: Sequence[Recording]) -> list[PseudoMeasurement] | None:
+        """Of a network behind each recording; none: there is no network."""
+        return None
+
+    def filtered(
         self,
         recordings: Sequence[Recording],
         states: Sequence[Mapping[str, float] | None] | None = None,
         levels: Mapping[str, float] | None = None,
         gate: Gate | None = None,
+        pseudo: Sequence[PseudoMeasurement] | None = None,
     ) -> Iterator[tuple[list[int], Filtered[Tensor]]]:
         """Rows of recordings that were filtered together, padded to the longest, and what came of them.
 
-        Levels are found without a gate, which noise that is too small would close.
+        Levels are found, and networks learn, without a gate: noise that is too small would close it.
         """
-        model = TrackFilter(self.track())
+        model = TrackFilter(self.track(sees_sideslip=pseudo is not None))
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
-            parts = [samples_of(recordings[row].stack(self.channels)) for row in rows]
-            measurements = torch.as_tensor(padded([part[0] for part in parts], np.nan))
+            parts = [self.taken(recordings[row].stack(self.channels)) for row in rows]
+            seen, steps_noise = [part[0] for part in parts], process
+            if pseudo is not None:
+                own = [pseudo[row] for row in rows]
+                seen = [np.column_stack([one, added.sideslip]) for one, added in zip(seen, own, strict=True)]
+                if own[0].process is not None:
+                    steps_noise = torch.diag_embed(torch.as_tensor(padded([added.process for added in own], None)))  # type: ignore[misc]
+            measurements = torch.as_tensor(padded(seen, np.nan))
             inputs = torch.as_tensor(padded([part[1] for part in parts], None))
-            trusted = torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()]))
+            noise = sensors[torch.as_tensor(np.stack([self.trusts_forces(ay) for ay in measurements[..., 0].numpy()])).long()]
+            if pseudo is not None:
+                noise = with_variance(noise, torch.as_tensor(padded([added.variance[:, None] for added in own], None)[..., 0]))
             given = None if states is None else [states[row] for row in rows]
             with torch.no_grad():
                 initial = model.start(inputs[:, 0], given)
-                outcome = model.filtered(measurements, inputs, process, sensors[trusted.long()], initial, gate)
-            yield rows, outcome.steps
+                yield rows, model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps
 
-    def gate(self) -> Gate | None:
+    def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
+        return samples_of(samples[:, : len(CHANNELS[self.inputs])])
+
+    def gate_in_use(self) -> Gate | None:
         """That of the filter in use."""
-        return Gate.of(self.settings.gate, self.settings.rate_hz)
+        return Gate.of(self.gate, self.rate_hz)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
-        return in_nonlinear_range(ay, self.settings.nonlinear_from, self.settings.linear_below, before)
+        return in_nonlinear_range(ay, self.nonlinear_from, self.linear_below, before)
 
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of measurements where the car is linear and where it is not, (2, 4, 4).
@@ -390,43 +416,110 @@ class DugoffUkf(Estimator):
         process = torch.tensor([levels["process_vy"], levels["process_yaw_rate"]], dtype=torch.float64).square().diag()
         factor = levels.get("force_factor", 1.0)
         rows = [[levels["ay"], levels["yaw_rate"], *(own * levels.get(name, 1.0) for name in WHEELS)] for own in (factor, 1.0)]
-        alike = self.settings.correlated_samples
+        alike = self.correlated_samples
         return process, torch.diag_embed(torch.tensor(rows, dtype=torch.float64).square() * alike)
 
-    def online(self) -> DugoffUkfStepper:
-        """A stepper that starts from the first sample it sees."""
-        return DugoffUkfStepper(self)
+    def new_filter(self, first: FilterStep) -> UnscentedStepper:
+        """Straight ahead and unknown, or rolling."""
+        own = TrackFilter(self.track(sees_sideslip=len(first.measurement) > 4))
+        mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
+        return UnscentedStepper(own.model(torch.float64), mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
+
+    def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
+        """Measurements as far as the car is fast enough, and the noise of the range that it is in."""
+        if not memory:
+            process, sensors = (noise.numpy() for noise in self.noise_covariances(self.levels))
+            memory |= {"process": process, "noise": process, "sensors": sensors, "trusts": False}
+        measurements, inputs = (part[0] for part in self.taken(sample[None]))
+        memory["trusts"] = bool(self.trusts_forces(measurements[:1], memory["trusts"])[0])
+        noise, process = memory["sensors"][int(memory["trusts"])], memory["noise"]
+        memory["noise"] = memory["process"]
+        measurements, noise = self.with_pseudo(sample, measurements, noise, memory)
+        if inputs[0] < self.minimum_speed:
+            measurements, memory["noise"] = np.full_like(measurements, np.nan), ROLLING
+        return FilterStep(measurements, inputs, process[None], noise[None])
+
+    def with_pseudo(
+        self, sample: FloatArray, measurement: FloatArray, noise: FloatArray, memory: dict[str, Any]
+    ) -> tuple[FloatArray, FloatArray]:
+        """A measurement (m,) and its covariance with those that a network adds, whose process noise is left in ``memory``."""
+        return measurement, noise
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Tyre parameters in the order of `AxleTyres`, and levels of noise in that of `level_names`."""
-        return {"tyres": self.tyres.copy(), "levels": np.array([self.levels[name] for name in self.level_names])}
+        return {"tyres": self.axle_tyres.copy(), "levels": np.array([self.levels[name] for name in self.level_names])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take tyres and levels back."""
-        shapes = {name: values.shape for name, values in self.weights().items()}
+        shapes = {name: values.shape for name, values in DugoffUkf.weights(self).items()}
         if {name: values.shape for name, values in weights.items()} != shapes:
             raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)} of these inputs, not {', '.join(weights)}")
-        self.tyres = np.array(weights["tyres"], dtype=np.float64)
+        self.axle_tyres = np.array(weights["tyres"], dtype=np.float64)
         self.levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
 
+    def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
+        """``vy_ref`` where a level is searched, or tyres are identified without a sideslip angle."""
+        if training.method != "data" and self._unknown(SEARCHED[self.inputs]):
+            return ("vy_ref",)
+        return () if self._tyres_given or "sideslip_ref" in channels else ("vy_ref",)
 
-class DugoffUkfStepper(Stepper):
-    """The filter, one sample at a time."""
+    def unmatched(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
+        """Where no recording matches the pattern that names those to identify tyres on."""
+        if self._tyres_given or any(fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings):
+            return ()
+        return ("training.tyres_from='*'",)
 
-    def __init__(self, estimator: DugoffUkf) -> None:
-        self._estimator = estimator
-        self._filter = TrackStepper(TrackFilter(estimator.track()), estimator.gate())
-        self._process, self._sensors = (noise.numpy() for noise in estimator.noise_covariances(estimator.levels))
-        self._trusts = False
+    def c_values(self) -> dict[str, Any]:
+        """The filter alone."""
+        s = self.settings
+        car, forces = s.car, s.inputs == "full"
+        wheelbase = car.cg_to_front_axle + car.cg_to_rear_axle
+        process, sensors = self.noise_covariances(self.levels)
+        measured = 4 if forces else 2  # forces that are never measured need no row
+        return {
+            "network": False,
+            **gate_values(self.gate_in_use()),
+            "n": len(TRACK_STATES),
+            "m": measured,
+            "rule": symmetric_rule(len(TRACK_STATES), KAPPA),
+            "lower": None,
+            "repair": True,
+            "margin": MARGIN,
+            "forces": forces,
+            "smooth": s.curve == "smooth",
+            "car": car,
+            "step": 1.0 / s.rate_hz,
+            "transfer": car.cg_height / wheelbase,
+            "load_front": GRAVITY * car.cg_to_rear_axle / wheelbase,
+            "load_rear": GRAVITY * car.cg_to_front_axle / wheelbase,
+            "minimum_speed": s.minimum_speed,
+            "rolling": np.square(UNKNOWN),
+            "process": process.diagonal().numpy(),
+            "sensors": sensors.diagonal(dim1=-2, dim2=-1).numpy()[:, :measured],
+            "front": self.axle_tyres[:3],
+            "rear": self.axle_tyres[3:],
+            "nonlinear_from": s.nonlinear_from,
+            "linear_below": s.linear_below,
+            "largest": LARGEST_RATIO[s.curve],
+            "least_share": LEAST_SHARE,
+            "least_load": LEAST_LOAD,
+            "least_cosine": LEAST_COSINE,
+        }
 
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Lateral velocity [m/s] and yaw rate [rad/s] at the time of the sample; measurements that are NaN are skipped."""
-        estimator = self._estimator
-        row = checked_sample(sample, estimator.channels, estimator.skippable)
-        measurements, inputs = samples_of(row[None])
-        self._trusts = bool(estimator.trusts_forces(measurements[:, 0], self._trusts)[0])
-        state = self._filter.step(measurements[0], inputs[0], self._process, self._sensors[int(self._trusts)])
-        return dict(zip(TRACK_STATES, state.tolist(), strict=True)) | {"vy_variance": self._filter.variance}
+
+def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
+    """Covariances of what sensors measure and a network adds, (..., 5, 5), differentiable in the variance.
+
+    Args:
+        sensors: of the four measured numbers, diagonal, (..., 4, 4).
+        variance: of the network's angle (...) [rad²].
+    """
+    return torch.diag_embed(torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1))
+
+
+def finite(error: float) -> float:
+    """An error, or a large one instead of one that is not finite."""
+    return error if math.isfinite(error) else BAD
 
 
 def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:

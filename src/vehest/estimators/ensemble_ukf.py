@@ -13,9 +13,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.declared import setting
+from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, NetworkUkfSettings, Word
-from vehest.estimators.networks.sample_network import SampleNetwork, believed, learnt_samples
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
+from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
 from vehest.estimators.phase_records import record_of_phases
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
@@ -28,26 +30,6 @@ BOX = ((-6.0, 4.0), (0.2, 2.0))
 STARTS = ((-2.0, 2.0), (0.5, 1.5))
 LEAST_SPREAD = 1e-12  # rad², of models that agree to the last digit
 MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within [rad²]
-
-
-@dataclass(frozen=True)
-class EnsembleUkfSettings(NetworkUkfSettings):
-    """Settings of the filter, of its networks, and of how they are put together.
-
-    Args:
-        members: networks M of the ensemble.
-        variance: ``models``, that of the networks' angles, as in the paper; or ``mixture``, with the mean of their own variances on top.
-    """
-
-    members: int = 20
-    variance: Literal["models", "mixture"] = "models"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.members < 2:
-            raise ConfigurationError(f"estimator.members must be at least 2, since one network alone has no spread, not {self.members}")
-        if self.variance not in ("models", "mixture"):
-            raise ConfigurationError(f"estimator.variance '{self.variance}' is not one of: models, mixture")
 
 
 @dataclass(frozen=True)
@@ -80,13 +62,14 @@ class EnsembleUkf(NetworkUkf):
     predictive uncertainty estimation using deep ensembles, 2017.
     """
 
-    name = "ensemble_ukf"
-    title = "UKF with a deep ensemble"
-    settings_type = EnsembleUkfSettings
+    name, title = "ensemble_ukf", "UKF with a deep ensemble"
     training_type = EnsembleSettings
-    settings: EnsembleUkfSettings
+    members: int = setting(20, "networks M of the ensemble; one alone has no spread", least=2)
+    variance: Literal["models", "mixture"] = setting(
+        "models", "that of the networks' angles, as in the paper, or with the mean of their own variances on top"
+    )
 
-    def __init__(self, settings: EnsembleUkfSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.scaling = np.array([0.0, 1.0])
 
@@ -95,15 +78,17 @@ class EnsembleUkf(NetworkUkf):
         """With p₁ and p₂."""
         return super().n_parameters + len(self.scaling)
 
-    def _new_network(self) -> SampleNetwork:
-        return SampleNetwork(len(self.inputs), self.settings.hidden, 2, self.settings.members)
+    def new_network(self) -> SampleNetwork:
+        """From a sample to an angle and its variance, by each member."""
+        return SampleNetwork(len(self.network_inputs), self.hidden, 2, self.members)
 
-    def _fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
-        slow = self.settings.minimum_speed
-        raw, judged = (learnt_samples(part, self.inputs, self.name, slow) for part in (data.train, data.validation))
-        network = self.network = self._new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.settings.normalisation)
-        streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.settings.members, np.uint64) >> np.uint64(1)
+    def fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
+        """Networks, then the scaling of their variance."""
+        slow = self.minimum_speed
+        raw, judged = (learnt_samples(part, self.network_inputs, self.name, slow) for part in (data.train, data.validation))
+        network = self.network = self.new_network().to(getattr(torch, training.dtype))
+        network.scale(*raw, self.normalisation)
+        streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.members, np.uint64) >> np.uint64(1)
         network.reset([torch.Generator().manual_seed(int(stream)) for stream in streams])
         train, validation = network.samples(*raw), network.samples(*judged)
         phase = sample_phase(
@@ -112,9 +97,9 @@ class EnsembleUkf(NetworkUkf):
             training.phase,
             training.batch_size,
             len(train.targets),
-            self.settings.members,
-            lambda draw: network.losses(train, draw, self.settings.dropout, gaussian_likelihood),
-            lambda: network.judged(validation, gaussian_likelihood),
+            self.members,
+            lambda draw: network.losses(train, draw, self.dropout, gaussian_likelihood),
+            lambda: network.validation_losses(validation, gaussian_likelihood),
         )
         record = record_of_phases(train_phases([phase], self._seed, context, index, training.checkpoint_seconds))
         if record.interrupted or training.identification.method == "data":
@@ -130,31 +115,35 @@ class EnsembleUkf(NetworkUkf):
         return FitRecord(record.history, {**record.metrics, **found}, search.interrupted)
 
     def _search(self, recordings: Sequence[Recording], training: EnsembleSettings, context: FitContext) -> SearchRecord:
-        told = [self._told(recording.stack(self.inputs)) for recording in recordings]
+        found = [self._mean_and_variance(recording.stack(self.network_inputs)) for recording in recordings]
         how = training.identification
         quiet = FitContext(should_stop=context.should_stop)
 
         def cost(scaling: FloatArray) -> float:
-            words = [Word(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in told]
-            error = self.mean_squared_error(recordings, words, how.skip_seconds, how.error)
-            return error if np.isfinite(error) else 1e6
+            pseudo = [PseudoMeasurement(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in found]
+            return finite(self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo))
 
         if how.method == "optuna":
             return staged_optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
         return nelder_mead_over_grid(cost, BOX, STARTS, how.search, quiet)
 
-    def _told(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""
-        said, unit = self.network.said(inputs), float(self.network.unit)
-        variance = said[..., 0].var(axis=0)
-        if self.settings.variance == "mixture":
-            variance = variance + np.logaddexp(said[..., 1], 0.0).mean(axis=0)
-        return believed(unit * said[..., 0].mean(axis=0)), unit**2 * variance
+        outputs, unit = self.network.outputs(inputs), float(self.network.unit)
+        variance = outputs[..., 0].var(axis=0)
+        if self.variance == "mixture":
+            variance = variance + np.logaddexp(outputs[..., 1], 0.0).mean(axis=0)
+        return clip_sideslip(unit * outputs[..., 0].mean(axis=0)), unit**2 * variance
 
-    def word(self, inputs: FloatArray) -> Word:
+    def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:
         """Mean of the networks, and its scaled variance."""
-        sideslip, variance = self._told(inputs)
-        return Word(sideslip, scaled_variance(variance, self.scaling))
+        sideslip, variance = self._mean_and_variance(inputs)
+        return PseudoMeasurement(sideslip, scaled_variance(variance, self.scaling))
+
+    def c_values(self) -> dict[str, Any]:
+        """With the scaling of the variance."""
+        own = {"scaling": self.scaling, "mixture": self.variance == "mixture"}
+        return {**super().c_values(), **own, "least_spread": LEAST_SPREAD, "most_size": MOST_SIZE}
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Those of filter and networks, and p₁ and p₂."""
@@ -170,7 +159,7 @@ class EnsembleUkf(NetworkUkf):
 
 
 def scaled_variance(variance: FloatArray, scaling: FloatArray) -> FloatArray:
-    """10^p₁ (σ²)^p₂, and ε on top so that no filter takes a network's word for the truth; (T,) [rad²] (Eq. 11)."""
+    """10^p₁ (σ²)^p₂, and ε on top so that no filter takes it for exact; (T,) [rad²] (Eq. 11)."""
     size = scaling[0] + scaling[1] * np.log10(np.maximum(variance, LEAST_SPREAD))
     return LEAST_VARIANCE + 10.0 ** np.clip(size, *MOST_SIZE)
 

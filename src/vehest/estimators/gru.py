@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork, RecurrentSettings
+from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork
 
 
 class GruNetwork(RecurrentNetwork):
@@ -19,7 +19,7 @@ class GruNetwork(RecurrentNetwork):
     Source: Cho et al. 2014; Gräber et al., IEEE T-IV 4 (1), 2019.
     """
 
-    def __init__(self, settings: RecurrentSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings, n_gates=3, n_channels=4)
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
@@ -47,6 +47,11 @@ class Gru(RecurrentEstimator):
     name = "gru"
     title = "GRU"
     network_type = GruNetwork
+
+    @classmethod
+    def drawn(cls, variant: str) -> tuple[str, str, str]:
+        """Purple."""
+        return "#8e24aa", "solid", "D"
 
 
 ESTIMATOR = Gru

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from copy import copy
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -15,10 +15,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.filtering.single_track import SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
-from vehest.filters.gating import Gate, in_words, suffix
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.estimators.base import FitData, FitRecord, Stepper
+from vehest.estimators.declared import Group, setting
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
+from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.noise_levels import high_passed_level
@@ -29,31 +30,16 @@ SILENT = 1e-9  # rad/s, m/s², rad: a level below it is no noise but rounding
 
 
 @dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviations of the sensors' noise, given, or else read off measured signals above a frequency.
+class SensorNoise(Group):
+    """Standard deviations of the sensors' noise, given, or else read off measured signals above a frequency."""
 
-    Args:
-        read_from: ``training`` (the recordings of the fit) or ``recording`` (each recording that is estimated, as a whole).
-        yaw_rate: [rad/s]; read if none is given.
-        ay: [m/s²]; read if none is given.
-        steer: [rad]; read if none is given.
-        cutoff: frequency above which signals count as noise, as a fraction of the Nyquist frequency.
-        steer_factor: by which the steering's level is multiplied.
-    """
-
-    read_from: Literal["training", "recording"] = "training"
-    yaw_rate: float | None = None
-    ay: float | None = None
-    steer: float | None = None
-    cutoff: float = 0.2
-    steer_factor: float = 1000.0
-
-    def __post_init__(self) -> None:
-        if self.read_from not in ("training", "recording"):
-            raise ConfigurationError(f"estimator.noise.read_from '{self.read_from}' is not one of: training, recording")
-        require_positive("estimator.noise", {name: getattr(self, name) for name in (*LEVELS, "steer_factor")})
-        if not 0.0 < self.cutoff < 0.8:
-            raise ConfigurationError(f"estimator.noise.cutoff must lie between 0 and 0.8 of the Nyquist frequency, not at {self.cutoff}")
+    group = "estimator.noise"
+    read_from: Literal["training", "recording"] = setting("training", "recordings of the fit, or each recording as a whole (offline)")
+    yaw_rate: float | None = setting(None, "null: read off", unit="rad/s", positive=True)
+    ay: float | None = setting(None, "null: read off", unit="m/s²", positive=True)
+    steer: float | None = setting(None, "null: read off", unit="rad", positive=True)
+    cutoff: float = setting(0.2, "fraction of the Nyquist frequency above which signals count as noise", above=0.0, below=0.8)
+    steer_factor: float = setting(1000.0, "factor of the steering's level, as in the authors' code", positive=True)
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -62,23 +48,16 @@ class SensorNoise:
 
 
 @dataclass(frozen=True)
-class SensorOffsets:
+class SensorOffsets(Group):
     """Offsets that are states, first-order Gauss-Markov processes: an error that is constant within a manoeuvre is in the covariance.
-
-    Args:
-        ay: standard deviation of the accelerometer's offset, or of the road's bank [m/s²]; none: no such state.
-        steer: of the steering angle's [rad]; none: no such state.
-        seconds: how long an offset lasts: its correlation falls to 1/e [s].
 
     Source: Bar-Shalom, Li & Kirubarajan 2001 (autocorrelated noise by augmentation).
     """
 
-    ay: float | None = None
-    steer: float | None = None
-    seconds: float = 60.0
-
-    def __post_init__(self) -> None:
-        require_positive("estimator.offsets", asdict(self))
+    group = "estimator.offsets"
+    ay: float | None = setting(None, "of the accelerometer, or of the road's bank; null: no state", unit="m/s²", positive=True)
+    steer: float | None = setting(None, "of the steering angle; null: no state", unit="rad", positive=True)
+    seconds: float = setting(60.0, "time in which an offset's correlation falls to 1/e", unit="s", positive=True)
 
     @property
     def given(self) -> tuple[str, ...]:
@@ -86,160 +65,110 @@ class SensorOffsets:
         return tuple(name for name in ("ay", "steer") if getattr(self, name) is not None)
 
 
-@dataclass(frozen=True)
-class KalmanSettings(SingleTrackSettings):
-    """Settings of the Kalman filter.
-
-    Args:
-        noise: levels of the sensors' noise.
-        offsets: of sensors, that are states beside β and r.
-        initial_deviation: standard deviation of β and r before the first sample [rad, rad/s].
-        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
-    """
-
-    noise: SensorNoise = SensorNoise()
-    offsets: SensorOffsets = SensorOffsets()
-    initial_deviation: float = 100.0
-    gate: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive("estimator", {"initial_deviation": self.initial_deviation, "gate": self.gate})
-
-
-class KalmanFilter(SingleTrackEstimator):
+class KalmanFilter(SideslipFilter):
     """Kalman filter of sideslip angle and yaw rate, which measures a_y and r; the steering angle is a noisy input.
 
-    Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels are standard deviations of the
-    high-passed signals; no reference is looked at.
+    Process noise (σ_δ · factor)² B Bᵀ, measurement noise diag(σ_ay², σ_r²). The three levels, which are `values`, are standard deviations
+    of the high-passed signals; no reference is looked at.
 
     Source: Leanza, Reina & Blanco-Claraco, Sensors 21 (16), 5409, 2021, and the authors' public code.
     """
 
-    name = "kalman"
-    title = "Kalman filter"
+    name, title = "kalman", "Kalman filter"
+    learns_from = ()
     open_weights = LEVELS
-    settings_type = KalmanSettings
-    settings: KalmanSettings
+    template = "kalman"
+    noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
+    offsets: SensorOffsets = setting(SensorOffsets(), "standard deviations of offsets that are states")
+    initial_deviation: float = setting(100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True)
 
-    def __init__(self, settings: KalmanSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.levels = {name: _number(getattr(settings.noise, name)) for name in LEVELS}
+        self.values = {name: math.nan if level is None else level for name in LEVELS for level in (getattr(self.noise, name),)}
+        self.unknown = self.noise.unknown if self.noise.read_from == "training" else ()
 
     @property
     def causal(self) -> bool:
         """Not if noise levels are read off the whole recording, later samples included."""
-        return self.settings.noise.read_from == "training" or not self.settings.noise.unknown
-
-    @property
-    def learns(self) -> bool:
-        """Whether noise levels are read off the training recordings."""
-        return self.settings.noise.read_from == "training" and bool(self.settings.noise.unknown)
+        return self.noise.read_from == "training" or not self.noise.unknown
 
     @property
     def adapts(self) -> bool:
         """Whether offsets are states."""
-        return bool(self.settings.offsets.given)
+        return bool(self.offsets.given)
 
     @property
     def variant(self) -> str:
         """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
-        offsets = "".join(f"_{name}_offset" for name in self.settings.offsets.given)
-        return self.name + noise + offsets + suffix(self.settings.gate)
+        offsets = "".join(f"_{name}_offset" for name in self.offsets.given)
+        return self.name + noise + offsets + suffix(self.gate)
 
     @property
     def full_title(self) -> str:
         """Title with where the noise levels come from, offsets, and the gate."""
         noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
         names = {"ay": "ay", "steer": "the steering angle"}
-        offsets = "".join(f", offset of {names[name]}" for name in self.settings.offsets.given)
-        return self.title + noise + offsets + in_words(self.settings.gate)
+        offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
+        return self.title + noise + offsets + in_words(self.gate)
 
-    @property
-    def n_parameters(self) -> int:
-        """Noise levels that the fit reads."""
-        return len(self.settings.noise.unknown) if self.learns else 0
-
-    @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
-        """Read noise levels off the measured channels of the training recordings."""
-        started = time.monotonic()
-        for member in members:
-            assert isinstance(member, KalmanFilter)
-            if member.learns:
-                member.levels = member._levels_of(data.train)
-        return [FitRecord(metrics={"epochs": 0, "train_seconds": (time.monotonic() - started) / len(members)}) for _ in members]
+    def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
+        """Noise levels of the measured channels of the training recordings."""
+        return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        levels = dict(self.levels)
-        for name in self.settings.noise.unknown:
+        levels = dict(self.values)
+        for name in self.noise.unknown:
             among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
             try:
-                levels[name] = high_passed_level([recording[name] for recording in recordings], self.settings.noise.cutoff)
+                levels[name] = high_passed_level([recording[name] for recording in recordings], self.noise.cutoff)
             except ValueError as error:
                 raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
             if not levels[name] > SILENT:
                 raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
         return levels
 
-    def _known_levels(self) -> dict[str, float]:
-        if any(math.isnan(level) for level in self.levels.values()):
-            raise ConfigurationError("the Kalman filter has no noise levels yet; fit or load it first, or give estimator.noise")
-        return self.levels
-
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        levels = self._known_levels() if self.causal else self._levels_of([recording])
-        measurements = recording.stack(self.channels)
-        first = self.start(measurements[0, 1], initial_state)
-        result = self.filter_samples(measurements, levels, first)
-        scaled = np.linalg.solve(result.innovation_covariance, result.innovation[..., None])[..., 0]
-        nis = np.einsum("ti,ti->t", result.innovation, scaled)
-        n_measured: FloatArray = np.sum(np.asarray(result.measured), axis=1, dtype=np.float64)
-        return self.wrapped_state(
-            recording, result.filtered.mean[:, :2], result.filtered.covariance[:, :2, :2], nis=nis, nis_dof=n_measured
-        )
+        own = self
+        if not self.causal:
+            own = copy(self)
+            own.values = self._levels_of([recording])
+        return super(KalmanFilter, own)._estimate_one(recording, initial_state)
 
-    def start(self, vx: float, initial_state: Mapping[str, float] | None = None) -> Gaussian[FloatArray]:
-        """State before the first sample: β and r, and offsets of 0 that are known to their standard deviations."""
-        motion = self.first_state(vx, self.settings.initial_deviation, initial_state)
-        variances = [getattr(self.settings.offsets, name) ** 2 for name in self.settings.offsets.given]
-        mean, covariance = np.zeros(2 + len(variances)), np.diag([0.0, 0.0, *variances])
-        mean[:2], covariance[:2, :2] = motion
-        return Gaussian(mean, covariance)
+    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+        """β and r, and offsets of 0 that are known to their standard deviations."""
+        offsets = [getattr(self.offsets, name) for name in self.offsets.given]
+        return self.first_motion(sample, np.array([self.initial_deviation, self.initial_deviation, *offsets]), given)
 
     def filter_samples(
-        self,
-        samples: FloatArray,
-        levels: Mapping[str, float],
-        first: Gaussian[FloatArray],
-        refused: NDArray[np.int64] | None = None,
-    ) -> Filtered[FloatArray]:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement; ``refused``: see `kalman_scan`."""
+        self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
+    ) -> FilteredStates:
+        """Filter by `kalman_scan`; a_y is measured first."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         observation = np.zeros((len(samples), 2, 2))
         observation[:, 0], observation[:, 1, 1] = C, 1.0
-        spread = levels["steer"] * self.settings.noise.steer_factor * B
+        spread = self.values["steer"] * self.noise.steer_factor * B
         model = LinearModel(
             transition=A,
             transition_offset=B * steer[:, None],
             process_noise=spread[:, :, None] * spread[:, None, :],
             observation=observation,
             observation_offset=np.stack([D * steer, np.zeros_like(steer)], axis=1),
-            observation_noise=np.diag([levels["ay"] ** 2, levels["yaw_rate"] ** 2]),
+            observation_noise=np.diag([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2]),
         )
-        model = self._with_offsets(model, B, D)
-        gate = Gate.of(self.settings.gate, self.settings.rate_hz)
-        return kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
+        found = kalman_scan(self._with_offsets(model, B, D), np.stack([ay, yaw_rate], axis=1), first, gate, refused)
+        mean, covariance = found.filtered
+        innovations = (found.innovation, found.innovation_covariance, np.asarray(found.measured))
+        return FilteredStates(mean, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1]))
 
     def _with_offsets(self, model: LinearModel[FloatArray], B: FloatArray, D: FloatArray) -> LinearModel[FloatArray]:
         """The model with offsets as states: what is measured is a_y + b_ay, and the wheels stand at δ - b_δ."""
-        offsets = self.settings.offsets
+        offsets = self.offsets
         if not offsets.given:
             return model
         steps, n = len(B), 2 + len(offsets.given)
-        kept = math.exp(-1.0 / (offsets.seconds * self.settings.rate_hz))
+        kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
         transition, noise, observation = np.zeros((steps, n, n)), np.zeros((steps, n, n)), np.zeros((steps, 2, n))
         transition[:, :2, :2], noise[:, :2, :2], observation[:, :, :2] = model.transition, model.process_noise, model.observation
         for row, name in enumerate(offsets.given, 2):
@@ -252,44 +181,40 @@ class KalmanFilter(SingleTrackEstimator):
         offset = np.concatenate([model.transition_offset, np.zeros((steps, n - 2))], axis=1)
         return LinearModel(transition, offset, noise, observation, model.observation_offset, model.observation_noise)
 
-    def online(self) -> KalmanStepper:
+    def online(self) -> Stepper:
         """A stepper that knows nothing of the state yet."""
         if not self.causal:
             raise ConfigurationError(
                 "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
                 "set estimator.noise.read_from=training, or give the levels"
             )
-        self._known_levels()
-        return KalmanStepper(self)
+        return super().online()
 
-    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Noise levels; NaN where they are read off each recording."""
-        return {name: np.array([level]) for name, level in self.levels.items()}
-
-    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take noise levels back."""
-        if set(weights) != set(LEVELS) or any(values.shape != (1,) for values in weights.values()):
-            raise DataError(f"weights of 'kalman' must be one level each of {', '.join(LEVELS)}, not {', '.join(weights)}")
-        self.levels = {name: float(weights[name][0]) for name in LEVELS}
-
-
-class KalmanStepper(SingleTrackStepper):
-    """The filter, one sample at a time."""
-
-    _estimator: KalmanFilter
-
-    def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
-        return self._estimator.start(row[1])
-
-    def _filtered(
-        self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]
-    ) -> tuple[Gaussian[FloatArray], dict[str, float]]:
-        filtered = self._estimator.filter_samples(rows, self._estimator.levels, state, refused).filtered
-        return Gaussian(filtered.mean[-1], filtered.covariance[-1]), {}
-
-
-def _number(level: float | None) -> float:
-    return math.nan if level is None else level
+    def c_values(self) -> dict[str, Any]:
+        """Its car, levels of noise, offsets and gate."""
+        car, kept = self.car, math.exp(-1.0 / (self.offsets.seconds * self.rate_hz))
+        offsets = [
+            {"name": name, "row": row, "initial": level, "wander": level * math.sqrt(1.0 - kept**2)}
+            for row, name in enumerate(self.offsets.given, 2)
+            for level in (getattr(self.offsets, name),)
+        ]
+        front, rear = car.cornering_stiffness_front, car.cornering_stiffness_rear
+        return {
+            **gate_values(self.gate_in_use()),
+            "n": 2 + len(offsets),
+            "columns": 4 + len(offsets) + (len(offsets) > 1),
+            "offsets": offsets,
+            "kept": kept,
+            "car": car,
+            "step": 1.0 / self.rate_hz,
+            "sum": front + rear,
+            "moment": car.cg_to_front_axle * front - car.cg_to_rear_axle * rear,
+            "damping": car.cg_to_front_axle**2 * front + car.cg_to_rear_axle**2 * rear,
+            "minimum_speed": self.minimum_speed,
+            "steer_level": self.values["steer"] * self.noise.steer_factor,
+            "sensors": [self.values["ay"], self.values["yaw_rate"]],
+            "initial": self.initial_deviation,
+        }
 
 
 ESTIMATOR = KalmanFilter

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -12,32 +12,27 @@ from scipy.signal import lfilter
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.estimators.base import EstimatorSettings
-from vehest.estimators.baseline import Baseline
+from vehest.estimators.declared import fitted
+from vehest.estimators.recursive import Recursive
 
 SHORTEST, LONGEST = 0.02, 200.0  # s, time constants that are looked at
 N_STARTS = 25  # of a grid over them, in equal ratios, around the best of which the search goes on
 
 
-@dataclass(frozen=True)
-class KinematicSettings(EstimatorSettings):
-    """Nothing to choose but the rate."""
-
-
-class Kinematic(Baseline):
+class Kinematic(Recursive):
     """dv/dt = a_y - u r - v/T, with the time constant T that fits the training recordings best.
 
     Exact kinematics for T to infinity, where offsets and tilt of the acceleration add up without bound; the leak forgets them, and with
     them every slow slide. Between samples the acceleration is held.
     """
 
-    name = "kinematic"
-    title = "Kinematic integration"
+    name, title = "kinematic", "Kinematic integration"
     channels = ("vx", "yaw_rate", "ay")
-    settings_type = KinematicSettings
-    numbers = ("time_constant",)
+    ignores_initial_state = True
+    template = "kinematic"
+    time_constant: float = fitted("time constant of the leak", unit="s", positive=True)
 
-    def best_numbers(self, recordings: Sequence[Recording]) -> dict[str, float]:
+    def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
         """T [s]: the best of a grid, then a search between its neighbours."""
         grid = np.geomspace(SHORTEST, LONGEST, N_STARTS)
         errors = [self._error_with(recordings, time_constant) for time_constant in grid]
@@ -47,16 +42,24 @@ class Kinematic(Baseline):
         return {"time_constant": math.exp(found.x) if found.fun < errors[best] else float(grid[best])}
 
     def _error_with(self, recordings: Sequence[Recording], time_constant: float) -> float:
-        self.values = {"time_constant": float(time_constant)}
+        self.time_constant = time_constant
         return self.mean_squared_error(recordings)
 
-    def lateral_velocity(self, samples: Mapping[str, FloatArray], start: float = 0.0) -> FloatArray:
-        """v [m/s] at each sample, from ``start`` one sample before."""
-        time_constant = self.values["time_constant"]
-        kept = math.exp(-1.0 / (self.settings.rate_hz * time_constant))
-        rate = samples["ay"] - samples["vx"] * samples["yaw_rate"]
-        integrated: FloatArray = lfilter([(1.0 - kept) * time_constant], [1.0, -kept], rate, zi=np.array([kept * start]))[0]
-        return integrated
+    @property
+    def kept(self) -> float:
+        """Share of v that is left after a sample."""
+        return math.exp(-1.0 / (self.rate_hz * self.time_constant))
+
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
+        """v [m/s] at each sample, from that one sample before."""
+        vx, yaw_rate, ay = samples.T
+        gain, (start,) = (1.0 - self.kept) * self.time_constant, state
+        vy = lfilter([gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start]))[0]
+        return {"vy": vy}, (float(vy[-1]),)
+
+    def c_values(self) -> dict[str, Any]:
+        """Its time constant, and what follows from it."""
+        return {"time_constant": self.time_constant, "kept": self.kept, "gain": (1.0 - self.kept) * self.time_constant}
 
 
 ESTIMATOR = Kinematic

@@ -6,41 +6,19 @@ The method is patented by its authors (PCT/IT2023/050058).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.estimators.networks.windowed import WindowedEstimator, WindowedSettings
+from vehest.estimators.declared import setting
+from vehest.estimators.networks.windowed import WindowedEstimator
 
 GAMMA_START = 0.98
 GAMMA_SPREAD = 0.01
 SMALL = 0.1
-
-
-@dataclass(frozen=True)
-class KsnnSettings(WindowedSettings):
-    """Structure of a KS-NN.
-
-    Args:
-        n_local: number P of local models along |yaw rate|.
-        n_hidden: neurons Q of each feedback function; 0 makes it linear.
-        bias: whether the feedback functions may learn sensor offsets.
-    """
-
-    n_local: int = 2
-    n_hidden: int = 2
-    bias: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.n_local < 1:
-            raise ConfigurationError(f"estimator.n_local must be at least 1, not {self.n_local}")
-        if self.n_hidden < 0:
-            raise ConfigurationError(f"estimator.n_hidden must not be negative, not {self.n_hidden}")
 
 
 class KinematicsStructuredNetwork(nn.Module):
@@ -61,7 +39,7 @@ class KinematicsStructuredNetwork(nn.Module):
 
     yaw_rate_max: Tensor
 
-    def __init__(self, settings: KsnnSettings, yaw_rate_max: float = 1.0) -> None:
+    def __init__(self, settings: Any, yaw_rate_max: float = 1.0) -> None:
         super().__init__()
         local, hidden = settings.n_local, settings.n_hidden
         self.settings = settings
@@ -166,33 +144,64 @@ class Ksnn(WindowedEstimator):
     Source: Da Lio et al. 2023; patented (PCT/IT2023/050058).
     """
 
-    name = "ksnn"
-    title = "KS-NN"
-    settings_type = KsnnSettings
-    settings: KsnnSettings
+    name, title = "ksnn", "KS-NN"
+    template = "ksnn"
+    notice = (
+        "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence;",
+        "the licence of this software grants none.",
+    )
+    n_local: int = setting(2, "local models P along |yaw rate|", least=1)
+    n_hidden: int = setting(2, "neurons Q of each feedback function; 0: linear", least=0)
+    bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
+
+    @classmethod
+    def drawn(cls, variant: str) -> tuple[str, str, str]:
+        """Blue with linear feedback, orange with nonlinear; darker and solid with biases (Da Lio et al. 2023, Fig. 6)."""
+        nonlinear, bias = "nonlinear" in variant, "bias" in variant and "no_bias" not in variant
+        shades = ("#f59a23", "#b8480b") if nonlinear else ("#4aa5e0", "#0b4f9c")
+        return shades[bias], "solid" if bias else "dashed", "^" if nonlinear else "o"
 
     @property
     def variant(self) -> str:
         """Name of the structure as in Table III."""
-        kind = "nonlinear" if self.settings.n_hidden else "linear"
-        bias = "bias" if self.settings.bias else "no_bias"
-        neurons = f"_q{self.settings.n_hidden}" if self.settings.n_hidden else ""
-        return f"{kind}_{bias}_p{self.settings.n_local}{neurons}"
+        kind = "nonlinear" if self.n_hidden else "linear"
+        bias = "bias" if self.bias else "no_bias"
+        neurons = f"_q{self.n_hidden}" if self.n_hidden else ""
+        return f"{kind}_{bias}_p{self.n_local}{neurons}"
 
     @property
     def full_title(self) -> str:
         """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
-        kind = "nonlinear" if self.settings.n_hidden else "linear"
-        neurons = f", Q = {self.settings.n_hidden}" if self.settings.n_hidden else ""
-        return f"{self.title} {kind} {'+ bias' if self.settings.bias else 'no bias'}, P = {self.settings.n_local}{neurons}"
+        kind = "nonlinear" if self.n_hidden else "linear"
+        neurons = f", Q = {self.n_hidden}" if self.n_hidden else ""
+        return f"{self.title} {kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
 
-    def new_network(self, train: list[Recording]) -> KinematicsStructuredNetwork:
+    def network_for(self, train: list[Recording]) -> KinematicsStructuredNetwork:
         """A network whose local models span the yaw rates of the training recordings."""
         return KinematicsStructuredNetwork(self.settings, max(float(np.abs(r["yaw_rate"]).max()) for r in train))
 
-    def empty_network(self) -> KinematicsStructuredNetwork:
+    def new_network(self) -> KinematicsStructuredNetwork:
         """A network to load weights into."""
         return KinematicsStructuredNetwork(self.settings)
+
+    def c_values(self) -> dict[str, Any]:
+        """Its local models and their neurons."""
+        s, w = self.settings, {name: values.astype(np.float64) for name, values in self.weights().items()}
+        parts = [w["gamma"], w["beta"], w["linear_weight"]]
+        if s.bias:
+            parts.append(w["linear_bias"] + (w["output_bias"] if s.n_hidden else 0.0))
+        neurons = [w["hidden_weight"], w["output_weight"], *([w["hidden_bias"]] if s.bias else [])] if s.n_hidden else []
+        return {
+            "window": s.window,
+            "local": s.n_local,
+            "active": min(s.n_local, 2),
+            "hidden": s.n_hidden,
+            "bias": s.bias,
+            "step": 1.0 / s.rate_hz,
+            "per_width": (s.n_local - 1) / float(w["yaw_rate_max"]),
+            "linear": np.concatenate(parts, axis=1),
+            "neurons": np.stack(neurons, axis=-1) if neurons else None,
+        }
 
 
 ESTIMATOR = Ksnn

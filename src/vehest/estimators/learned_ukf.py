@@ -4,28 +4,48 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
-from vehest.estimators.filtering.car_filter import CarFilter
+from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.declared import Group, setting
+from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
+from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
+from vehest.estimators.network import Network
 from vehest.estimators.phase_records import record_of_phases
-from vehest.filters.gating import Gate, in_words, suffix
+from vehest.filters.definiteness import MARGIN
+from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Gaussian
+from vehest.filters.noise_models import StateDependentNoise
 from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
-from vehest.vehicle.dynamics import STATES, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar
+from vehest.vehicle.dynamics import (
+    PACEJKA,
+    PHYSICAL,
+    STATES,
+    TURN,
+    UNSCALED,
+    Dynamics,
+    NeuralCar,
+    PacejkaCar,
+    Perceptron,
+    ResidualCar,
+    TyreNetworkCar,
+    physical_of,
+)
 from vehest.vehicle.planar import F1TENTH_START, Chassis
+from vehest.vehicle.tyres import STILL
 
 DYNAMICS = ("pacejka", "residual", "neural", "tyre_network", "friction_tyre_network")
 SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}
@@ -45,41 +65,25 @@ UNKNOWN = (0.5, 0.3, 0.1, 0.1)  # m/s, m/s, rad/s, m/s: standard deviations of a
 
 
 @dataclass(frozen=True)
-class CarSettings:
-    """A small car with one electric motor.
+class CarSettings(Group):
+    """A small car with one electric motor: what is known, and where learning starts."""
 
-    Args:
-        mass: [kg].
-        wheelbase: [m].
-        wheel_radius: [m].
-        yaw_inertia: where learning starts [kg m²].
-        cg_to_rear_axle: where learning starts [m].
-        drag_constant: the same [N].
-        drag_linear: the same [N s/m].
-        drag_quadratic: the same [N s²/m²].
-        powertrain_inertia: the same [kg m²].
-        torque_constant: the same [N m/A].
-        friction_viscous: the same [N s].
-        friction_coulomb: the same [N m].
-    """
-
-    mass: float = 5.1
-    wheelbase: float = 0.33
-    wheel_radius: float = 0.05
-    yaw_inertia: float = F1TENTH_START["yaw_inertia"]
-    cg_to_rear_axle: float = F1TENTH_START["cg_to_rear_axle"]
-    drag_constant: float = F1TENTH_START["drag_constant"]
-    drag_linear: float = F1TENTH_START["drag_linear"]
-    drag_quadratic: float = F1TENTH_START["drag_quadratic"]
-    powertrain_inertia: float = F1TENTH_START["powertrain_inertia"]
-    torque_constant: float = F1TENTH_START["torque_constant"]
-    friction_viscous: float = F1TENTH_START["friction_viscous"]
-    friction_coulomb: float = F1TENTH_START["friction_coulomb"]
+    group = "estimator.car"
+    mass: float = setting(5.1, "known", unit="kg", positive=True)
+    wheelbase: float = setting(0.33, "known", unit="m", positive=True)
+    wheel_radius: float = setting(0.05, "known", unit="m", positive=True)
+    yaw_inertia: float = setting(F1TENTH_START["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True)
+    cg_to_rear_axle: float = setting(F1TENTH_START["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True)
+    drag_constant: float = setting(F1TENTH_START["drag_constant"], "learnt from here on", unit="N", positive=True)
+    drag_linear: float = setting(F1TENTH_START["drag_linear"], "learnt from here on", unit="N s/m", positive=True)
+    drag_quadratic: float = setting(F1TENTH_START["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True)
+    powertrain_inertia: float = setting(F1TENTH_START["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True)
+    torque_constant: float = setting(F1TENTH_START["torque_constant"], "learnt from here on", unit="N m/A", positive=True)
+    friction_viscous: float = setting(F1TENTH_START["friction_viscous"], "learnt from here on", unit="N s", positive=True)
+    friction_coulomb: float = setting(F1TENTH_START["friction_coulomb"], "learnt from here on", unit="N m", positive=True)
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ConfigurationError(f"estimator.car.{name} must be positive, not {value}")
+        super().__post_init__()
         if self.cg_to_rear_axle >= self.wheelbase:
             raise ConfigurationError(f"estimator.car.cg_to_rear_axle must be less than the wheelbase, not {self.cg_to_rear_axle}")
 
@@ -94,58 +98,7 @@ class CarSettings:
         return {name: getattr(self, name) for name in F1TENTH_START}
 
 
-@dataclass(frozen=True)
-class LearnedUkfSettings(EstimatorSettings):
-    """Settings of the learned filter.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        dynamics: `pacejka` (PC), `residual` (PCR), `neural` (NN), `tyre_network` (NNT) or `friction_tyre_network` (NNTF).
-        noise: `constant` covariances, or `state_dependent` ones (subscript H).
-        through_filter: whether the dynamics learn through the filter too (subscript U); otherwise only the noise does.
-        friction: that of the training recordings, which its estimate is trained towards.
-        start_friction: that estimates start from; none: the same.
-        width: of hidden layers; 0: the paper's, 64 for tyres and 256 for rates.
-        scaled: whether networks see and give numbers of about 1; otherwise SI units, as in the authors' code.
-        repair: whether covariances that are not positive definite are repaired; otherwise an estimate that loses one is NaN from there on.
-        least_speed: smallest forward speed that the state may have [m/s].
-        least_friction: smallest friction that the state may have.
-        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
-        car: what is known of the car, and where learning starts.
-    """
-
-    rate_hz: float = 100.0
-    dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = "friction_tyre_network"
-    noise: Literal["constant", "state_dependent"] = "state_dependent"
-    through_filter: bool = True
-    friction: float = 0.6
-    start_friction: float | None = None
-    width: int = 0
-    scaled: bool = True
-    repair: bool = True
-    least_speed: float = 0.05
-    least_friction: float = 0.05
-    gate: float | None = None
-    car: CarSettings = CarSettings()
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.dynamics not in DYNAMICS:
-            raise ConfigurationError(f"estimator.dynamics '{self.dynamics}' is not one of: {', '.join(DYNAMICS)}")
-        if self.noise not in ("constant", "state_dependent"):
-            raise ConfigurationError(f"estimator.noise '{self.noise}' is not one of: constant, state_dependent")
-        for name in ("friction", "least_speed", "least_friction"):
-            if not getattr(self, name) > 0:
-                raise ConfigurationError(f"estimator.{name} must be positive, not {getattr(self, name)}")
-        if self.gate is not None and not self.gate > 0:
-            raise ConfigurationError(f"estimator.gate must be positive, not {self.gate}")
-        if self.start_friction is not None and not self.start_friction > self.least_friction:
-            raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
-        if self.width < 0:
-            raise ConfigurationError(f"estimator.width must not be negative, not {self.width}")
-
-
-class LearnedUkf(Estimator):
+class LearnedUkf(Network, SigmaPointEstimator):
     """UKF of vx, vy, yaw rate, rim speed and friction, its dynamics and noise learnt through the filter itself.
 
     Measured are ax, ay, yaw rate and the motor's speed; steering angle and motor current are inputs. Samples that are missing are skipped,
@@ -155,18 +108,48 @@ class LearnedUkf(Estimator):
     the authors' public code.
     """
 
-    name = "learned_ukf"
-    title = "Learned UKF"
+    name, title = "learned_ukf", "Learned UKF"
     channels = ("vx", *MEASURED, *INPUTS)
     skippable = channels
-    settings_type = LearnedUkfSettings
+    refuses = ("infinite",)
+    learns_from = REFERENCES
+    slow_kernel = "vehest.estimators.kernels.planar_car"
+    template = "learned_ukf"
+    states = STATES
     training_type = ThroughFilterSettings
-    settings: LearnedUkfSettings
+    network: CarFilter
+    dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = setting(
+        "friction_tyre_network", "pacejka (PC), residual (PCR), neural (NN), tyre_network (NNT) or friction_tyre_network (NNTF)"
+    )
+    noise: Literal["constant", "state_dependent"] = setting("state_dependent", "constant or state_dependent (subscript H) covariances")
+    through_filter: bool = setting(True, "whether the dynamics learn through the filter too (subscript U), or the noise alone")
+    friction: float = setting(0.6, "that of the training recordings, which its estimate is trained towards", positive=True)
+    start_friction: float | None = setting(None, "that estimates start from; null: the same")
+    width: int = setting(0, "of hidden layers; 0: the paper's, 64 for tyres and 256 for rates", least=0)
+    scaled: bool = setting(True, "whether networks see and give numbers of about 1; otherwise SI units, as in the authors' code")
+    repair: bool = setting(True, "whether covariances that lose definiteness are repaired; otherwise the estimate is NaN from there on")
+    least_speed: float = setting(0.05, "smallest forward speed that the state may have", unit="m/s", positive=True)
+    least_friction: float = setting(0.05, "smallest friction that the state may have", positive=True)
+    gate: float | None = setting(
+        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
+    )
+    car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
-    def __init__(self, settings: LearnedUkfSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.filter = self._new_filter()
-        self._seed = 0
+        self.network = self.new_network()
+
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: friction that starts below its smallest value.
+        """
+        if self.start_friction is not None and not self.start_friction > self.least_friction:
+            raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
+
+    @property
+    def filter(self) -> CarFilter:
+        """Its network: the filter whose dynamics and noise are learnt."""
+        return self.network
 
     @property
     def adapts(self) -> bool:
@@ -198,17 +181,8 @@ class LearnedUkf(Estimator):
         return (self.name, self._trained)
 
     @property
-    def _trained(self) -> LearnedUkfSettings:
+    def _trained(self) -> Any:
         return replace(self.settings, start_friction=None, repair=True, gate=None)
-
-    @property
-    def n_parameters(self) -> int:
-        """Weights, physical parameters and entries of the noise's factors."""
-        return sum(parameter.numel() for parameter in self.filter.parameters())
-
-    def seed(self, seed: int) -> None:
-        """Seed of the initial weights and of the sequences."""
-        self._seed = seed
 
     @classmethod
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
@@ -233,14 +207,14 @@ class LearnedUkf(Estimator):
     ) -> list[PhaseRecord]:
         dtype = getattr(torch, training.dtype)
         train, validation = ([self.drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
-        self.filter = self._new_filter(repair=True).to(dtype)
-        if self.settings.scaled:
+        self.network = self.new_network(repair=True).to(dtype)
+        if self.scaled:
             self._scale(train)
         self.filter.reset(torch.Generator().manual_seed(self._seed))
         weights = torch.tensor(WEIGHTS, dtype=dtype)
         last = torch.zeros(1, dtype=dtype)
         counted = Weights(torch.cat([weights, last]), torch.cat([weights, last + 1.0]), torch.cat([weights[:3], last, last]))
-        learns_dynamics = self.settings.through_filter
+        learns_dynamics = self.through_filter
         phases = [
             one_step_phase(self.filter, self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
             *filter_phases(
@@ -256,10 +230,11 @@ class LearnedUkf(Estimator):
             ),
         ]
         records = train_phases(phases, self._seed, context, index, training.checkpoint_seconds, twins)
-        self.filter.repair = self.settings.repair
+        self.filter.repair = self.repair
         return records
 
-    def _new_filter(self, repair: bool | None = None) -> CarFilter:
+    def new_network(self, repair: bool | None = None) -> CarFilter:
+        """The filter before it learns."""
         s = self.settings
         return CarFilter(
             self._new_dynamics(),
@@ -292,10 +267,10 @@ class LearnedUkf(Estimator):
         if isinstance(self.filter.dynamics, TyreNetworkCar):
             seen = [vx, vy, yaw_rate, rim, friction, steer, SLIP, SLIP, SLIP]
             scales = seen if self.filter.dynamics.friction_scaled else [*seen, current]
-            given = [0.5 * self.settings.car.mass * GRAVITY] * 4
+            given = [0.5 * self.car.mass * GRAVITY] * 4
         else:
             scales = [vx, vy, yaw_rate, rim, steer, current]
-            rates = torch.cat([drive.states[1:, :4] - drive.states[:-1, :4] for drive in train]) * self.settings.rate_hz
+            rates = torch.cat([drive.states[1:, :4] - drive.states[:-1, :4] for drive in train]) * self.rate_hz
             given = rates.square().mean(0).sqrt().clamp(min=1e-6).tolist()
         network.input_scale.copy_(torch.tensor(scales))
         network.output_scale.copy_(torch.tensor(given))
@@ -303,7 +278,7 @@ class LearnedUkf(Estimator):
     def _samples(self, recording: Recording) -> tuple[FloatArray, FloatArray]:
         """Measurements (T, 4) with the rim speed last, and inputs (T, 2), held where they are missing."""
         measurements = recording.stack(MEASURED)
-        measurements[:, 3] *= self.settings.car.wheel_radius
+        measurements[:, 3] *= self.car.wheel_radius
         return measurements, _held(recording.stack(INPUTS))
 
     def _start(self, measurement: FloatArray, state: Mapping[str, float] | None) -> tuple[Tensor, Tensor]:
@@ -319,9 +294,6 @@ class LearnedUkf(Estimator):
         with torch.no_grad():
             covariance = self.filter.initial_covariance().to(dtype) + torch.tensor([*extra, 0.0], dtype=dtype).diag()
         return torch.tensor(mean, dtype=dtype), covariance
-
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        return self._estimate_all([recording], [initial_state])[0]
 
     def _estimate_all(self, recordings: Sequence[Recording], states: Sequence[Mapping[str, float] | None]) -> list[Estimate]:
         """Recordings of one length are filtered together."""
@@ -339,7 +311,7 @@ class LearnedUkf(Estimator):
         starts = [self._start(own[0][0], state) for own, state in zip(samples, states, strict=True)]
         initial = Gaussian(torch.stack([mean for mean, _ in starts]), torch.stack([covariance for _, covariance in starts]))
         with torch.no_grad():
-            steps = self.filter.filtered(measurements, inputs, initial, gate=self.gate()).steps
+            steps = self.filter.filtered(measurements, inputs, initial, gate=self.gate_in_use()).steps
             nis = torch.linalg.solve_ex(steps.innovation_covariance, steps.innovation).result.mul(steps.innovation).sum(-1)
         mean, covariance, dof = steps.filtered.mean.double().numpy(), steps.filtered.covariance.double().numpy(), steps.measured.sum(-1)
         estimates = []
@@ -351,9 +323,9 @@ class LearnedUkf(Estimator):
             estimates.append(self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra))
         return estimates
 
-    def gate(self) -> Gate | None:
+    def gate_in_use(self) -> Gate | None:
         """That of the filter in use; it learns without."""
-        return Gate.of(self.settings.gate, self.settings.rate_hz)
+        return Gate.of(self.gate, self.rate_hz)
 
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
         """A recording as its filter takes it: true states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
@@ -367,59 +339,55 @@ class LearnedUkf(Estimator):
             if np.isnan(recording[name]).any():
                 raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
         measurements, inputs = self._samples(recording)
-        states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.settings.friction)]
+        states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.friction)]
         return Drive(*(torch.as_tensor(part, dtype=dtype) for part in (np.stack(states, 1), inputs, measurements)))
 
-    def online(self) -> LearnedUkfStepper:
-        """A stepper that starts from the first sample it sees."""
-        return LearnedUkfStepper(self)
-
-    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Parameters of dynamics and noise, and scales."""
-        return {name: tensor.detach().numpy().copy() for name, tensor in self.filter.state_dict().items()}
-
-    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take them back."""
-        own = self._new_filter()
-        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
-        expected = {name: tuple(tensor.shape) for name, tensor in own.state_dict().items()}
-        found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        if expected != found:
-            differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
-            raise DataError(f"weights of '{self.name}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
-        own.to(tensors["initial_noise.factor"].dtype).load_state_dict(tensors)
-        self.filter = own
-
-
-class LearnedUkfStepper(Stepper):
-    """The filter, one sample at a time."""
-
-    def __init__(self, estimator: LearnedUkf) -> None:
-        self._estimator = estimator
-        own = estimator.filter
+    def new_filter(self, first: FilterStep) -> UnscentedStepper:
+        """From the first measurement."""
+        own = self.network
+        mean, covariance = (part.numpy() for part in self._start(first.measurement, None))
         with torch.no_grad():
-            self._model = own.point_model()
-        self._noises = own.noise_at()
-        self._inputs = np.zeros(2)
-        self._filter: UnscentedStepper | None = None
-
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """States at the time of the sample; what is NaN in it is skipped or, of inputs, held."""
-        row = np.array(required(sample, (*MEASURED, *INPUTS)))
-        if np.isinf(row).any():
-            raise DataError(f"the sample holds an infinite value: {dict(sample)}")
-        self._inputs = np.where(np.isnan(row[4:]), self._inputs, row[4:])
-        row[3] *= self._estimator.settings.car.wheel_radius
-        if self._filter is None:
-            own = self._estimator.filter
-            mean, covariance = (part.numpy() for part in self._estimator._start(row[:4], None))
-            self._filter = UnscentedStepper(
-                self._model, mean, covariance, len(MEASURED), own.rule, repair=own.repair, gate=self._estimator.gate()
+            return UnscentedStepper(
+                own.point_model(), mean, covariance, len(MEASURED), own.rule, repair=own.repair, gate=self.gate_in_use()
             )
-        dtype = self._filter.mean.dtype
-        estimated = self._filter.step(row[:4].astype(dtype), self._inputs.astype(dtype), *self._noises)
-        variance = float(self._filter.covariance[STATES.index("vy"), STATES.index("vy")])
-        return dict(zip(STATES, estimated.tolist(), strict=True)) | {"vy_variance": variance}
+
+    def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
+        """Measurements that are NaN are skipped, inputs held."""
+        if not memory:
+            memory |= {"inputs": np.zeros(2), "noises": self.network.noise_at()}
+        measurement = sample[1:5].copy()
+        measurement[3] *= self.car.wheel_radius
+        memory["inputs"] = np.where(np.isnan(sample[5:]), memory["inputs"], sample[5:])
+        return FilterStep(measurement, memory["inputs"], *memory["noises"])
+
+    def c_values(self) -> dict[str, Any]:
+        """Its dynamics, noise, car and gate."""
+        s = self.settings
+        own = deepcopy(self.filter).double()
+        with torch.no_grad():
+            process, observation = own.process_noise, own.observation_noise
+            return {
+                **gate_values(self.gate_in_use()),
+                **_dynamics_in_c(own.dynamics),
+                "n": len(STATES),
+                "m": len(MEASURED),
+                "rule": own.rule,
+                "lower": [value if math.isfinite(value) else None for value in own.lower],
+                "repair": own.repair,
+                "margin": MARGIN,
+                "kind": s.dynamics,
+                "dynamics": s.dynamics.replace("_", " "),
+                "noise_kind": s.noise.replace("_", " "),
+                "step": own.step,
+                "radius": s.car.wheel_radius,
+                "still": STILL,
+                "turn": TURN,
+                "unscaled": UNSCALED,
+                "friction": s.friction if s.start_friction is None else s.start_friction,
+                "initial": _numbers(own.initial_covariance()) + np.diag([*np.square(UNKNOWN), 0.0]),
+                "process": _noise_in_c(process, LEAST_ENTROPY, own.noise_at()[0]),
+                "observation": _noise_in_c(observation, None, own.noise_at()[1]),
+            }
 
 
 def _held(values: FloatArray) -> FloatArray:
@@ -430,6 +398,49 @@ def _held(values: FloatArray) -> FloatArray:
         if missing.any():
             held[k, missing] = held[k - 1, missing] if k else 0.0
     return held
+
+
+def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:
+    """Physical numbers, curves, and the network's layers, inputs first."""
+    physical = physical_of(dynamics)  # type: ignore[arg-type]
+    p = dict(zip((*PHYSICAL, *PACEJKA), physical.values.tolist(), strict=True))
+    weight = physical.mass * GRAVITY / physical.wheelbase
+    front_arm = physical.wheelbase - p["cg_to_rear_axle"]
+    values: dict[str, Any] = {
+        "p": p,
+        "mass": physical.mass,
+        "front_arm": front_arm,
+        "front_load": weight * p["cg_to_rear_axle"],
+        "rear_load": weight * front_arm,
+        "curves": [[p[f"{letter}_{where}"] for letter in "BCD"] for where in ("x", "front", "rear")],
+    }
+    network = getattr(dynamics, "network", None)
+    if isinstance(network, Perceptron):
+        for number, (matrix, offset) in enumerate(network.layers(), 1):
+            values |= {f"W{number}": _numbers(matrix.T), f"b{number}": _numbers(offset)}
+    return values
+
+
+def _noise_in_c(noise: nn.Module, least: float | None, at: Any) -> dict[str, Any]:
+    """A covariance that is constant, or linear in the state by its factor; see `compiled_noise`."""
+    if not isinstance(noise, StateDependentNoise):
+        nothing = np.zeros((1, len(STATES)))
+        return {"constant": at(nothing, nothing)[0], "weight": None}
+    n = noise.constant.n
+    unit = noise.unit[torch.tril_indices(n, n)[0]]
+    return {
+        "constant": _numbers(noise.constant(noise.state_unit, noise.state_unit)),
+        "weight": _numbers(noise.weight / noise.state_unit * unit[:, None]),
+        "offset": _numbers(noise.offset * unit),
+        "scale": noise.scale,
+        "least": least,
+        "units": n * math.log(2.0 * math.pi * math.e),
+        "size": n,
+    }
+
+
+def _numbers(values: Tensor) -> np.ndarray[Any, Any]:
+    return values.detach().numpy().astype(np.float64)
 
 
 ESTIMATOR = LearnedUkf

@@ -2,31 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from vehest.data.errors import ConfigurationError
+from vehest.estimators.declared import setting
 from vehest.estimators.filtering.car_filter import FRICTION, OBSERVATION, PROCESS, CarFilter
-from vehest.estimators.learned_ukf import LearnedUkf, LearnedUkfSettings
+from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.filters.diagonal_noise import DiagonalNoise, DiagonalStateDependentNoise
 from vehest.vehicle.dynamics import STATES, Dynamics, PacejkaCar
-
-
-@dataclass(frozen=True)
-class LearnedUkfVariantSettings(LearnedUkfSettings):
-    """Settings of the learned filter, and how it differs from the paper's.
-
-    Args:
-        correlated_noise: whether the covariances of process and measurements have entries off their diagonals, as in the paper.
-        curvature: whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of `pacejka` alone.
-    """
-
-    correlated_noise: bool = True
-    curvature: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.curvature and self.dynamics != "pacejka":
-            raise ConfigurationError(f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}")
 
 
 class LearnedUkfVariant(LearnedUkf):
@@ -37,21 +18,31 @@ class LearnedUkfVariant(LearnedUkf):
     Source: Węgrzynowski et al. 2024, Sections III-B.2 (Eq. 3) and III-B.3.
     """
 
-    name = "learned_ukf_variant"
-    title = "Learned UKF, variant"
-    settings_type = LearnedUkfVariantSettings
-    settings: LearnedUkfVariantSettings
+    name, title = "learned_ukf_variant", "Learned UKF, variant"
+    template = ""
+    correlated_noise: bool = setting(
+        True, "whether covariances of process and measurements have entries off their diagonals, as in the paper"
+    )
+    curvature: bool = setting(False, "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone")
+
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: a curvature of other dynamics.
+        """
+        super().check()
+        if self.curvature and self.dynamics != "pacejka":
+            raise ConfigurationError(f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}")
 
     @property
     def variant(self) -> str:
         """The paper's name, with what is different."""
-        return super().variant + ("" if self.settings.correlated_noise else "_diagonal") + ("_curved" if self.settings.curvature else "")
+        return super().variant + ("" if self.correlated_noise else "_diagonal") + ("_curved" if self.curvature else "")
 
     @property
     def full_title(self) -> str:
         """Title with what is different."""
-        how = [] if self.settings.correlated_noise else ["diagonal noise"]
-        how += ["curvature"] * self.settings.curvature
+        how = [] if self.correlated_noise else ["diagonal noise"]
+        how += ["curvature"] * self.curvature
         return ", ".join([super().full_title, *how])
 
     @property
@@ -66,12 +57,13 @@ class LearnedUkfVariant(LearnedUkf):
                 held += (entries - noise.constant.n) * (2 + noise.weight.shape[1])
         return super().n_parameters - held
 
-    def _new_filter(self, repair: bool | None = None) -> CarFilter:
-        made = super()._new_filter(repair)
-        if self.settings.correlated_noise:
+    def new_network(self, repair: bool | None = None) -> CarFilter:
+        """The filter before it learns."""
+        made = super().new_network(repair)
+        if self.correlated_noise:
             return made
-        process = (*PROCESS, FRICTION[self.settings.noise])
-        if self.settings.noise == "constant":
+        process = (*PROCESS, FRICTION[self.noise])
+        if self.noise == "constant":
             made.process_noise, made.observation_noise = DiagonalNoise(process), DiagonalNoise(OBSERVATION)
         else:
             made.process_noise = DiagonalStateDependentNoise(process, len(STATES))
@@ -79,8 +71,8 @@ class LearnedUkfVariant(LearnedUkf):
         return made
 
     def _new_dynamics(self) -> Dynamics:
-        car = self.settings.car
-        return PacejkaCar(car.chassis, car.start, with_curvature=True) if self.settings.curvature else super()._new_dynamics()
+        car = self.car
+        return PacejkaCar(car.chassis, car.start, with_curvature=True) if self.curvature else super()._new_dynamics()
 
 
 ESTIMATOR = LearnedUkfVariant

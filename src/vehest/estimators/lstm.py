@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork, RecurrentSettings
+from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork
 
 
 class LstmNetwork(RecurrentNetwork):
@@ -19,7 +19,7 @@ class LstmNetwork(RecurrentNetwork):
     Source: Hochreiter & Schmidhuber 1997; Kong et al., World Electr. Veh. J. 13 (1), 2022.
     """
 
-    def __init__(self, settings: RecurrentSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings, n_gates=4, n_channels=4)
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
@@ -46,6 +46,11 @@ class Lstm(RecurrentEstimator):
     name = "lstm"
     title = "LSTM"
     network_type = LstmNetwork
+
+    @classmethod
+    def drawn(cls, variant: str) -> tuple[str, str, str]:
+        """Light purple."""
+        return "#c792dd", "dashed", "v"
 
 
 ESTIMATOR = Lstm

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,12 +17,12 @@ from torch import Tensor
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.filtering.single_track import KNOWN, SingleTrackEstimator, SingleTrackSettings, SingleTrackStepper, require_positive
+from vehest.estimators.base import FitData, FitRecord, rate
+from vehest.estimators.declared import Group, setting
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
-from vehest.filters.gating import Gate, in_words, suffix
+from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.nonlinear import NonlinearModel, unscented_filter
@@ -61,95 +61,82 @@ KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
 
 
 @dataclass(frozen=True)
-class TrackNoise:
-    """Standard deviations, those of the three sensors all or none; where they are not given, the fit finds them.
+class TrackNoise(Group):
+    """Standard deviations, those of the three sensors all or none; where they are not given, the fit finds them."""
 
-    Args:
-        yaw_rate: of the gyroscope [rad/s].
-        ay: of the accelerometer, and of what the model misses [m/s²].
-        steer: of the steering angle, over a second's step [rad √s].
-        tyres: by which logarithms of tyre parameters wander [1/√s]. Training drives on one set of tyres and one road say little of it.
-    """
-
-    yaw_rate: float | None = None
-    ay: float | None = None
-    steer: float | None = None
-    tyres: float | None = None
-
-    def __post_init__(self) -> None:
-        require_positive("estimator.noise", asdict(self))
+    group = "estimator.noise"
+    yaw_rate: float | None = setting(None, "of the gyroscope", unit="rad/s", positive=True)
+    ay: float | None = setting(None, "of the accelerometer, and of what the model misses", unit="m/s²", positive=True)
+    steer: float | None = setting(None, "of the steering angle, over a second's step", unit="rad √s", positive=True)
+    tyres: float | None = setting(
+        None,
+        "by which logarithms of tyre parameters wander; training drives on one set of tyres and one road say little of it",
+        unit="1/√s",
+        positive=True,
+    )
 
 
 @dataclass(frozen=True)
-class AxleCurves:
-    """Axle curves at friction 1, all that the tyres need or none; where they are not given, the fit finds them.
+class AxleCurves(Group):
+    """Axle curves at friction 1, all that the tyres need or none; where they are not given, the fit finds them."""
 
-    Args:
-        c1_front: where the front axle's curve bends [rad²]; not of linear tyres.
-        c2_front: cornering stiffness of the front axle [N/rad].
-        c1_rear: of the rear axle.
-        c2_rear: of the rear axle.
-        deviation: standard deviation of their logarithms at the start, by which tyres may differ from these; with a fit, on top of what
-            that does not know. Where it is not given: 0.1 about curves that are given, and nothing on top of a fit.
+    group = "estimator.curves"
+    c1_front: float | None = setting(None, "where the front axle's curve bends; not of linear tyres", unit="rad²", positive=True)
+    c2_front: float | None = setting(None, "cornering stiffness of the front axle", unit="N/rad", positive=True)
+    c1_rear: float | None = setting(None, "of the rear axle", unit="rad²", positive=True)
+    c2_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
+    deviation: float | None = setting(
+        None, "standard deviation of their logarithms at the start, on top of the fit's; null: 0 after a fit, else 0.1", positive=True
+    )
+
+
+class RationalFilter(SideslipFilter):
+    """Filter of sideslip angle, yaw rate, their rates and, if wanted, tyre parameters, over `TyreTrack`.
+
+    Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process noise Δt B Λ Bᵀ comes from the steering
+    angle and the wandering parameters. Below the minimum speed wheels roll without slip, and tyre parameters are held.
+
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60; friction as a state and the unscented filter are beyond it.
     """
 
-    c1_front: float | None = None
-    c2_front: float | None = None
-    c1_rear: float | None = None
-    c2_rear: float | None = None
-    deviation: float | None = None
+    name, title = "rational_ekf", "EKF with tyres"
+    training_type = NoiseTuningSettings
+    template = "rational_ekf"
+    rate_hz: float = rate(20.0)
+    tyres: Tyres = setting(
+        "rational_adaptive",
+        "linear (LINT: cornering stiffnesses are states), rational (RATT: fixed), rational_adaptive (RATTE: c₁ and c₂ of both axles are "
+        "states) or rational_friction (beyond the paper: the friction is)",
+    )
+    filter: Literal["extended", "unscented"] = setting("extended", "kind of Kalman filter")
+    bound: float = setting(
+        3.0, "factor by which tyre parameters may leave those at the start, three of their standard deviations at least", above=1.0
+    )
+    largest_sideslip: float = setting(
+        0.5, "beyond it the filter has diverged: motion and tyres restart", unit="rad", above=0.0, most=LARGEST[0]
+    )
+    adapt_above: float = setting(
+        0.0, "lateral acceleration |u r| below which tyre parameters are held; 0: never, as in the paper", unit="m/s²", least=0.0
+    )
+    noise: TrackNoise = setting(TrackNoise(), "levels of noise")
+    curves: AxleCurves = setting(AxleCurves(), "axle curves")
 
-    def __post_init__(self) -> None:
-        require_positive("estimator.curves", asdict(self))
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        given = {name: getattr(settings.curves, name) for name in self.curve_names}
+        self.axle_curves = np.array([_number(given.get(name, math.inf)) for name in CURVES])
+        self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
+        self.values = {name: _number(getattr(settings.noise, name) if name in self.level_names else 0.0) for name in LEVELS}
+        self._seed = 0
 
-
-@dataclass(frozen=True)
-class RationalSettings(SingleTrackSettings):
-    """Settings of the filter.
-
-    Args:
-        tyres: ``linear`` (LINT: cornering stiffnesses are states), ``rational`` (RATT: fixed), ``rational_adaptive`` (RATTE: c₁ and c₂ of
-            both axles are states) or ``rational_friction`` (beyond the paper: the friction is).
-        filter: ``extended`` or ``unscented``.
-        bound: factor by which tyre parameters may leave those that the filter started with; never less than three standard deviations of
-            what it knew of them at the start, since a parameter that stands on a bound inside its own band says so with false certainty.
-        largest_sideslip: sideslip angle beyond which the filter counts as lost: the motion begins anew as that of a car that rolls, and the
-            tyres as they were at the start [rad].
-        adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²]; 0: never, as in the paper. Straight ahead
-            a crossfall and offsets of sensors are all that there is to adapt to.
-        noise: levels of noise.
-        curves: axle curves.
-        gate: standard deviations of an innovation beyond which a measurement is refused in use; none: all are taken. See `Gate`.
-            Of the extended filter.
-    """
-
-    rate_hz: float = 20.0
-    tyres: Tyres = "rational_adaptive"
-    filter: Literal["extended", "unscented"] = "extended"
-    bound: float = 3.0
-    largest_sideslip: float = 0.5
-    adapt_above: float = 0.0
-    noise: TrackNoise = TrackNoise()
-    curves: AxleCurves = AxleCurves()
-    gate: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.tyres not in KINDS:
-            raise ConfigurationError(f"estimator.tyres '{self.tyres}' is not one of: {', '.join(KINDS)}")
-        if self.filter not in ("extended", "unscented"):
-            raise ConfigurationError(f"estimator.filter '{self.filter}' is not one of: extended, unscented")
-        require_positive("estimator", {"gate": self.gate})
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: a gate of the unscented filter, or levels or curves that are given in part.
+        """
         if self.gate is not None and self.filter != "extended":
             raise ConfigurationError(
                 "estimator.gate is there for estimator.filter=extended only; set gate to null, or the filter to extended"
             )
-        if not self.bound > 1.0:
-            raise ConfigurationError(f"estimator.bound must be more than 1, not {self.bound}")
-        if not 0.0 < self.largest_sideslip <= LARGEST[0]:
-            raise ConfigurationError(f"estimator.largest_sideslip must lie between 0 and {LARGEST[0]} rad, not at {self.largest_sideslip}")
-        if not self.adapt_above >= 0.0:
-            raise ConfigurationError(f"estimator.adapt_above must not be negative, not {self.adapt_above}")
         for group, names in (("noise", LEVELS[:3]), ("curves", self.curve_names)):
             given = [name for name in names if getattr(getattr(self, group), name) is not None]
             if given and len(given) < len(names):
@@ -170,79 +157,31 @@ class RationalSettings(SingleTrackSettings):
         """Parameters that these tyres' curves have."""
         return tuple(name for name in CURVES if self.tyres != "linear" or name.startswith("c2"))
 
-
-class FilteredDrive(NamedTuple):
-    """What the filter knows after T samples.
-
-    Attributes:
-        mean: states in the order of `TyreTrack`, (T, n).
-        deviation: their standard deviations, (T, n).
-        sideslip_covariance: of sideslip angle and yaw rate, (T, 2, 2).
-        innovation: of yaw rate and lateral acceleration, 0 where nothing was measured, (T, 2).
-        innovation_covariance: that of the identity where nothing was measured, (T, 2, 2).
-        measured: bool, (T, 2).
-        last: state after the last sample.
-    """
-
-    mean: FloatArray
-    deviation: FloatArray
-    sideslip_covariance: FloatArray
-    innovation: FloatArray
-    innovation_covariance: FloatArray
-    measured: NDArray[np.bool_]
-    last: Gaussian[FloatArray]
-
-    def nis(self) -> tuple[FloatArray, FloatArray]:
-        """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured; (T,) each."""
-        (first, both), (_, second) = np.moveaxis(self.innovation_covariance, 0, 2)
-        one, other = self.innovation.T
-        nis = (second * one**2 - 2.0 * both * one * other + first * other**2) / (first * second - both**2)
-        return nis, np.sum(self.measured, axis=1, dtype=np.float64)
-
-
-class RationalFilter(SingleTrackEstimator):
-    """Filter of sideslip angle, yaw rate, their rates and, if wanted, tyre parameters, over `TyreTrack`.
-
-    Measured are yaw rate and lateral acceleration; steering angle and speed are inputs. Process noise Δt B Λ Bᵀ comes from the steering
-    angle and the wandering parameters. Below the minimum speed wheels roll without slip, and tyre parameters are held.
-
-    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 11 to 60; friction as a state and the unscented filter are beyond it.
-    """
-
-    name = "rational_ekf"
-    title = "EKF with tyres"
-    settings_type = RationalSettings
-    training_type = NoiseTuningSettings
-    settings: RationalSettings
-
-    def __init__(self, settings: RationalSettings) -> None:
-        super().__init__(settings)
-        curves = {name: getattr(settings.curves, name) for name in settings.curve_names}
-        self.curves = np.array([_number(curves.get(name, math.inf)) for name in CURVES])
-        self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
-        self.levels = {name: _number(getattr(settings.noise, name) if name in settings.level_names else 0.0) for name in LEVELS}
-        self._seed = 0
+    def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
+        """None where curves are given and no level is searched; ``vy_ref`` unless there is a sideslip angle."""
+        given = self._curves_given and (training.method == "data" or not self._searched)
+        return () if given or "sideslip_ref" in channels else ("vy_ref",)
 
     @property
     def adapts(self) -> bool:
         """Whether tyres are states."""
-        return self.settings.tyres != "rational"
+        return self.tyres != "rational"
 
     @property
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
-        kind = KINDS[self.settings.tyres][0] + ("_ukf" if self.settings.filter == "unscented" else "")
-        return kind + ("_held" if self._holds else "") + suffix(self.settings.gate)
+        kind = KINDS[self.tyres][0] + ("_ukf" if self.filter == "unscented" else "")
+        return kind + ("_held" if self._holds else "") + suffix(self.gate)
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
         held = ", tyres held straight ahead" if self._holds else ""
-        return f"{KINDS[self.settings.tyres][1]}, {self.settings.filter} Kalman filter{held}{in_words(self.settings.gate)}"
+        return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{in_words(self.gate)}"
 
     @property
     def _holds(self) -> bool:
-        return bool(self.settings.adapted) and self.settings.adapt_above > 0.0
+        return bool(self.adapted) and self.adapt_above > 0.0
 
     @property
     def learns(self) -> bool:
@@ -252,22 +191,21 @@ class RationalFilter(SingleTrackEstimator):
     @property
     def n_parameters(self) -> int:
         """Parameters of curves and levels of noise that are not given."""
-        settings = self.settings
-        unknown = [name for name in settings.level_names if getattr(settings.noise, name) is None]
-        return len(settings.curve_names) * (not self._curves_given) + len(unknown)
+        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
+        return len(self.curve_names) * (not self._curves_given) + len(unknown)
 
     @property
     def _curves_given(self) -> bool:
-        return self.settings.curves.c2_front is not None
+        return self.curves.c2_front is not None
 
     @property
     def _levels_given(self) -> bool:
-        return all(getattr(self.settings.noise, name) is not None for name in self.settings.level_names)
+        return all(getattr(self.noise, name) is not None for name in self.level_names)
 
     @property
     def _searched(self) -> tuple[str, ...]:
         """Levels that are tuned: the sensors' as ratios to the first, whose size follows from the innovations."""
-        return tuple(name for name in self.settings.level_names[1:] if getattr(self.settings.noise, name) is None)
+        return tuple(name for name in self.level_names[1:] if getattr(self.noise, name) is None)
 
     def seed(self, seed: int) -> None:
         """Seed of Optuna's trials; nothing else is random."""
@@ -275,17 +213,17 @@ class RationalFilter(SingleTrackEstimator):
 
     def track(self) -> TyreTrack:
         """The model in torch, at the curves that the filter starts with."""
-        self._require_fitted()
-        adapted = tuple(TYRE_PARAMETERS.index(name) for name in self.settings.adapted)
-        return TyreTrack(self.settings.car, (*self.curves.tolist(), 1.0), adapted, 1.0 / self.settings.rate_hz)  # type: ignore[arg-type]
+        self.require_fitted({})
+        adapted = tuple(TYRE_PARAMETERS.index(name) for name in self.adapted)
+        return TyreTrack(self.car, (*self.axle_curves.tolist(), 1.0), adapted, 1.0 / self.rate_hz)  # type: ignore[arg-type]
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Fit axle curves to the reference sideslip of the training recordings, then find the noise levels; see `NoiseTuningSettings`.
 
         Members of one seed cannot differ, others only by Optuna's trials.
         """
-        return [member._fit_one(data, training, context) for member in members if isinstance(member, RationalFilter)]
+        return [member._fit_one(data, training, context) for member in members]
 
     def _fit_one(self, data: FitData, training: NoiseTuningSettings, context: FitContext) -> FitRecord:
         started = time.monotonic()
@@ -295,7 +233,7 @@ class RationalFilter(SingleTrackEstimator):
         if not self._curves_given:
             metrics |= self._fit_curves(_named_like(data.train, training.curves_from))
         if training.method == "data":
-            self.levels = self._levels_of(data.train)
+            self.values = self._levels_of(data.train)
         elif self._searched:
             extended = self._extended()
             search = extended._tune(data.train, training, context)
@@ -305,36 +243,36 @@ class RationalFilter(SingleTrackEstimator):
             boxes = np.array([BOXES[name] for name in self._searched])
             at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
-            self.levels = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
+            self.values = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
             interrupted = search.interrupted
         if data.validation and all(_has_reference(recording) for recording in data.validation):
             metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
-        metrics |= {f"noise_{name}": self.levels[name] for name in self.settings.level_names}
+        metrics |= {f"noise_{name}": self.values[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
 
     def _fit_curves(self, recordings: Sequence[Recording]) -> dict[str, float]:
         """Set curves and the covariance of their logarithms; returns them with half the width of their 95 % intervals."""
-        linear = self.settings.tyres == "linear"
+        linear = self.tyres == "linear"
         kind: Literal["linear", "rational"] = "linear" if linear else "rational"
-        motion = axle_motion(recordings, self.settings.car, self.settings.minimum_speed)
+        motion = axle_motion(recordings, self.car, self.minimum_speed)
         fit = fit_motion(motion, kind)
         rows = [1, 3] if linear else [0, 1, 2, 3]
-        self.curves[rows] = [*fit.front, *fit.rear]
+        self.axle_curves[rows] = [*fit.front, *fit.rear]
         self.curve_covariance = np.zeros((len(CURVES), len(CURVES)))
         for axle, covariance in enumerate(_doubts(motion, kind, fit)):
             own = rows[axle * len(covariance) : (axle + 1) * len(covariance)]
             self.curve_covariance[np.ix_(own, own)] = covariance
-        found = {CURVES[row]: float(self.curves[row]) for row in rows}
-        half = NORMAL_95 * self.curves * np.sqrt(np.diagonal(self.curve_covariance))
+        found = {CURVES[row]: float(self.axle_curves[row]) for row in rows}
+        half = NORMAL_95 * self.axle_curves * np.sqrt(np.diagonal(self.curve_covariance))
         intervals = {f"{CURVES[row]}_interval": float(half[row]) for row in rows}
-        self.curve_covariance[np.ix_(rows, rows)] += (self.settings.curves.deviation or 0.0) ** 2 * np.eye(len(rows))
+        self.curve_covariance[np.ix_(rows, rows)] += (self.curves.deviation or 0.0) ** 2 * np.eye(len(rows))
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
         return {**found, **intervals, **rms}
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        unknown = [name for name in self.settings.level_names if getattr(self.settings.noise, name) is None]
-        levels = {**self.levels, **{name: value for name, value in ASSUMED.items() if name in unknown}}
+        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
+        levels = {**self.values, **{name: value for name, value in ASSUMED.items() if name in unknown}}
         for name in ("yaw_rate", "ay"):
             if name not in unknown:
                 continue
@@ -348,7 +286,7 @@ class RationalFilter(SingleTrackEstimator):
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
-        if self.settings.filter == "extended":
+        if self.filter == "extended":
             return self
         twin = copy(self)
         twin.settings = replace(self.settings, filter="extended")
@@ -358,7 +296,7 @@ class RationalFilter(SingleTrackEstimator):
         """Levels with the smallest error of sideslip, as powers of ten."""
         pairs = [_samples(recording) for recording in recordings]
         wanted = [_reference(recording) for recording in recordings]
-        skip = round(training.skip_seconds * self.settings.rate_hz)
+        skip = round(training.skip_seconds * self.rate_hz)
 
         def cost(powers: FloatArray) -> float:
             levels = self._calibrated(powers, pairs)
@@ -372,9 +310,9 @@ class RationalFilter(SingleTrackEstimator):
     def _calibrated(self, powers: FloatArray, pairs: Sequence[FloatArray]) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
         found = dict(zip(self._searched, (10.0**powers).tolist(), strict=True))
-        tyres = found.get("tyres", self.settings.noise.tyres or 0.0)
+        tyres = found.get("tyres", self.noise.tyres or 0.0)
         if "ay" not in found:
-            return {**self.levels, "tyres": tyres}
+            return {**self.values, "tyres": tyres}
 
         def scaled(scale: float) -> dict[str, float]:
             return {"yaw_rate": scale, "ay": scale * found["ay"], "steer": scale * found["steer"], "tyres": tyres}
@@ -392,89 +330,83 @@ class RationalFilter(SingleTrackEstimator):
 
     def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float) -> float:
         pairs, wanted = [_samples(r) for r in recordings], [_reference(r) for r in recordings]
-        return self._cost(pairs, wanted, self.levels, round(skip_seconds * self.settings.rate_hz))
+        return self._cost(pairs, wanted, self.values, round(skip_seconds * self.rate_hz))
 
     def _cost(self, pairs: Sequence[FloatArray], wanted: Sequence[FloatArray], levels: Mapping[str, float], skip: int) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
         total, count = 0.0, 0
         for samples, reference in zip(pairs, wanted, strict=True):
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
-            counted = (samples[skip:, 1] >= self.settings.minimum_speed) & np.isfinite(reference[skip:])
+            counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
         value = total / max(count, 1)
         return value if math.isfinite(value) else BAD
 
-    def start(self, sample: FloatArray, initial_state: Mapping[str, float] | None = None) -> Gaussian[FloatArray]:
-        """State before the first sample: at rest on its course, or what a protocol hands over; parameters as they were fitted."""
-        given = dict(initial_state or {})
-        mean = np.zeros(len(MOTION) + len(self.settings.adapted))
-        covariance = np.zeros((len(mean), len(mean)))
-        covariance[range(4), range(4)] = np.square(ROLLING)
-        if "vy" in given:
-            mean[0], covariance[0, 0] = math.atan2(given["vy"], max(sample[1], self.settings.minimum_speed)), KNOWN**2
-        if "yaw_rate" in given:
-            mean[1], covariance[1, 1] = given["yaw_rate"], KNOWN**2
-        covariance[4:, 4:] = self.start_tyres()
-        return Gaussian(mean, covariance)
+    def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
+        """At rest on its course, or what a protocol hands over; parameters as they were fitted."""
+        tyres = self.start_tyres()
+        first = self.first_motion(sample, np.array([*ROLLING, *np.zeros(len(tyres))]), given)
+        first.covariance[4:, 4:] = tyres
+        return first
 
     def start_tyres(self) -> FloatArray:
         """Covariance of the logarithms of the adapted tyre parameters at the start, (n - 4, n - 4)."""
-        adapted = self.settings.adapted
+        adapted = self.adapted
         if adapted == ("friction",):
             return np.array([[FRICTION_START**2]])
         rows = [CURVES.index(name) for name in adapted]
         return np.ascontiguousarray(self.curve_covariance[np.ix_(rows, rows)])
 
-    def gate(self) -> Gate | None:
-        """That of filters in use."""
-        return Gate.of(self.settings.gate, self.settings.rate_hz)
-
     def bounds(self) -> FloatArray:
         """Largest absolute value of each state, (n,)."""
         spread = WITHIN * np.sqrt(np.diagonal(self.start_tyres()))
-        return np.array([*LARGEST, *np.maximum(spread, math.log(self.settings.bound)).tolist()])
+        return np.array([*LARGEST, *np.maximum(spread, math.log(self.bound)).tolist()])
 
     def filter_samples(
         self,
         samples: FloatArray,
         first: Gaussian[FloatArray] | None = None,
-        levels: Mapping[str, float] | None = None,
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
-    ) -> FilteredDrive:
+        levels: Mapping[str, float] | None = None,
+    ) -> FilteredStates:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
 
-        ``gate`` and ``refused`` (how often on end yaw rate and ay were before the first sample, after the last one on return): see `Gate`.
-        Levels are found without a gate, which noise that is too small would close.
+        Args:
+            samples: (T, 4).
+            first: none: `first_gaussian` of the first sample.
+            levels: of noise; none: `values`.
+            gate: levels are found without.
+            refused: see `Gate`.
 
         Raises:
             ConfigurationError: curves or levels are neither given nor fitted.
         """
-        levels = self.levels if levels is None else levels
-        self._require_fitted(levels)
-        first = self.start(samples[0]) if first is None else first
-        if self.settings.filter == "unscented":
+        levels = self.values if levels is None else levels
+        self.require_fitted(levels)
+        first = self.first_gaussian(samples[0], {}) if first is None else first
+        if self.filter == "unscented":
             return self._unscented(samples, first, levels)
         from vehest.estimators.kernels.rational_ekf import scan
 
-        car, adapted, bound = self.settings.car, self.settings.adapted, self.bounds()
+        car, adapted, bound = self.car, self.adapted, self.bounds()
         mean, covariance = first.mean.copy(), first.covariance.copy()
         out = _empty(len(samples), len(mean))
         scan(
             np.ascontiguousarray(samples),
             np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle]),
-            np.array([*self.curves, 1.0]),
+            np.array([*self.axle_curves, 1.0]),
             np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
             np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted)]),
             -bound,
             bound,
             np.square(ROLLING),
             self.start_tyres(),
-            self.settings.largest_sideslip,
+            self.largest_sideslip,
             LOST**2,
-            1.0 / self.settings.rate_hz,
-            self.settings.minimum_speed,
-            self.settings.adapt_above,
+            1.0 / self.rate_hz,
+            self.minimum_speed,
+            self.adapt_above,
             math.inf if gate is None else gate.deviations**2,
             0 if gate is None else gate.patience,
             np.zeros(2, np.int64) if refused is None else refused,
@@ -482,13 +414,14 @@ class RationalFilter(SingleTrackEstimator):
             covariance,
             *out,
         )
-        return FilteredDrive(*out, Gaussian(mean, covariance))
+        means, deviation, *others = out
+        return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
 
     def nonlinear_model(self, levels: Mapping[str, float] | None = None) -> NonlinearModel:
         """The same for the filters of `vehest.filters.nonlinear`; inputs are speed and steering angle."""
-        levels = self.levels if levels is None else levels
+        levels = self.values if levels is None else levels
         track, bound = self.track(), torch.as_tensor(self.bounds())
-        n_tyres = len(self.settings.adapted)
+        n_tyres = len(self.adapted)
         tyres = torch.full((n_tyres,), levels["tyres"], dtype=torch.float64)
         noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
 
@@ -506,17 +439,17 @@ class RationalFilter(SingleTrackEstimator):
             process_noise,
             lambda states, inputs: noise.expand(*states.shape[:-1], 2, 2),
             lambda states: torch.maximum(torch.minimum(states, bound), -bound),
-            self._found_again,
+            self._restart_if_diverged,
             free if self._holds else None,
         )
 
     def _adapts(self, yaw_rate: Tensor, inputs: Tensor) -> Tensor:
         """Whether the car corners hard enough for its tyres to show."""
-        return (inputs[..., 0] * yaw_rate).abs() >= self.settings.adapt_above
+        return (inputs[..., 0] * yaw_rate).abs() >= self.adapt_above
 
-    def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredDrive:
+    def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
         """Stretch by stretch: where the car moves the filter, where it hardly does the rolling car."""
-        model, slow = self.nonlinear_model(levels), samples[:, 1] < self.settings.minimum_speed
+        model, slow = self.nonlinear_model(levels), samples[:, 1] < self.minimum_speed
         n, state, at = len(first.mean), first, 0
         out = _empty(len(samples), n)
         rule = cubature_rule(n)
@@ -533,7 +466,7 @@ class RationalFilter(SingleTrackEstimator):
             before = 1 if at else 0  # one more sample, whose measurements the state holds already
             rows = samples[at - before : end].copy()
             rows[:before, [0, 2]] = np.nan
-            inputs = torch.as_tensor(np.stack([np.maximum(rows[:, 1], self.settings.minimum_speed), rows[:, 3]], 1))
+            inputs = torch.as_tensor(np.stack([np.maximum(rows[:, 1], self.minimum_speed), rows[:, 3]], 1))
             initial = Gaussian(torch.as_tensor(state.mean), torch.as_tensor(state.covariance))
             with torch.no_grad():
                 steps = unscented_filter(model, torch.as_tensor(rows[:, [0, 2]]), inputs, initial, rule).steps
@@ -541,14 +474,15 @@ class RationalFilter(SingleTrackEstimator):
             _write(out, slice(at, end), *(part.numpy()[before:] for part in parts))
             state = Gaussian(steps.filtered.mean[-1].numpy(), steps.filtered.covariance[-1].numpy())
             at = end
-        return FilteredDrive(*out, state)
+        means, deviation, *others = out
+        return FilteredStates(means, *others, state, deviation)  # type: ignore[call-arg, arg-type]
 
-    def _found_again(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+    def _restart_if_diverged(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
         """The motion of a car that rolls, where the sideslip angle is lost; without measurements the model may be unstable.
 
         Where it is beyond its limit the tyres are taken to be the reason, and start anew as well.
         """
-        diverged = ~(state.mean[..., 0].abs() < self.settings.largest_sideslip)
+        diverged = ~(state.mean[..., 0].abs() < self.largest_sideslip)
         lost = diverged | ~(state.covariance[..., 0, 0] < LOST**2)
         if not bool(lost.any()):
             return state
@@ -564,7 +498,7 @@ class RationalFilter(SingleTrackEstimator):
 
     def _rolled(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
         """The state with the motion of a car that rolls without slip, under speed and steering angle, (..., 2)."""
-        car = self.settings.car
+        car = self.car
         turn = inputs[..., 1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
         mean, covariance = state.mean.clone(), state.covariance.clone()
         mean[..., :4] = torch.stack([car.cg_to_rear_axle * turn, inputs[..., 0] * turn, 0.0 * turn, 0.0 * turn], -1)
@@ -575,47 +509,39 @@ class RationalFilter(SingleTrackEstimator):
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""
-        values = dict(zip(TYRE_PARAMETERS, np.repeat([*self.curves, 1.0], len(states)).reshape(5, -1), strict=True))
-        for column, name in enumerate(self.settings.adapted, len(MOTION)):
+        values = dict(zip(TYRE_PARAMETERS, np.repeat([*self.axle_curves, 1.0], len(states)).reshape(5, -1), strict=True))
+        for column, name in enumerate(self.adapted, len(MOTION)):
             values[name] = values[name] * np.exp(states[:, column])
         return values
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        samples = _samples(recording)
-        filtered = self.filter_samples(samples, self.start(samples[0], initial_state), gate=self.gate())
-        nis, n_measured = filtered.nis()
-        others = {**self._quantities(filtered.mean), "nis": nis, "nis_dof": n_measured}
-        return self.wrapped_state(recording, filtered.mean[:, :2], filtered.sideslip_covariance, **others)
-
-    def _quantities(self, states: FloatArray) -> dict[str, FloatArray]:
+    def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
         """What an estimate says of the tyres."""
         tyres = self.parameters_of(states)
         found = {f"cornering_stiffness_{axle}": tyres[f"c2_{axle}"] * tyres["friction"] for axle in ("front", "rear")}
-        if self.settings.tyres != "linear":
+        if self.tyres != "linear":
             found |= {f"tyre_c1_{axle}": tyres[f"c1_{axle}"] for axle in ("front", "rear")}
-        if self.settings.tyres == "rational_friction":
+        if self.tyres == "rational_friction":
             found["friction"] = tyres["friction"]
         return found
 
-    def _require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
-        if np.isnan(self.curves).any() or any(math.isnan(level) for level in (levels or {}).values()):
+    def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
+        """Raises:
+        ConfigurationError: curves or levels are neither given nor fitted.
+        """
+        has_no_curves = np.isnan(self.axle_curves).any()
+        if has_no_curves or any(math.isnan(level) for level in (self.values if levels is None else levels).values()):
             raise ConfigurationError(
-                f"estimator '{self.name}' has no {'axle curves' if np.isnan(self.curves).any() else 'noise levels'} yet; "
+                f"estimator '{self.name}' has no {'axle curves' if has_no_curves else 'noise levels'} yet; "
                 "fit or load it first, or give estimator.curves and estimator.noise"
             )
-
-    def online(self) -> RationalStepper:
-        """A stepper that starts as an estimate does."""
-        self._require_fitted(self.levels)
-        return RationalStepper(self)
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Curves c₁ and c₂ of the front, then of the rear axle, the covariance of their logarithms, and the levels of noise.
 
         Linear tyres have no c₁: 0 stands for it in a file, whose numbers are finite.
         """
-        levels = np.array([self.levels[name] for name in LEVELS])
-        curves = np.where(np.isinf(self.curves), 0.0, self.curves)
+        levels = np.array([self.values[name] for name in LEVELS])
+        curves = np.where(np.isinf(self.axle_curves), 0.0, self.axle_curves)
         return {"curves": curves, "curve_covariance": self.curve_covariance.copy(), "levels": levels}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
@@ -624,25 +550,57 @@ class RationalFilter(SingleTrackEstimator):
         if {name: values.shape for name, values in weights.items()} != shapes:
             raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)}, not {', '.join(weights)}")
         curves = np.array(weights["curves"], dtype=np.float64)
-        self.curves = np.where(curves == 0.0, math.inf, curves)
+        self.axle_curves = np.where(curves == 0.0, math.inf, curves)
         self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)
-        self.levels = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
+        self.values = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
+
+    def c_values(self) -> dict[str, Any]:
+        """Its car, curves, levels of noise and gate.
+
+        Raises:
+            ConfigurationError: its filter is unscented.
+        """
+        if self.filter != "extended":
+            raise ConfigurationError("estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended")
+        adapted = [_slope_in_c(name) for name in self.adapted]
+        step = 1.0 / self.rate_hz
+        return {
+            **gate_values(self.gate_in_use()),
+            "n": 4 + len(adapted),
+            "columns": 4 + len(adapted) + max(2, 1 + len(adapted)),
+            "linear": self.tyres == "linear",
+            "adapted": adapted,
+            "wanted": [part for part in ("c1", "friction") if any(part in tyre["slope"] for tyre in adapted)],
+            "states": {name: row for row, name in enumerate(self.adapted, 4)},
+            "curves": dict(zip(TYRE_PARAMETERS, [*self.axle_curves.tolist(), 1.0], strict=True)),
+            "car": self.car,
+            "step": step,
+            "minimum_speed": self.minimum_speed,
+            "adapt_above": self.adapt_above,
+            "sensors": [self.values["yaw_rate"], self.values["ay"]],
+            "steer_spread": math.sqrt(step) * self.values["steer"],
+            "tyre_spread": math.sqrt(step) * self.values["tyres"],
+            "bounds": self.bounds(),
+            "rolling": ROLLING,
+            "largest_sideslip": self.largest_sideslip,
+            "lost": LOST,
+            "tyre_root": _root(self.start_tyres()),
+        }
 
 
-class RationalStepper(SingleTrackStepper):
-    """The filter, one sample at a time; it also tells of the tyres."""
+def _slope_in_c(name: str) -> dict[str, str]:
+    """A tyre parameter that is a state: the axle it is of, and the member of the axle's force that is its slope."""
+    if name == "friction":
+        return {"name": name, "axle": "both", "slope": "per_log_friction"}
+    curve, axle = name.split("_")
+    return {"name": name, "axle": axle, "slope": "force" if curve == "c2" else "per_log_c1"}
 
-    _estimator: RationalFilter
 
-    def _first(self, row: FloatArray) -> Gaussian[FloatArray]:
-        return self._estimator.start(row)
-
-    def _filtered(
-        self, rows: FloatArray, state: Gaussian[FloatArray], refused: NDArray[np.int64]
-    ) -> tuple[Gaussian[FloatArray], dict[str, float]]:
-        filtered = self._estimator.filter_samples(rows, state, gate=self._estimator.gate(), refused=refused)
-        tyres = self._estimator._quantities(filtered.mean[-1:])
-        return filtered.last, {name: float(values[-1]) for name, values in tyres.items()}
+def _root(covariance: FloatArray) -> FloatArray:
+    """Lower triangular L with L Lᵀ = covariance, which need not be definite."""
+    values, vectors = np.linalg.eigh(covariance)
+    upper = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T)[1]
+    return np.ascontiguousarray(upper.T)
 
 
 def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording]:
@@ -666,7 +624,7 @@ def _doubts(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFi
 
 
 def _samples(recording: Recording) -> FloatArray:
-    return recording.stack(SingleTrackEstimator.channels)
+    return recording.stack(SideslipFilter.channels)
 
 
 def _has_reference(recording: Recording) -> bool:

@@ -1,81 +1,139 @@
-"""What recursions with a state and a handful of fitted numbers need besides: fitting, estimating, running online, saving."""
+"""Base of observers and filters: fitting their numbers, estimating, running online, saving."""
 
 from __future__ import annotations
 
 import math
 import time
-from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, ClassVar
 
+import numba
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
+from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.training.context import FitContext, NoTraining
+from vehest.training.search import nelder_mead_over_grid
 
 
-class RecursiveEstimator(Estimator):
-    """An observer or filter: it goes through samples in order and carries a state; its fit, if any, determines a few numbers.
+def compiled(step: Callable[..., Any]) -> Any:
+    """Decorator of a family's ``step``, which numba compiles when it is first used."""
+    return staticmethod(numba.njit(error_model="numpy")(step))
 
-    Nothing in it is random. `run` is called with all samples of a recording, or online with one at a time.
+
+class Recursive(Estimator):
+    """An observer or filter: it goes through samples in order and carries a state. Nothing in it is random.
+
+    Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a setting is not fitted. A family has
+    either a compiled ``step(numbers, state, sample)``, which returns the state after a sample, or its own `run`.
 
     Attributes:
-        numbers: names of what the fit determines, each one number.
-        values: those numbers; NaN before the fit.
+        states: quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first.
+        values: fitted numbers by name.
     """
 
-    training_type = NoTraining
-    numbers: ClassVar[tuple[str, ...]] = ()
+    training_type: ClassVar[type] = NoTraining
+    states: ClassVar[tuple[str, ...]] = ("vy",)
+    refuses: ClassVar[tuple[str, ...]] = ("NaN",)
+    step: ClassVar[Any]
+    values: dict[str, float]
 
-    def __init__(self, settings: EstimatorSettings) -> None:
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name, declared in cls.settings_type.declarations().items():
+            if declared.is_fitted:
+                setattr(cls, name, _FittedNumber(name))
+
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.values = dict.fromkeys(self.numbers, math.nan)
+        declared = settings.declarations()
+        given = {name: getattr(settings, name) for name in declared if declared[name].is_fitted}
+        self.values = {name: math.nan if value is None else value for name, value in given.items()}
+        self.unknown = tuple(name for name, value in given.items() if value is None)
 
-    @abstractmethod
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
-        """The state before the first sample.
+        """The state before the first sample: what is given, else what is measured, else 0.
 
         Args:
             sample: values of ``channels``, (C,).
             given: what a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty otherwise.
         """
+        measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
+        return tuple(float(given.get(name, measured.get(name, 0.0))) for name in self.states)
 
-    @abstractmethod
-    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
-        """Go on from a state.
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
+        """The quantities of ``states`` by the compiled ``step``; see `Estimator.run`."""
+        found = np.empty((len(samples), len(self.states)))
+        state = _scan(self.step, self.numbers(), state, np.ascontiguousarray(samples), found)
+        return dict(zip(self.states, found.T.copy(), strict=True)), state
 
-        Args:
-            samples: values of ``channels``, (T, C), T ≥ 1.
-            state: that before the first of them.
+    def numbers(self) -> Any:
+        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes them."""
+        numbers = {name: value for name, value in vars(self.settings).items() if isinstance(value, float)} | self.values
+        return self._numbers_type(**numbers, dt=1.0 / self.rate_hz)
 
-        Returns:
-            Quantities of an `Estimate` at the time of each sample, (T,), ``vy`` [m/s] among them, and the state after the last.
+    @cached_property
+    def _numbers_type(self) -> Any:
+        names = [name for name, value in vars(self.settings).items() if isinstance(value, float) and name not in self.values]
+        return namedtuple("Numbers", [*names, *self.values, "dt"])
+
+    def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
+        """Numbers of the smallest mean squared error of vy, where the family has them in closed form.
+
+        Raises:
+            DataError: the recordings do not determine them.
         """
+        return None
 
-    def fitted(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
-        """What is best for `numbers`, and how it was found; for estimators that have any.
+    def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
+        """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
         Args:
             data: recordings with ``vy_ref``, without gaps but in channels that are skippable.
             training: of ``training_type``.
             context: progress and the wish to stop.
         """
-        raise NotImplementedError(f"{type(self).__name__} has numbers to determine, and no method 'fitted'")
+        values = self.closed_form(data.train)
+        if values is not None:
+            self.values |= values
+            losses = {"best_train_loss": data.train, "best_validation_loss": data.validation}
+            return values, FitRecord(metrics={name: self.mean_squared_error(recordings) for name, recordings in losses.items()})
+        declared = [self.settings.declarations()[name] for name in self.unknown]
+        scales = [max(float(np.abs(r[own.of_largest]).max()) for r in data.train) if own.of_largest else 1.0 for own in declared]
+        boxes, starts = (
+            [tuple(value * scale for value in getattr(own, part)) for own, scale in zip(declared, scales, strict=True)]
+            for part in ("box", "start")
+        )
+
+        def cost(numbers: FloatArray) -> float:
+            self.values |= dict(zip(self.unknown, numbers.tolist(), strict=True))
+            return self.mean_squared_error(data.train)
+
+        search = nelder_mead_over_grid(cost, boxes, starts, training, context)  # type: ignore[arg-type]
+        self.values |= dict(zip(self.unknown, search.best.tolist(), strict=True))
+        columns = (*(f"start_{name}" for name in self.unknown), *self.unknown, "train_loss")
+        history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+        metrics = {
+            "evaluations": search.evaluations,
+            "best_train_loss": search.cost,
+            "best_validation_loss": self.mean_squared_error(data.validation),
+        }
+        return self.values, FitRecord(history, metrics, search.interrupted)
 
     @property
     def n_parameters(self) -> int:
-        """As many as `numbers` has names."""
-        return len(self.numbers)
+        """How many numbers are not given."""
+        return len(self.unknown)
 
     @property
     def learns(self) -> bool:
         """Whether there is any number to determine."""
-        return bool(self.numbers)
+        return bool(self.unknown)
 
     def seed(self, seed: int) -> None:
         """Nothing here is random."""
@@ -88,25 +146,24 @@ class RecursiveEstimator(Estimator):
             DataError: a channel or the reference is missing or has gaps.
         """
         started = time.monotonic()
-        own = [member for member in members if isinstance(member, RecursiveEstimator)]
+        own = [member for member in members if isinstance(member, Recursive)]
         values: Mapping[str, float] = {}
         record = FitRecord()
-        if cls.numbers:
+        if own[0].learns:
             for recording in (*data.train, *data.validation):
-                cls._check_complete(recording)
-            values, record = own[0].fitted(data, training, context)
+                own[0]._check_complete(recording)
+            values, record = own[0].find_numbers(data, training, context)
         for member in own:
-            member.values = {name: float(values[name]) for name in cls.numbers}
+            member.values |= {name: float(value) for name, value in values.items()}
         metrics = {"epochs": 0, **record.metrics, "train_seconds": time.monotonic() - started}
         return [replace(record, metrics=metrics)] * len(members)
 
-    @classmethod
-    def _check_complete(cls, recording: Recording) -> None:
-        for name in (*cls.channels, "vy_ref"):
+    def _check_complete(self, recording: Recording) -> None:
+        for name in (*self.channels, *self.learns_from):
             if name not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which the fit of '{cls.name}' needs")
-            if name not in cls.skippable and np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{cls.name}' cannot learn from")
+                raise DataError(f"recording '{recording.id}' has no channel '{name}', which the fit of '{self.name}' needs")
+            if name not in self.skippable and np.isnan(recording[name]).any():
+                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
 
     def mean_squared_error(self, recordings: Sequence[Recording]) -> float:
         """Of vy against ``vy_ref`` with the present `values` [m²/s²]; NaN without recordings."""
@@ -116,23 +173,10 @@ class RecursiveEstimator(Estimator):
             errors.append(self.run(samples, self.first_state(samples[0], {}))[0]["vy"] - recording["vy_ref"])
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        self._check_fitted()
-        samples = recording.stack(self.channels)
-        found, _ = self.run(samples, self.first_state(samples[0], dict(initial_state or {})))
-        others = {name: values for name, values in found.items() if name != "vy"}
-        return self._wrapped(recording, found["vy"], **others)  # type: ignore[arg-type]
-
-    def online(self) -> Stepper:
-        """A stepper without a state yet.
-
-        Raises:
-            ConfigurationError: it has not been fitted.
+    def require_fitted(self) -> None:
+        """Raises:
+        ConfigurationError: a number is neither given nor fitted.
         """
-        self._check_fitted()
-        return RecursiveStepper(self)
-
-    def _check_fitted(self) -> None:
         if any(math.isnan(value) for value in self.values.values()):
             raise ConfigurationError(f"estimator '{self.name}' has not been fitted yet; fit or load it first")
 
@@ -147,26 +191,29 @@ class RecursiveEstimator(Estimator):
             DataError: one is missing.
         """
         try:
-            self.values = {name: float(weights[name][0]) for name in self.numbers}
+            self.values = {name: float(weights[name][0]) for name in self.values}
         except (KeyError, IndexError):
-            raise DataError(f"weights of '{self.name}' must be {', '.join(self.numbers)}, not {', '.join(weights)}") from None
+            raise DataError(f"weights of '{self.name}' must be {', '.join(self.values)}, not {', '.join(weights)}") from None
 
 
-class RecursiveStepper(Stepper):
-    """A recursion, one sample at a time."""
+class _FittedNumber:
+    """Attribute of an estimator that is one of its ``values``."""
 
-    def __init__(self, estimator: RecursiveEstimator) -> None:
-        self._estimator = estimator
-        self._state: Any = None
-        self._started = False
+    def __init__(self, name: str) -> None:
+        self.name = name
 
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Every quantity at the time of the sample, ``vy`` [m/s] among them; NaN in skippable channels was not measured."""
-        row = np.array(required(sample, self._estimator.channels))
-        for name, value in zip(self._estimator.channels, row, strict=True):
-            if math.isnan(value) and name not in self._estimator.skippable:
-                raise DataError(f"the sample's '{name}' is NaN, which estimator '{self._estimator.name}' cannot skip")
-        state = self._state if self._started else self._estimator.first_state(row, {})
-        found, self._state = self._estimator.run(row[None], state)
-        self._started = True
-        return {name: float(values[0]) for name, values in found.items()}
+    def __get__(self, owner: Recursive | None, kind: type | None = None) -> Any:
+        return self if owner is None else owner.values[self.name]
+
+    def __set__(self, owner: Recursive, value: float) -> None:
+        owner.values[self.name] = float(value)
+
+
+@numba.njit(error_model="numpy")
+def _scan(step, numbers, state, samples, found):  # type: ignore[no-untyped-def]
+    """State after the last sample; writes the state after each sample into ``found``, (T, n)."""
+    for k in range(len(samples)):
+        state = step(numbers, state, samples[k])
+        for i in range(len(state)):
+            found[k, i] = state[i]
+    return state

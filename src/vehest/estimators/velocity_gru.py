@@ -2,35 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vehest.data.errors import ConfigurationError
-from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork, VelocityNetworkSettings
-
-
-@dataclass(frozen=True)
-class VelocityGruSettings(VelocityNetworkSettings):
-    """Settings of the GRU.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        inputs: measured channels that the network sees.
-        outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates.
-        n_states: size of the hidden state.
-        dropout: share of the hidden state that is hidden from the read-out in training.
-        negative_slope: of the leaky rectifier after the read-out; the paper gives none, 0.3 is assumed (the default of Keras).
-    """
-
-    dropout: float = 0.075
-    negative_slope: float = 0.3
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.negative_slope <= 1:
-            raise ConfigurationError(f"estimator.negative_slope must be over 0 and at most 1, not {self.negative_slope}")
+from vehest.estimators.declared import setting
+from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork
 
 
 class VelocityGruNetwork(VelocityNetwork):
@@ -41,7 +19,7 @@ class VelocityGruNetwork(VelocityNetwork):
     Source: Srinivasan et al., End-to-end velocity estimation for autonomous racing, IEEE RA-L 5 (4), 2020.
     """
 
-    def __init__(self, settings: VelocityGruSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.negative_slope = settings.negative_slope
         self.recurrent = nn.GRU(len(settings.inputs), settings.n_states, batch_first=True)
@@ -63,10 +41,11 @@ class VelocityGru(RecurrentVelocityEstimator):
 
     name = "velocity_gru"
     title = "Velocity GRU"
-    settings_type = VelocityGruSettings
-    settings: VelocityGruSettings
+    dropout: float = setting(0.075, "share of the hidden state that is hidden from the read-out in training", least=0.0, below=1.0)
+    negative_slope: float = setting(0.3, "of the leaky rectifier after the read-out; assumed (the default of Keras)", above=0.0, most=1.0)
 
-    def _new_network(self) -> VelocityGruNetwork:
+    def new_network(self) -> VelocityGruNetwork:
+        """A network of these sizes."""
         return VelocityGruNetwork(self.settings)
 
 

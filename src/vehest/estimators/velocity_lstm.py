@@ -2,35 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError
-from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork, VelocityNetworkSettings
-
-
-@dataclass(frozen=True)
-class VelocityLstmSettings(VelocityNetworkSettings):
-    """Settings of the LSTM.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        inputs: measured channels that the network sees.
-        outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates.
-        n_states: size of the hidden state; 64 is assumed.
-        dropout: share of the hidden state that is hidden from the dense layers in training; that of the GRU is assumed.
-        n_dense: neurons of the hidden dense layer; 64 is assumed.
-    """
-
-    dropout: float = 0.075
-    n_dense: int = 64
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.n_dense < 1:
-            raise ConfigurationError(f"estimator.n_dense must be at least 1, not {self.n_dense}")
+from vehest.estimators.declared import setting
+from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork
 
 
 class VelocityLstmNetwork(VelocityNetwork):
@@ -44,7 +22,7 @@ class VelocityLstmNetwork(VelocityNetwork):
     Source: Bou Ghosn et al., Robust LSTM-based vehicle velocity observer for regular and near-limits applications, IEEE IV 2023.
     """
 
-    def __init__(self, settings: VelocityLstmSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.recurrent = nn.LSTM(len(settings.inputs), settings.n_states, batch_first=True)
         self.dense = nn.Linear(settings.n_states + len(settings.outputs), settings.n_dense)
@@ -78,10 +56,11 @@ class VelocityLstm(RecurrentVelocityEstimator):
 
     name = "velocity_lstm"
     title = "Velocity LSTM"
-    settings_type = VelocityLstmSettings
-    settings: VelocityLstmSettings
+    dropout: float = setting(0.075, "share of the hidden state that is hidden from the dense layers in training", least=0.0, below=1.0)
+    n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
 
-    def _new_network(self) -> VelocityLstmNetwork:
+    def new_network(self) -> VelocityLstmNetwork:
+        """A network of these sizes."""
         return VelocityLstmNetwork(self.settings)
 
 

@@ -1,33 +1,30 @@
-"""The plainest baseline: the car does not slide."""
+"""Baseline: the car does not slide."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.estimators.base import EstimatorSettings
-from vehest.estimators.baseline import Baseline
+from vehest.estimators.recursive import Recursive
 
 
-@dataclass(frozen=True)
-class ZeroSettings(EstimatorSettings):
-    """Nothing to choose but the rate."""
+class Zero(Recursive):
+    """v = 0 at all times."""
 
-
-class Zero(Baseline):
-    """v = 0 at all times: what an estimator is worth at all is what it takes away from this error."""
-
-    name = "zero"
-    title = "Zero (v = 0)"
+    name, title = "zero", "Zero (v = 0)"
     channels = ("vx",)
-    settings_type = ZeroSettings
+    ignores_initial_state = True
+    template = "static"
 
-    def lateral_velocity(self, samples: Mapping[str, FloatArray], start: float = 0.0) -> FloatArray:
+    def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Zeros [m/s]."""
-        return np.zeros(len(samples["vx"]))
+        return {"vy": np.zeros(len(samples))}, state
+
+    def c_values(self) -> dict[str, Any]:
+        """Its equation."""
+        return {"about": "v = 0."}
 
 
 ESTIMATOR = Zero

@@ -1,37 +1,17 @@
-"""The method of a fitted estimator as C99: a header with its state and a source with its step, one template a family."""
+"""The method of a fitted estimator as C99: a header with its state and a source with its step, by the family's template."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import sys
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
+from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.export.rendering import Precision, ascii_only, render, render_block
-
-FAMILIES = {
-    "zero": "baselines",
-    "static_map": "baselines",
-    "kinematic": "baselines",
-    "data_sheet": "baselines",
-    "luenberger": "luenberger",
-    "kalman": "kalman",
-    "ksnn": "ksnn",
-    "gru": "recurrent",
-    "lstm": "recurrent",
-    "velocity_gru": "recurrent",
-    "velocity_lstm": "recurrent",
-    "sideslip_ffnn": "sample_networks",
-    "rational_ekf": "rational_ekf",
-    "learned_ukf": "learned_ukf",
-    "dugoff_ukf": "track_ukf",
-    "ensemble_ukf": "track_ukf",
-    "cnn_ukf": "track_ukf",
-}
-"""Module of `vehest.export.methods` that exports a family, by the family's name in the registry; its function has that name."""
 
 
 @dataclass(frozen=True)
@@ -41,31 +21,12 @@ class MethodSource:
     Args:
         header: vehest_method.h.
         source: vehest_method.c.
-        notes: lines for whoever uses it: licences, and where a precision does not suffice.
+        notes: lines for whoever uses it, such as a patent.
     """
 
     header: str
     source: str
     notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class MethodTemplate:
-    """What a family's module in `vehest.export.methods` returns.
-
-    Args:
-        name: template in ``templates/methods``, without ending.
-        values: what it needs of the fitted estimator.
-        refuses_nan: channels whose absence ends in an error in Python's stepper.
-        refuses_infinite: channels whose infinite value does.
-        notes: see `MethodSource`; they also stand at the top of the source.
-    """
-
-    name: str
-    values: Mapping[str, Any]
-    refuses_nan: tuple[str, ...] = ()
-    refuses_infinite: tuple[str, ...] = ()
-    notes: tuple[str, ...] = field(default=())
 
 
 def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
@@ -74,17 +35,20 @@ def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
     Raises:
         ConfigurationError: the family has no C, or the estimator is not causal or not fitted.
     """
-    template = _template(estimator, precision)
-    path = f"methods/{template.name}.c.j2"
-    values = {**_common(estimator), **template.values}
-    values |= {
-        "refuses_nan": template.refuses_nan,
-        "refuses_infinite": template.refuses_infinite,
-        "notes": template.notes,
+    if not estimator.template:
+        raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}")
+    estimator.online()  # raises where it is not causal, or not fitted
+    path = f"methods/{estimator.template}.c.j2"
+    beside = Path(str(sys.modules[type(estimator).__module__].__file__)).parent
+    refuses = {
+        "refuses_nan": [name for name in estimator.channels if "NaN" in estimator.refuses and name not in estimator.skippable],
+        "refuses_infinite": estimator.channels if "infinite" in estimator.refuses else (),
+        "notes": estimator.notice,
     }
-    state = render_block(path, "state", precision, **values).rstrip()
+    values = {**_common(estimator), **estimator.c_values(), **refuses}
+    state = render_block(path, "state", precision, beside, **values).rstrip()
     header = render("method.h.j2", precision, **values, state=state)
-    return MethodSource(header, render(path, precision, **values), template.notes)
+    return MethodSource(header, render(path, precision, beside, **values), estimator.notice)
 
 
 def types_header(estimator: Estimator, precision: Precision) -> str:
@@ -94,16 +58,7 @@ def types_header(estimator: Estimator, precision: Precision) -> str:
 
 def exportable() -> tuple[str, ...]:
     """Names of families that have C."""
-    return tuple(FAMILIES)
-
-
-def _template(estimator: Estimator, precision: Precision) -> MethodTemplate:
-    if estimator.name not in FAMILIES:
-        raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(FAMILIES)}")
-    estimator.online()  # raises where it is not causal, or not fitted
-    module = importlib.import_module(f"vehest.export.methods.{FAMILIES[estimator.name]}")
-    made: MethodTemplate = getattr(module, estimator.name)(estimator, precision)
-    return made
+    return tuple(name for name in estimator_names() if estimator_class(name).template)
 
 
 def _common(estimator: Estimator) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstim
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.sideslip_ffnn import SideslipFfnn
 from vehest.estimators.velocity_gru import VelocityGru
-from vehest.export.methods.ksnn import PATENT
 
 OPSET, IR_VERSION = 18, 9
 """Of the ai.onnx operators and of the file: both are read by onnxruntime from 1.15 on."""
@@ -154,7 +153,7 @@ class Graph:
                 "channels": json.dumps({name: channel(name).unit for name in estimator.channels}, ensure_ascii=False),
                 "outputs": json.dumps(quantities),
                 **{name: json.dumps(start) for name, start in self.starts.items()},
-                **({"licence": " ".join(PATENT)} if estimator.name == "ksnn" else {}),
+                **({"licence": " ".join(estimator.notice)} if estimator.notice else {}),
             },
         )
         _check(model)

@@ -6,6 +6,7 @@ import math
 import re
 import textwrap
 from functools import cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -25,15 +26,22 @@ _BLANK = re.compile(r"\n{3,}")
 _ASCII = {"²": "^2", "³": "^3", "·": "*", "°": "deg", "ω": "omega", "β": "beta", "δ": "delta", "ä": "ae", "ö": "oe", "ü": "ue"}
 
 
-def render(template: str, precision: Precision, **values: Any) -> str:
-    """The text of a template of `vehest.export`; every floating literal outside comments has the type of ``vehest_real``."""
-    text = _environment(precision).get_template(template).render(values)
+def render(template: str, precision: Precision, beside: Path | None = None, **values: Any) -> str:
+    """The text of a template; every floating literal outside comments has the type of ``vehest_real``.
+
+    Args:
+        template: path among those of `vehest.export`; ``methods/NAME`` may also be ``NAME`` in another folder.
+        precision: of numbers.
+        beside: that folder.
+        values: what it needs.
+    """
+    text = _environment(precision, beside).get_template(template).render(values)
     return typed(_BLANK.sub("\n\n", text), precision)
 
 
-def render_block(template: str, block: str, precision: Precision, **values: Any) -> str:
-    """The text of one block of a template."""
-    found = _environment(precision).get_template(template)
+def render_block(template: str, block: str, precision: Precision, beside: Path | None = None, **values: Any) -> str:
+    """The text of one block of a template; see `render`."""
+    found = _environment(precision, beside).get_template(template)
     if block not in found.blocks:
         return ""
     context = found.new_context(dict(values))
@@ -90,11 +98,16 @@ def unit_of(name: str) -> str:
 
 
 @cache
-def _environment(precision: Precision) -> Environment:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+def _environment(precision: Precision, beside: Path | None) -> Environment:
+    from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, PrefixLoader, StrictUndefined
 
+    own = PackageLoader("vehest.export")
     environment = Environment(
-        loader=PackageLoader("vehest.export"), undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+        loader=ChoiceLoader([own, PrefixLoader({"methods": FileSystemLoader(beside)})]) if beside else own,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
     environment.filters |= {
         "real": partial(literal, precision=precision),

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from vehest.estimators.registry import estimator_class, estimator_names
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
 
@@ -83,33 +85,16 @@ REFERENCE = Line(REFERENCE_COLOUR)
 
 
 def colour_of(estimator: str, variant: str = "") -> str:
-    """Colour of an estimator: one hue a family, as in Fig. 6 of Da Lio et al. 2023.
-
-    Luenberger is grey, KS-NN with linear feedback blue, with nonlinear feedback orange (the darker shade has biases), GRU
-    and LSTM are purple. Any other name gets a colour of its own that depends on the name only.
-    """
-    if estimator == "luenberger":
-        return LUENBERGER_GREY
-    if estimator == "ksnn":
-        shades = NONLINEAR_ORANGES if "nonlinear" in variant else LINEAR_BLUES
-        return shades[_has_bias(variant)]
-    if estimator == "gru":
-        return GRU_PURPLE
-    if estimator == "lstm":
-        return LSTM_PURPLE
-    return OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)]
+    """Colour of an estimator; see `line_of`."""
+    return line_of(estimator, variant).colour
 
 
 def line_of(estimator: str, variant: str = "") -> Line:
-    """Line of an estimator; what its colour says, dash and marker say too, for those who see colours differently."""
-    colour = colour_of(estimator, variant)
-    if estimator == "luenberger":
-        return Line(colour, "solid", "s")
-    if estimator == "ksnn":
-        return Line(colour, "solid" if _has_bias(variant) else "dashed", "^" if "nonlinear" in variant else "o")
-    if estimator in {"gru", "lstm"}:
-        return Line(colour, "solid" if estimator == "gru" else "dashed", "D" if estimator == "gru" else "v")
-    return Line(colour, "solid", "P")
+    """Line of an estimator as its family declares it (`Estimator.drawn`), else one of a colour that depends on the name only."""
+    drawn = estimator_class(estimator).drawn(variant) if estimator in estimator_names() else None
+    if drawn is not None:
+        return Line(*drawn)
+    return Line(OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)], "solid", "P")
 
 
 def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
@@ -212,7 +197,3 @@ def listed(words: Sequence[str]) -> str:
 def _grouped(value: float, decimals: int) -> str:
     text = f"{value:,.{decimals}f}" if abs(value) >= 1e4 else f"{value:.{decimals}f}"
     return text.replace(",", "\N{NARROW NO-BREAK SPACE}").replace("-", "\N{MINUS SIGN}")
-
-
-def _has_bias(variant: str) -> bool:
-    return "bias" in variant and "no_bias" not in variant

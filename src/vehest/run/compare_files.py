@@ -23,7 +23,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_estimate
 from vehest.estimators.model_files import read_description
-from vehest.estimators.static_map import StaticMap, StaticMapSettings
+from vehest.estimators.static_map import StaticMap
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.metrics import Protocol, accuracy, score
 from vehest.evaluation.ranking import rank
@@ -188,7 +188,7 @@ def _held_out_map(reference: Recording, start: float, stop: float) -> FloatArray
         part = reference.cut(*fitted).select(["yaw_rate", "vx", "vy_ref"])
         clean = np.isfinite(np.stack(list(part.channels.values()))).all(axis=0)
         kept = {name: values[clean] for name, values in part.channels.items()}
-        model = StaticMap(StaticMapSettings(reference.rate_hz))
-        model.values = model.best_numbers([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
-        vy[held_out] = model.lateral_velocity({name: reference[name][held_out] for name in model.channels})
+        model = StaticMap(StaticMap.settings_type(reference.rate_hz))
+        model.values = model.closed_form([Recording(part.id, part.vehicle, part.rate_hz, 0.0, kept)])
+        vy[held_out] = model.run(reference.stack(model.channels)[held_out], None)[0]["vy"]
     return vy

@@ -29,9 +29,6 @@ VERSION = "1"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
 
-SLOW = {"learned_ukf": "vehest.estimators.kernels.planar_car"}
-"""Estimators that compile for tens of seconds -> their slowest kernel."""
-
 T = TypeVar("T")
 
 
@@ -103,9 +100,10 @@ def code_of_training(estimator: str) -> str:
 
 def has_to_compile(estimator: str) -> bool:
     """Whether an estimator's training compiles on this machine before it starts; later ones load the result."""
-    if estimator not in SLOW:
+    name = estimator_class(estimator).slow_kernel
+    if not name:
         return False
-    kernel = importlib.import_module(SLOW[estimator])
+    kernel = importlib.import_module(name)
     if not hasattr(kernel._transition, "stats"):  # NUMBA_DISABLE_JIT
         return False
     folder = kernel._transition.stats.cache_path

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.model_files import load_model
-from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf, Word
+from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.evaluation.metrics import Scored
 from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear, sideslip_error
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run
@@ -50,10 +51,9 @@ def hybrid_of(run: Run) -> NetworkUkf:
     return fitted
 
 
-def words_of(run: Run, drives: Sequence[Recording]) -> list[Word]:
-    """What a hybrid's network says of drives."""
-    fitted = hybrid_of(run)
-    return [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
+def pseudo_measurements_of(run: Run, drives: Sequence[Recording]) -> list[PseudoMeasurement]:
+    """What a hybrid's network adds to the measurements of drives."""
+    return hybrid_of(run).pseudo_measurements(drives)
 
 
 def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
@@ -65,14 +65,14 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     """What the network of a hybrid says of each test manoeuvre."""
     drives, spans = prepared.seen(TEST), prepared.spans(TEST)
     found = []
-    for drive, span, word in zip(drives, spans, words_of(run, drives), strict=True):
+    for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
         (part,) = run.test[span.recording]
         at = rows_of(part, drive)
         found.append(
             Outputs(
-                sideslip_error(replace(part, sideslip=word.sideslip[at])),
-                np.degrees(np.sqrt(word.variance[at])),
-                None if word.process is None else np.sqrt(word.process[at]),
+                sideslip_error(replace(part, sideslip=own.sideslip[at])),
+                np.degrees(np.sqrt(own.variance[at])),
+                None if own.process is None else np.sqrt(own.process[at]),
                 np.degrees(part.sideslip_ref),
                 is_nonlinear(part),
             )
@@ -80,10 +80,11 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     return found
 
 
-def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], words: Sequence[Word]) -> list[FloatArray]:
+def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]) -> list[FloatArray]:
     """β of a hybrid's filter given what its network is made to say, drive by drive [rad]."""
     found: dict[int, FloatArray] = {}
-    for rows, (mean, *_) in fitted.filtered(drives, words):
+    for rows, steps in fitted.filtered(drives, pseudo=pseudo):
+        mean = steps.filtered.mean.numpy()
         for place, row in enumerate(rows):
             vx = drives[row]["vx"]
             found[row] = np.arctan2(mean[place, : len(vx), 0], vx)
@@ -93,10 +94,10 @@ def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], words: Sequen
 def shift_of(run: Run, prepared: Prepared) -> float:
     """By how many degrees β moves for 1° of β_DD: median over test manoeuvres of the mean over scored samples."""
     fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
-    words = [fitted.word(fitted.seen(drive.stack(fitted.channels))) for drive in drives]
-    moved = [word._replace(sideslip=word.sideslip + math.radians(1.0)) for word in words]
+    pseudo = fitted.pseudo_measurements(drives)
+    moved = [own._replace(sideslip=own.sideslip + math.radians(1.0)) for own in pseudo]
     shifts = []
-    both = zip(drives, spans, filtered_with(fitted, drives, words), filtered_with(fitted, drives, moved), strict=True)
+    both = zip(drives, spans, filtered_with(fitted, drives, pseudo), filtered_with(fitted, drives, moved), strict=True)
     for drive, span, before, after in both:
         at = rows_of(run.test[span.recording][0], drive)
         shifts.append(float(np.degrees(np.mean((after - before)[at]))))
@@ -106,14 +107,13 @@ def shift_of(run: Run, prepared: Prepared) -> float:
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
     """A hybrid whose filter is told at each sample how wrong its network's angle is; no estimator, since nobody knows that."""
     fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
-    words = []
-    for drive, span in zip(drives, spans, strict=True):
-        word = fitted.word(fitted.seen(drive.stack(fitted.channels)))
+    pseudo = []
+    for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):
         whole = prepared.recording(span.dataset, span.recording).cut(drive.start_time, drive.start_time + len(drive) / drive.rate_hz)
-        error = word.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
-        words.append(word._replace(variance=LEAST_VARIANCE + np.square(error)))
+        error = own.sideslip - np.arctan2(whole["vy_ref"], whole["vx"])[: len(drive)]
+        pseudo.append(own._replace(variance=LEAST_VARIANCE + np.square(error)))
     test = {}
-    for drive, span, sideslip in zip(drives, spans, filtered_with(fitted, drives, words), strict=True):
+    for drive, span, sideslip in zip(drives, spans, filtered_with(fitted, drives, pseudo), strict=True):
         (part,) = run.test[span.recording]
         test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
     return Run(candidate, run.model, run.validation, test)

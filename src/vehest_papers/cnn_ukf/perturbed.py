@@ -14,6 +14,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
+from vehest.estimators.dugoff_ukf import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS
 from vehest.estimators.model_files import load_model
@@ -64,7 +65,7 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
     of_filter = filter_of(changed)
     if of_filter is None:
         raise DataError(f"estimator '{fitted.name}' has no cornering stiffness")
-    of_filter.tyres[[0, len(DUGOFF_PARAMETERS)]] *= 1.0 + np.array([front, rear])
+    of_filter.axle_tyres[[0, len(DUGOFF_PARAMETERS)]] *= 1.0 + np.array([front, rear])
     return changed
 
 
@@ -87,12 +88,11 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
     """A copy of a DE-UKF whose p₁ and p₂ (Eq. 11) suit its filter as it is now, by the rule of its training."""
     changed = copy.deepcopy(fitted)
     changed.scaling = np.array([0.0, 1.0])
-    words = [changed.word(changed.seen(recording.stack(changed.channels))) for recording in recordings]
+    pseudo = changed.pseudo_measurements(recordings)
 
     def cost(powers: FloatArray) -> float:
-        scaled = [word._replace(variance=scaled_variance(word.variance - LEAST_VARIANCE, powers)) for word in words]
-        error = changed.mean_squared_error(recordings, scaled, over="recordings")
-        return error if np.isfinite(error) else 1e6
+        scaled = [own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers)) for own in pseudo]
+        return finite(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
 
     changed.scaling = staged_optuna_search(cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK).best
     return changed

@@ -16,7 +16,6 @@ from vehest.data.store import read_recording
 from vehest.data.transforms import LowPass, RemoveOutliers
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import DugoffUkf
-from vehest.estimators.network_ukf import NetworkUkf
 from vehest.evaluation.metrics import Scored, score_all
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
@@ -127,8 +126,7 @@ def candidate_of(model: EvaluatedModel) -> str:
 
 def filter_of(fitted: Estimator) -> DugoffUkf | None:
     """The filter of a fitted method; none if it has none."""
-    of_filter = fitted.model if isinstance(fitted, NetworkUkf) else fitted
-    return of_filter if isinstance(of_filter, DugoffUkf) else None
+    return fitted if isinstance(fitted, DugoffUkf) else None
 
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:

@@ -185,7 +185,7 @@ def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> T
                 of_filter = filter_of(load_model(run.model.model_folder))
                 if of_filter is not None:
                     row: dict[str, object] = {"part": title, "candidate": candidate, "seed": run.model.seed}
-                    row |= dict(zip(TYRES, of_filter.tyres.tolist(), strict=True))
+                    row |= dict(zip(TYRES, of_filter.axle_tyres.tolist(), strict=True))
                     rows.append(row | {level: of_filter.levels.get(level, math.nan) for level in LEVELS})
     for row in rows:
         row |= {f"shown_{level}": significant(float(row[level])) for level in LEVELS}  # type: ignore[arg-type]
@@ -272,7 +272,7 @@ def given_as_found(full: Runs) -> str:
         for run in full[candidate]:
             given = filter_of(load_model(run.model.model_folder))
             assert found is not None and given is not None  # noqa: PT018 - both are filters by their names
-            pairs = {name: (found.tyres[place], given.tyres[place]) for place, name in enumerate(TYRES)}
+            pairs = {name: (found.axle_tyres[place], given.axle_tyres[place]) for place, name in enumerate(TYRES)}
             pairs |= {level: (found.levels[level], given.levels[level]) for level in SENSORS["full"]}
             for name, (there, here) in pairs.items():
                 difference = abs(here - there) if name.startswith("reduction") else abs(here / there - 1.0)

@@ -11,14 +11,14 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.estimators.network_ukf import Word
+from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of, sideslip_error
-from vehest_papers.cnn_ukf.networks import words_of
+from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 
 WIDE = 5.0  # ratio from which deviations stand on a logarithmic axis
@@ -184,16 +184,16 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
 
 def _said(
     hybrids: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, window: tuple[float, float] | None = None
-) -> dict[str, tuple[FloatArray, Word]]:
+) -> dict[str, tuple[FloatArray, PseudoMeasurement]]:
     """Candidate -> times from the start of what is scored [s], and what its network says there."""
     drive = prepared.recording(span.dataset, span.recording).cut(span.start - warm_up, span.stop).without_references()
     found = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
-        (word,) = words_of(run, [drive])
+        (word,) = pseudo_measurements_of(run, [drive])
         kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
         process = None if word.process is None else word.process[kept]
-        found[candidate] = drive.time[kept] - scored.time[0], Word(word.sideslip[kept], word.variance[kept], process)
+        found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(word.sideslip[kept], word.variance[kept], process)
     return found
 
 

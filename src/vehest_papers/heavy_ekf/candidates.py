@@ -13,9 +13,10 @@ from scipy import optimize
 from scipy.stats import qmc
 
 from vehest.constants import FloatArray
-from vehest.estimators.data_sheet import DataSheet, DataSheetSettings
-from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, RationalSettings, TrackNoise, Tyres
-from vehest.estimators.static_map import StaticMap, StaticMapSettings
+from vehest.estimators.data_sheet import DataSheet
+from vehest.estimators.rational_ekf import AxleCurves, RationalFilter, TrackNoise, Tyres
+from vehest.estimators.recursive import Recursive
+from vehest.estimators.static_map import StaticMap
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import crossfall_filter, paper
 from vehest_papers.heavy_ekf.twin import CURVES, NOISE, RATE, TRUCK, Conditions, Drive, drive
@@ -76,7 +77,7 @@ def estimator_of(name: str, levels: Levels, curves: FloatArray, car: SingleTrack
     else:
         given = AxleCurves(c1_front, c2_front, c1_rear, c2_rear, DEVIATION)
     noise = TrackNoise(NOISE["yaw_rate"], levels.ay, levels.steer, levels.tyres if tyres != "rational" else None)
-    return RationalFilter(RationalSettings(rate_hz=RATE, car=car, minimum_speed=2.0, tyres=tyres, curves=given, noise=noise))
+    return RationalFilter(RationalFilter.settings_type(rate_hz=RATE, car=car, minimum_speed=2.0, tyres=tyres, curves=given, noise=noise))
 
 
 def mistaken(mismatch: float) -> FloatArray:
@@ -110,14 +111,12 @@ def oracle(levels: Levels, own: Drive) -> FloatArray:
 def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray]]:
     """Name -> β of a drive, (T,): nothing, the static map of the tuning drives, and the data sheet."""
     recordings = [own.recording for own in tuning]
-    fitted = StaticMap(StaticMapSettings(rate_hz=RATE))
-    fitted.values = fitted.best_numbers(recordings)
-    sheet = DataSheet(DataSheetSettings(rate_hz=RATE, wheelbase=_wheelbase(), cg_to_rear_axle=float(TRUCK.cg_to_rear_axle)))
+    fitted = StaticMap(StaticMap.settings_type(RATE))
+    fitted.values = fitted.closed_form(recordings)
+    sheet = DataSheet(DataSheet.settings_type(rate_hz=RATE, wheelbase=_wheelbase(), cg_to_rear_axle=float(TRUCK.cg_to_rear_axle)))
 
-    def of(baseline: StaticMap | DataSheet) -> Callable[[Drive], FloatArray]:
-        return lambda own: np.arctan2(
-            baseline.lateral_velocity({"yaw_rate": own.samples[:, 0], "vx": own.samples[:, 1]}), own.samples[:, 1]
-        )
+    def of(baseline: Recursive) -> Callable[[Drive], FloatArray]:
+        return lambda own: np.arctan2(baseline.run(own.samples[:, [1, 0]], None)[0]["vy"], own.samples[:, 1])  # vx, yaw_rate
 
     return {ZERO: lambda own: np.zeros(len(own.sideslip)), STATIC_MAP: of(fitted), DATA_SHEET: of(sheet)}
 

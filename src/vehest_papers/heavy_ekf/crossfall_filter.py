@@ -33,29 +33,29 @@ def filtered(estimator: RationalFilter, samples: FloatArray, deviation: float = 
         deviation: standard deviation of b at the start [m/s²].
         wander: of its drift [m/s² √s⁻¹].
     """
-    settings, levels, first = estimator.settings, estimator.levels, estimator.start(samples[0])
-    place = [0, 1, 2, 3, *range(FIRST_TYRE, FIRST_TYRE + len(settings.adapted))]
+    levels, first = estimator.values, estimator.first_gaussian(samples[0], {})
+    place = [0, 1, 2, 3, *range(FIRST_TYRE, FIRST_TYRE + len(estimator.adapted))]
     mean, covariance, bound = (
-        np.zeros(FIRST_TYRE + len(settings.adapted)),
+        np.zeros(FIRST_TYRE + len(estimator.adapted)),
         np.zeros((len(place) + 1,) * 2),
         np.full(len(place) + 1, math.inf),
     )
     mean[place], covariance[np.ix_(place, place)], bound[place] = first.mean, first.covariance, estimator.bounds()
     covariance[4, 4] = deviation**2
     means = np.empty((len(samples), len(mean)))
-    car = settings.car
+    car = estimator.car
     _scan(
         np.ascontiguousarray(samples),
         np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle], dtype=np.float64),
-        np.array([*estimator.curves, 1.0]),
-        np.array([TYRE_PARAMETERS.index(name) for name in settings.adapted], dtype=np.int64),
+        np.array([*estimator.axle_curves, 1.0]),
+        np.array([TYRE_PARAMETERS.index(name) for name in estimator.adapted], dtype=np.int64),
         np.square([levels["yaw_rate"], levels["ay"], levels["steer"], levels["tyres"], wander]),
         bound,
         np.square(ROLLING),
         estimator.start_tyres(),
-        settings.largest_sideslip,
+        estimator.largest_sideslip,
         LOST**2,
-        1.0 / settings.rate_hz,
+        1.0 / estimator.rate_hz,
         mean,
         covariance,
         means,

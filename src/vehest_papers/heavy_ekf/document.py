@@ -198,7 +198,7 @@ def _truck(
         tables.table_3(rmse, list(filters), data),
         tables.gains_table(rmse),
         errors,
-        tables.order_in_words(rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.levels["tyres"]),
+        tables.order_in_words(rmse, errors.frame, fit, own, drives, filters[paper.RATTE].fitted.values["tyres"]),
         "## Appendix: tyre parameters over time",
     ]
     for name, number in ((paper.LINT, 8), (paper.RATTE, 9)):

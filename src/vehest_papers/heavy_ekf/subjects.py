@@ -84,10 +84,10 @@ def validation_drives(part: PartArtefacts) -> list[Recording]:
 
 def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
     """The curves that a rational filter was fitted with and how well its fit knew them, beside what the axles do in other drives."""
-    car, slowest = own.settings.car, own.settings.minimum_speed
+    car, slowest = own.car, own.minimum_speed
     motion = axle_motion(drives, car, slowest)
-    axles = own.curves.reshape(2, 2)
-    of_fit = own.curve_covariance - (own.settings.curves.deviation or 0.0) ** 2 * np.eye(4)
+    axles = own.axle_curves.reshape(2, 2)
+    of_fit = own.curve_covariance - (own.curves.deviation or 0.0) ** 2 * np.eye(4)
     blocks = [of_fit[at : at + 2, at : at + 2] * np.outer(values, values) for at, values in zip((0, 2), axles, strict=True)]
     left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
     rms = np.sqrt(np.mean(np.square(left), axis=1))

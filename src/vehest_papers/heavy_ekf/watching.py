@@ -40,9 +40,9 @@ def observability_of(own: RationalFilter, drive: Recording, minimum_speed: float
         model.observation,
         states,
         inputs,
-        sizes=np.array([*SIZES, *[PARAMETER_SIZE] * len(own.settings.adapted)]),
-        noise=np.array([own.levels["yaw_rate"], own.levels["ay"]]),
-        steps=round(WINDOW_SECONDS * own.settings.rate_hz),
+        sizes=np.array([*SIZES, *[PARAMETER_SIZE] * len(own.adapted)]),
+        noise=np.array([own.values["yaw_rate"], own.values["ay"]]),
+        steps=round(WINDOW_SECONDS * own.rate_hz),
     )
 
 

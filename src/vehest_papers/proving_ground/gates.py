@@ -15,7 +15,7 @@ import pandas as pd
 
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
-from vehest.estimators.static_map import StaticMap, StaticMapSettings
+from vehest.estimators.static_map import StaticMap
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import StoredDataset
@@ -81,15 +81,15 @@ class Gate:
 
 def static_map_of(recordings: Sequence[Recording]) -> StaticMap:
     """The baseline v = r (b - k u²) with both numbers fitted to recordings with vx, yaw_rate and vy_ref."""
-    fitted = StaticMap(StaticMapSettings(rate_hz=RATE_HZ))
-    fitted.values = fitted.best_numbers(recordings)
+    fitted = StaticMap(StaticMap.settings_type(RATE_HZ))
+    fitted.values = fitted.closed_form(recordings)
     return fitted
 
 
 def left_by(fitted: StaticMap, recordings: Sequence[Recording]) -> float:
     """FVU of a static map on recordings [1]."""
     vy = np.concatenate([own["vy_ref"] for own in recordings])
-    mapped = np.concatenate([fitted.lateral_velocity({name: own[name] for name in fitted.channels}) for own in recordings])
+    mapped = np.concatenate([fitted.run(own.stack(fitted.channels), None)[0]["vy"] for own in recordings])
     return float(np.var(vy - mapped) / np.var(vy))
 
 

@@ -77,7 +77,9 @@ class SingleTrackEstimator(Estimator):
         acceleration = lateral_acceleration(self.settings.car, speed)
         return SampledModel(*(part.numpy() for part in (*dynamics, *acceleration)))
 
-    def first_state(self, vx: float, deviation: float, initial_state: Mapping[str, float] | None) -> Gaussian[FloatArray]:
+    def first_state(  # type: ignore[override]
+        self, vx: float, deviation: float, initial_state: Mapping[str, float] | None
+    ) -> Gaussian[FloatArray]:
         """(β, r) before the first sample: 0 with a standard deviation, or what a protocol hands over (``vy``, ``yaw_rate``)."""
         given = dict(initial_state or {})
         mean = np.array([np.arctan2(given.get("vy", 0.0), max(vx, self.settings.minimum_speed)), given.get("yaw_rate", 0.0)])

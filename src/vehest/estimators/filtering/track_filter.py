@@ -19,7 +19,7 @@ from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, TorchModel, UnscentedStepper, unscented_scan
+from vehest.filters.unscented_scan import PointModel, TorchModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
@@ -110,42 +110,6 @@ class TrackFilter:
             track = self.track
             self._models[dtype] = CompiledDugoffTrack(track, dtype) if self.compiled else TorchModel(track.transition, track.observation)
         return self._models[dtype]
-
-
-class TrackStepper:
-    """The same filter of one sequence, one sample at a time, in float64.
-
-    Args:
-        own: the filter.
-        gate: which measurements are refused; none: all are taken.
-    """
-
-    def __init__(self, own: TrackFilter, gate: Gate | None = None) -> None:
-        self._own, self._model, self._gate = own, own.model(torch.float64), gate
-        self._filter: UnscentedStepper | None = None
-        self._rolled = False
-
-    @property
-    def variance(self) -> float:
-        """Of the lateral velocity at the last sample [m²/s²]; NaN before the first."""
-        return math.nan if self._filter is None else float(self._filter.covariance[0, 0])
-
-    def step(self, measurement: FloatArray, inputs: FloatArray, process_noise: FloatArray, observation_noise: FloatArray) -> FloatArray:
-        """The state at a sample, (2,), valid until the next one.
-
-        Args:
-            measurement: (m,); what is NaN was not measured.
-            inputs: (3,), finite.
-            process_noise: covariance of the step that led here, (2, 2).
-            observation_noise: (m, m).
-        """
-        slow = bool(inputs[0] < self._own.track.minimum_speed)
-        if self._filter is None:
-            mean, covariance = (part[0].numpy() for part in self._own.start(torch.as_tensor(inputs)[None]))
-            self._filter = UnscentedStepper(self._model, mean, covariance, len(measurement), self._own.rule, gate=self._gate)
-        seen = np.full_like(measurement, np.nan) if slow else measurement
-        noise, self._rolled = ROLLING if self._rolled else process_noise, slow
-        return self._filter.step(seen, inputs, noise[None], observation_noise[None])
 
 
 def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:

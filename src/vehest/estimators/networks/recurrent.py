@@ -4,30 +4,14 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator, WindowedSettings
-
-
-@dataclass(frozen=True)
-class RecurrentSettings(WindowedSettings):
-    """Settings of a recurrent benchmark.
-
-    Args:
-        n_states: size of the hidden state.
-    """
-
-    n_states: int = 5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.n_states < 1:
-            raise ConfigurationError(f"estimator.n_states must be at least 1, not {self.n_states}")
+from vehest.estimators.declared import setting
+from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 
 
 class RecurrentNetwork(StandardisedNetwork):
@@ -43,7 +27,7 @@ class RecurrentNetwork(StandardisedNetwork):
         returns: (...) lateral velocity [m/s] one step after the window.
     """
 
-    def __init__(self, settings: RecurrentSettings, n_gates: int, n_channels: int) -> None:
+    def __init__(self, settings: Any, n_gates: int, n_channels: int) -> None:
         super().__init__(n_channels)
         states = settings.n_states
         self.settings = settings
@@ -96,9 +80,9 @@ class RecurrentNetwork(StandardisedNetwork):
 class RecurrentEstimator(WindowedEstimator):
     """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
 
-    settings_type = RecurrentSettings
-    settings: RecurrentSettings
+    n_states: int = setting(5, "size of the hidden state", least=1)
     network_type: ClassVar[type[RecurrentNetwork]]
+    template = "window_recurrent"
 
     @property
     def variant(self) -> str:
@@ -110,6 +94,12 @@ class RecurrentEstimator(WindowedEstimator):
         """With the number of states."""
         return f"{self.title}, {self.settings.n_states} states"
 
-    def empty_network(self) -> RecurrentNetwork:
+    def new_network(self) -> RecurrentNetwork:
         """A network to load weights into."""
-        return self.network_type(self.settings)  # type: ignore[call-arg, arg-type]
+        return self.network_type(self.settings)  # type: ignore[call-arg]
+
+    def c_values(self) -> dict[str, Any]:
+        """Weights and sizes."""
+        weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
+        gates, states, _ = weights["input_weight"].shape
+        return {**weights, "window": self.settings.window, "gates": gates, "states": states}

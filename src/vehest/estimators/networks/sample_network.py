@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -15,8 +14,9 @@ from torch import Tensor, nn
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import EstimatorSettings
+from vehest.estimators.declared import setting
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of
+from vehest.estimators.network import Network
 from vehest.estimators.references import reference_sideslip
 from vehest.training.samples import Draw, Samples
 
@@ -30,61 +30,24 @@ NAMED: dict[str, str] = {"range": "", "standard": "_standard"}
 """What a normalisation adds to the name of a variant."""
 
 CHUNK = 50_000  # samples that are estimated at a time
-STEEPEST = 1.5  # rad, beyond which no sideslip angle of a network is believed
+STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
-@dataclass(frozen=True)
-class SampleNetworkSettings(EstimatorSettings):
-    """Settings of a network over single samples.
+class OnSamples(Network):
+    """Settings of estimators with a `SampleNetwork`."""
 
-    Args:
-        inputs: ``full``, with the forces of all tyres, or ``imu``, without.
-        hidden: widths of the two hidden layers.
-        dropout: share of hidden values that are hidden in training.
-        normalisation: how inputs are scaled, see `SampleNetwork.scale`.
+    network: SampleNetwork
+    hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
+    dropout: float = setting(0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0)
+    normalisation: Normalisation = setting("range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1")
 
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
-    inputs: Literal["full", "imu"] = "full"
-    hidden: tuple[int, int] = (250, 125)
-    dropout: float = 0.2
-    normalisation: Normalisation = "range"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.inputs not in INPUTS:
-            raise ConfigurationError(f"estimator.inputs '{self.inputs}' is not one of: {', '.join(INPUTS)}")
-        object.__setattr__(self, "hidden", checked_layers(self.hidden, self.dropout))
-        require_normalisation(self.normalisation)
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Measured channels that the network sees."""
-        return INPUTS[self.inputs]
-
-
-def checked_layers(hidden: Sequence[int], dropout: float) -> tuple[int, int]:
-    """Widths of two hidden layers as a tuple.
-
-    Raises:
-        ConfigurationError: they are no such widths, or the dropout is no share.
-    """
-    widths = tuple(hidden) if isinstance(hidden, Sequence) and not isinstance(hidden, str) else ()
-    if len(widths) != 2 or not all(isinstance(width, int) and not isinstance(width, bool) and width > 0 for width in widths):
-        raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {hidden!r}")
-    if not 0 <= dropout < 1:
-        raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {dropout}")
-    return widths[0], widths[1]
-
-
-def require_normalisation(name: str) -> None:
-    """Raises:
-    ConfigurationError: there is no such normalisation.
-    """
-    if name not in NAMED:
-        raise ConfigurationError(f"estimator.normalisation '{name}' is not one of: {', '.join(NAMED)}")
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: a layer without neurons.
+        """
+        super().check()
+        if min(self.hidden) < 1:
+            raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}")
 
 
 class SampleNetwork(nn.Module):
@@ -161,7 +124,7 @@ class SampleNetwork(nn.Module):
         """Losses of a batch, (M,); see `losses_of`."""
         return losses_of(*samples, draw.rows, list(self.parameters()), draw.seeds, dropout, criterion)
 
-    def said(self, inputs: FloatArray) -> NDArray[Any]:
+    def outputs(self, inputs: FloatArray) -> NDArray[Any]:
         """Outputs of measured inputs (T, C) without dropout, (M, T, O), in the network's own units."""
         pieces = []
         with torch.no_grad():
@@ -170,7 +133,11 @@ class SampleNetwork(nn.Module):
                 pieces.append(self(self.scaled(piece).unsqueeze(0)).double().numpy())
         return np.concatenate(pieces, axis=1)
 
-    def judged(self, samples: Samples, criterion: Criterion) -> Tensor:
+    def c_values(self) -> dict[str, Any]:
+        """Weights and ranges, and the largest angle, for a C template."""
+        return {name: tensor.detach().numpy().astype(np.float64) for name, tensor in self.state_dict().items()} | {"steepest": STEEPEST}
+
+    def validation_losses(self, samples: Samples, criterion: Criterion) -> Tensor:
         """Losses on samples without dropout, (M,)."""
         total = np.zeros(self.members)
         with torch.no_grad():
@@ -210,26 +177,9 @@ def learnt_samples(
     return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
 
 
-def believed(sideslip: FloatArray) -> FloatArray:
+def clip_sideslip(sideslip: FloatArray) -> FloatArray:
     """Sideslip angles within `STEEPEST`, since the lateral velocity is vx tan β."""
     return np.clip(sideslip, -STEEPEST, STEEPEST)
-
-
-def network_with_weights(network: SampleNetwork, weights: Mapping[str, NDArray[Any]], estimator: str) -> SampleNetwork:
-    """The network with weights put in, in the precision they were trained in.
-
-    Raises:
-        DataError: a name or shape does not fit.
-    """
-    expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-    found = {name: tuple(np.shape(values)) for name, values in weights.items()}
-    if expected != found:
-        differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
-        raise DataError(f"weights of '{estimator}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
-    tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
-    network = network.to(tensors["unit"].dtype)
-    network.load_state_dict(tensors)
-    return network
 
 
 def _hint(name: str) -> str:

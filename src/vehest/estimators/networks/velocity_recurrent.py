@@ -11,15 +11,15 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
+from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.declared import setting
+from vehest.estimators.network import Network
 from vehest.training.context import FitContext
 from vehest.training.sequences import Phase, PhaseRecord, PhaseSettings, train_phases
 
@@ -94,50 +94,6 @@ class SequenceSettings:
         return self.dropped_steps if self.validation_dropped_steps is None else self.validation_dropped_steps
 
 
-@dataclass(frozen=True)
-class VelocityNetworkSettings(EstimatorSettings):
-    """Settings of a recurrent network that sees all samples so far.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        inputs: measured channels that the network sees.
-        outputs: of ``vx``, ``vy`` and ``yaw_rate``, what it estimates; each is learnt from its ``_ref`` channel.
-        n_states: size of the hidden state.
-        dropout: share of the hidden state that is hidden from the layers after it in training.
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
-    inputs: tuple[str, ...] = ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer")
-    outputs: tuple[str, ...] = ("vx", "vy", "yaw_rate")
-    n_states: int = 64
-    dropout: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("inputs", "outputs"):
-            value = getattr(self, name)
-            if isinstance(value, str) or not all(isinstance(entry, str) for entry in value) or len(set(value)) != len(value):
-                raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {value!r}")
-            object.__setattr__(self, name, tuple(value))
-        if not self.inputs:
-            raise ConfigurationError("estimator.inputs must name at least one channel")
-        for name in self.inputs:
-            try:
-                reference = channel(name).is_reference
-            except DataError as error:
-                raise ConfigurationError(f"estimator.inputs: {error}") from None
-            if reference:
-                raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
-        if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
-            raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
-        if self.n_states < 1:
-            raise ConfigurationError(f"estimator.n_states must be at least 1, not {self.n_states}")
-        if not 0 <= self.dropout < 1:
-            raise ConfigurationError(f"estimator.dropout must lie in 0 … 1 (excluded), not {self.dropout}")
-
-
 class VelocityNetwork(nn.Module):
     """Base of recurrent networks from standardised measurements to standardised velocities.
 
@@ -152,7 +108,7 @@ class VelocityNetwork(nn.Module):
     output_mean: Tensor
     output_scale: Tensor
 
-    def __init__(self, settings: VelocityNetworkSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__()
         for name, size in (("input", len(settings.inputs)), ("output", len(settings.outputs))):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
@@ -200,60 +156,62 @@ class VelocityNetwork(nn.Module):
         """`forward` on standardised quantities."""
 
 
-class RecurrentVelocityEstimator(Estimator):
+class RecurrentVelocityEstimator(Network):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
-    if it is among ``estimator.inputs``. The loss is that of Węgrzynowski et al. 2024: squared errors, each output with its weight, over
-    sequences without their first samples.
+    if it is among ``inputs``. The loss is that of Węgrzynowski et al. 2024: squared errors, each output with its weight, over sequences
+    without their first samples.
     """
 
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SequenceSettings
-    settings_type: ClassVar[type[VelocityNetworkSettings]]
-    settings: VelocityNetworkSettings
+    template = "velocity_recurrent"
+    network: VelocityNetwork
+    inputs: tuple[str, ...] = setting(
+        ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"), "measured channels that the network sees"
+    )
+    outputs: tuple[str, ...] = setting(("vx", "vy", "yaw_rate"), "what it estimates, each learnt from its _ref channel")
+    n_states: int = setting(64, "size of the hidden state", least=1)
+    dropout: float = setting(0.0, "share of the hidden state that is hidden from later layers in training", least=0.0, below=1.0)
 
-    def __init__(self, settings: VelocityNetworkSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.channels = tuple(dict.fromkeys(("vx", *settings.inputs)))
-        self.network = self._new_network()
-        self._seed = 0
+        self.channels = tuple(dict.fromkeys(("vx", *self.inputs)))
+        self.learns_from = tuple(REFERENCES[name] for name in self.outputs)
+        self.network = self.new_network()
 
-    @abstractmethod
-    def _new_network(self) -> VelocityNetwork:
-        """A network to train or to load weights into."""
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: inputs or outputs that repeat or are unknown, or a reference among the inputs.
+        """
+        for name in ("inputs", "outputs"):
+            if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
+                raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}")
+        for name in self.inputs:
+            try:
+                reference = channel(name).is_reference
+            except DataError as error:
+                raise ConfigurationError(f"estimator.inputs: {error}") from None
+            if reference:
+                raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
+        if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
+            raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
 
     @property
     def variant(self) -> str:
         """Name of the structure."""
-        return f"states_{self.settings.n_states}"
+        return f"states_{self.n_states}"
 
     @property
     def full_title(self) -> str:
         """With the number of states."""
-        return f"{self.title}, {self.settings.n_states} states"
+        return f"{self.title}, {self.n_states} states"
 
-    @property
-    def n_parameters(self) -> int:
-        """Numbers that training determines; means and deviations of the data do not count."""
-        return sum(parameter.numel() for parameter in self.network.parameters())
-
-    def seed(self, seed: int) -> None:
-        """Seed of the initial weights, of sequences and of dropout."""
-        self._seed = seed
-
-    @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
-        """Train members one after the other."""
-        records = []
-        for index, member in enumerate(members):
-            assert isinstance(member, RecurrentVelocityEstimator)
-            records.append(member._fit(data, training, context, index))
-        return records
-
-    def _fit(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
+    def fit_member(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
+        """Train on sequences."""
         drives = [self._drive(recording) for recording in data.train]
-        network = self._new_network().to(getattr(torch, training.dtype))
+        network: Any = self.new_network().to(getattr(torch, training.dtype))
         network.standardise(np.concatenate([drive.inputs for drive in drives]), np.concatenate([drive.targets for drive in drives]))
         network.reset(torch.Generator().manual_seed(self._seed))
         self.network = network
@@ -262,84 +220,55 @@ class RecurrentVelocityEstimator(Estimator):
         return _fit_record(record)
 
     def _drive(self, recording: Recording) -> _Drive:
-        references = tuple(REFERENCES[name] for name in self.settings.outputs)
-        for name in (*self.channels, *references):
+        for name in (*self.channels, *self.learns_from):
             if np.isnan(recording[name]).any():
                 raise DataError(
                     f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from; "
                     f"cut them out in conf/split"
                 )
         return _Drive(
-            recording.id, recording.stack(self.settings.inputs), recording.stack(references), self._measured_velocities(recording.channels)
+            recording.id,
+            recording.stack(self.inputs),
+            recording.stack(self.learns_from),
+            self._measured_velocities(recording.channels),
         )
 
     def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
         """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read, and 0 for the lateral velocity."""
         n = len(channels["vx"])
-        columns = [channels[name] if name in self.channels and name != "vy" else np.zeros(n) for name in self.settings.outputs]
+        columns = [channels[name] if name in self.channels and name != "vy" else np.zeros(n) for name in self.outputs]
         return np.stack(columns, axis=1)
 
-    def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
-        inputs = recording.stack(self.settings.inputs)
-        state = self._start(recording.channels, initial_state)
-        pieces = []
-        for first in range(0, len(recording), CHUNK):
-            values, state = self._advance(inputs[first : first + CHUNK], state)
-            pieces.append(values)
-        columns = dict(zip(self.settings.outputs, np.concatenate(pieces).T, strict=True))
-        return self._wrapped(recording, columns.pop("vy"), **columns)
-
-    def _start(self, channels: Mapping[str, FloatArray], initial_state: Mapping[str, float] | None) -> State:
-        given = initial_state or {}
-        first = self._measured_velocities({name: samples[:1] for name, samples in channels.items()})[0]
-        values = [given.get(name, measured) for name, measured in zip(self.settings.outputs, first, strict=True)]
+    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> State:
+        """State of the network that starts from given velocities, else measured ones."""
+        measured = self._measured_velocities({name: np.array([value]) for name, value in zip(self.channels, sample.tolist(), strict=True)})
+        values = [given.get(name, own) for name, own in zip(self.outputs, measured[0], strict=True)]
         with torch.no_grad():
             return self.network.start(torch.tensor([values], dtype=self.network.input_mean.dtype))
 
-    def _advance(self, inputs: FloatArray, state: State) -> tuple[FloatArray, State]:
-        """Estimates (T, O) from measurements (T, C), and the state after them."""
+    def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
+        """Velocities [m/s, rad/s]."""
+        inputs = torch.as_tensor(samples[:, [self.channels.index(name) for name in self.inputs]], dtype=self.network.input_mean.dtype)
+        pieces = []
         with torch.no_grad():
-            outputs, state = self.network(torch.as_tensor(inputs, dtype=self.network.input_mean.dtype).unsqueeze(0), state)
-        return outputs[0].double().numpy(), state
+            for piece in inputs.split(CHUNK):
+                values, state = self.network(piece.unsqueeze(0), state)
+                pieces.append(values[0].double().numpy())
+        return dict(zip(self.outputs, np.concatenate(pieces).T, strict=True)), state
 
-    def online(self) -> RecurrentVelocityStepper:
-        """A stepper that starts from measured velocities at its first sample."""
-        return RecurrentVelocityStepper(self)
-
-    def weights(self) -> dict[str, NDArray[Any]]:
-        """Parameters, means and deviations."""
-        return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
-
-    def load_weights(self, weights: Mapping[str, NDArray[Any]]) -> None:
-        """Take parameters, means and deviations back, in the precision they were trained in."""
-        network = self._new_network()
-        expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-        found = {name: tuple(np.shape(values)) for name, values in weights.items()}
-        if expected != found:
-            raise DataError(f"weights of '{self.name}' do not fit its settings: expected {expected}, found {found}")
-        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
-        network = network.to(tensors["input_mean"].dtype)
-        network.load_state_dict(tensors)
-        self.network = network
-
-
-class RecurrentVelocityStepper(Stepper):
-    """Carries the network's state from sample to sample."""
-
-    def __init__(self, estimator: RecurrentVelocityEstimator) -> None:
-        self._estimator = estimator
-        self._state: State | None = None
-
-    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
-        """Velocities [m/s, rad/s] at the time of the sample."""
-        estimator = self._estimator
-        channels = dict(zip(estimator.channels, required(sample, estimator.channels), strict=True))
-        state = self._state
-        if state is None:
-            state = estimator._start({name: np.array([value]) for name, value in channels.items()}, None)
-        inputs = np.array([[channels[name] for name in estimator.settings.inputs]])
-        values, self._state = estimator._advance(inputs, state)
-        return dict(zip(estimator.settings.outputs, values[0].tolist(), strict=True))
+    def c_values(self) -> dict[str, Any]:
+        """Weights, sizes, and what estimates start from."""
+        s, weights = self.settings, {name: array.astype(np.float64) for name, array in self.weights().items()}
+        return {
+            **{name.replace(".", "_"): array for name, array in weights.items()},
+            "states": s.n_states,
+            "gates": len(weights["recurrent.weight_ih_l0"]) // s.n_states,
+            "slope": getattr(s, "negative_slope", 0.0),
+            "dense": getattr(s, "n_dense", 0),
+            "inputs": s.inputs,
+            "outputs": s.outputs,
+            "starts": [name if name in self.channels and name != "vy" else None for name in s.outputs],
+        }
 
 
 @dataclass(frozen=True)
@@ -417,7 +346,7 @@ class _Cutter:
 class _Mirror:
     """Signs of measurements and outputs, left for right."""
 
-    def __init__(self, settings: VelocityNetworkSettings, dtype: torch.dtype) -> None:
+    def __init__(self, settings: Any, dtype: torch.dtype) -> None:
         signs = [[-1.0 if name in ODD else 1.0 for name in names] for names in (settings.inputs, settings.outputs)]
         self._inputs, self._outputs = (torch.tensor(own, dtype=dtype) for own in signs)
 
@@ -437,7 +366,7 @@ class _Mirror:
 
 def _phase(
     network: VelocityNetwork,
-    settings: VelocityNetworkSettings,
+    settings: Any,
     training: SequenceSettings,
     train: Sequence[_Drive],
     validation: Sequence[_Drive],

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
-from vehest.estimators.base import Estimator, EstimatorSettings, FitData, FitRecord, Stepper, required
+from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, rate
+from vehest.estimators.declared import setting
 from vehest.estimators.model_files import load_model
+from vehest.estimators.network import Network
 from vehest.training.context import FitContext
 from vehest.training.members import predict_members, prepare, random_numbers
 from vehest.training.supervised import SupervisedSettings, train_members
@@ -26,25 +28,7 @@ from vehest.training.supervised import SupervisedSettings, train_members
 TARGET = "vy_ref"
 
 
-@dataclass(frozen=True)
-class WindowedSettings(EstimatorSettings):
-    """Settings of a network that sees N past samples.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        window: samples N it sees.
-    """
-
-    rate_hz: float = 20.0
-    window: int = 30
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.window < 1:
-            raise ConfigurationError(f"estimator.window must be at least 1, not {self.window}")
-
-
-class WindowedEstimator(Estimator):
+class WindowedEstimator(Network):
     """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et al. 2023, Fig. 1).
 
     The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it may have besides, a compiled recursion
@@ -53,25 +37,20 @@ class WindowedEstimator(Estimator):
 
     channels = ("yaw_rate", "vx", "ay", "ax")
     training_type = SupervisedSettings
-    settings_type: ClassVar[type[WindowedSettings]]
-    settings: WindowedSettings
+    rate_hz: float = rate(20.0)
+    window: int = setting(30, "samples that it sees", least=1)
 
-    def __init__(self, settings: WindowedSettings) -> None:
+    def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         with random_numbers(0):
-            self.network: nn.Module = self.empty_network()
-        self._seed = 0
+            self.network = self.new_network()
 
-    def new_network(self, train: list[Recording]) -> nn.Module:
+    def network_for(self, train: list[Recording]) -> nn.Module:
         """A network that knows the ranges of the training recordings: means and deviations if it is a `StandardisedNetwork`."""
-        network = self.empty_network()
+        network = self.new_network()
         if isinstance(network, StandardisedNetwork):
             network.standardise(train, self.channels)
         return network
-
-    @abstractmethod
-    def empty_network(self) -> nn.Module:
-        """A network as it is built, to load weights into."""
 
     @property
     def horizon_steps(self) -> int:
@@ -81,16 +60,7 @@ class WindowedEstimator(Estimator):
     @property
     def warm_up_steps(self) -> int:
         """Until the window is full."""
-        return self.settings.window - 1
-
-    @property
-    def n_parameters(self) -> int:
-        """Numbers that training determines; ranges taken from the data do not count."""
-        return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)
-
-    def seed(self, seed: int) -> None:
-        """Seed of the initial weights and of the order of the windows."""
-        self._seed = seed
+        return self.window - 1
 
     @classmethod
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
@@ -102,7 +72,7 @@ class WindowedEstimator(Estimator):
         """
         windowed = [member for member in members if isinstance(member, WindowedEstimator)]
         first = windowed[0]
-        sets = [windows_of(part, first.channels, TARGET, first.settings.window) for part in (data.train, data.validation)]
+        sets = [windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation)]
         started = start_weights(first, Path(training.start_from)) if training.start_from is not None else None
         for member in windowed:
             member.network = member._seeded_network(list(data.train), getattr(torch, training.dtype))
@@ -131,7 +101,7 @@ class WindowedEstimator(Estimator):
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
         with random_numbers(self._seed):
-            network = self.new_network(train)
+            network = self.network_for(train)
         _check_state(network)
         network = network.to(dtype)
         reset = getattr(network, "reset", None)
@@ -145,9 +115,9 @@ class WindowedEstimator(Estimator):
                 f"estimator '{self.name}' has no state to start from: it sees a window of samples only; set evaluation.initial_state=false"
             )
         vy = np.full(len(recording), np.nan)
-        starts = window_starts(len(recording), self.settings.window)
+        starts = window_starts(len(recording), self.window)
         if len(starts):
-            vy[self.settings.window :] = self._predict(recording.stack(self.channels), starts)
+            vy[self.window :] = self._predict(recording.stack(self.channels), starts)
         return self._wrapped(recording, vy)
 
     def _predict(self, series: np.ndarray[Any, Any], starts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -157,28 +127,12 @@ class WindowedEstimator(Estimator):
             prepared = prepare(self.network, torch.as_tensor(series, dtype=dtype))
             parameters = {name: parameter.unsqueeze(0) for name, parameter in self.network.named_parameters()}
             rows = torch.as_tensor(starts).unsqueeze(0)
-            result = predict_members(self.network, parameters, prepared, rows, self.settings.window, compiled=True)
+            result = predict_members(self.network, parameters, prepared, rows, self.window, compiled=True)
         return result[0].double().numpy()
 
     def online(self) -> WindowStepper:
         """A stepper with an empty window."""
         return WindowStepper(self)
-
-    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Parameters and ranges (persistent buffers) of the network."""
-        return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
-
-    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take parameters and ranges back, in the precision they were trained in."""
-        network = self.empty_network()
-        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
-        expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
-        found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-        if expected != found:
-            raise DataError(f"weights of '{self.name}' do not fit its settings: expected {expected}, found {found}")
-        network = network.to(next(iter(tensors.values())).dtype)
-        network.load_state_dict(tensors)
-        self.network = network
 
 
 class WindowStepper(Stepper):
@@ -188,12 +142,12 @@ class WindowStepper(Stepper):
 
     def __init__(self, estimator: WindowedEstimator) -> None:
         self._estimator = estimator
-        self._window: deque[list[float]] = deque(maxlen=estimator.settings.window)
+        self._window: deque[FloatArray] = deque(maxlen=estimator.window)
 
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
         """Lateral velocity [m/s] one interval after the sample; NaN until the window is full."""
-        self._window.append(required(sample, self._estimator.channels))
-        if len(self._window) < self._estimator.settings.window:
+        self._window.append(self._estimator.checked_sample(sample))
+        if len(self._window) < self._estimator.window:
             return {"vy": float("nan")}
         return {"vy": float(self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0])}
 

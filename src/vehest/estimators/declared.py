@@ -1,0 +1,96 @@
+"""Declarations of an estimator's settings and fitted numbers: bounds, unit and text, each stated once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, fields
+from typing import Any, ClassVar
+
+from vehest.data.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What is declared of a setting beside its type and default.
+
+    Args:
+        doc: text for people.
+        unit: SI unit; empty for what has none.
+        positive: whether it has to be more than 0.
+        least: smallest value; none: no such bound.
+        most: largest value.
+        above: value that it has to exceed.
+        below: value that it has to stay under.
+        start: values that the search for a fitted number starts from; empty where it has a closed form.
+        box: range that the search stays within.
+        of_largest: channel whose largest absolute value in training multiplies start and box; empty: none.
+        is_fitted: whether the fit determines it unless it is given.
+    """
+
+    doc: str
+    unit: str = ""
+    positive: bool = False
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+    start: tuple[float, ...] = ()
+    box: tuple[float, float] = (0.0, 0.0)
+    of_largest: str = ""
+    is_fitted: bool = False
+
+    def problem(self, value: Any) -> str:
+        """What is wrong with a value, in words that follow its name; empty where nothing is."""
+        if value is None:
+            return ""
+        if self.positive and not value > 0:
+            return f"must be positive, not {value}"
+        low, high = (one if one is not None else other for one, other in ((self.least, self.above), (self.most, self.below)))
+        fits_low = low is None or (value >= low if self.least is not None else value > low)
+        fits_high = high is None or (value <= high if self.most is not None else value < high)
+        if fits_low and fits_high:
+            return ""
+        if low is not None and high is not None:
+            return f"must lie between {low:g} and {high:g}{self.unit and f' {self.unit}'}, not at {value}"
+        if low is not None:
+            return f"must be {'at least' if self.least is not None else 'more than'} {low:g}, not {value}"
+        return f"must be {'at most' if self.most is not None else 'less than'} {high:g}, not {value}"
+
+
+def setting(default: Any, doc: str, **declared: Any) -> Any:
+    """A setting with its default; ``declared`` as in `Declaration`."""
+    return field(default=default, metadata={"declared": Declaration(doc, **declared)})
+
+
+def fitted(doc: str, **declared: Any) -> Any:
+    """A number that the fit determines unless it is given; ``declared`` as in `Declaration`."""
+    return field(default=None, metadata={"declared": Declaration(doc, is_fitted=True, **declared)})
+
+
+def declaration(of: Field[Any]) -> Declaration | None:
+    """What is declared of a dataclass's field, if anything."""
+    found: Declaration | None = of.metadata.get("declared")
+    return found
+
+
+@dataclass(frozen=True)
+class Group:
+    """Settings that belong together; their bounds are checked when they are made.
+
+    Raises:
+        ConfigurationError: a value is out of its bounds.
+    """
+
+    group: ClassVar[str] = "estimator"
+
+    def __post_init__(self) -> None:
+        for own in fields(self):
+            declared = declaration(own)
+            problem = declared.problem(getattr(self, own.name)) if declared else ""
+            if problem:
+                raise ConfigurationError(f"{self.group}.{own.name} {problem}")
+
+    @classmethod
+    def declarations(cls) -> Mapping[str, Declaration]:
+        """Name -> declaration."""
+        return {own.name: declared for own in fields(cls) if (declared := declaration(own))}

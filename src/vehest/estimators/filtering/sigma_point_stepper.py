@@ -1,0 +1,73 @@
+"""Sigma-point filters online: one stepper for all families that filter by `vehest.filters.unscented_scan`."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+from vehest.constants import FloatArray
+from vehest.estimators.base import Estimator, Stepper
+from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
+
+
+class FilterStep(NamedTuple):
+    """A sample as a filter takes it; see `UnscentedStepper.step`.
+
+    Attributes:
+        measurement: (m,).
+        inputs: (p,).
+        process_noise: of the step that led to the sample.
+        observation_noise: of the measurement.
+    """
+
+    measurement: FloatArray
+    inputs: FloatArray
+    process_noise: FloatArray | NoiseAt
+    observation_noise: FloatArray | NoiseAt
+
+
+class SigmaPointEstimator(Estimator):
+    """An estimator by an unscented filter.
+
+    Attributes:
+        states: names of the filter's states, ``vy`` among them.
+    """
+
+    states: ClassVar[tuple[str, ...]]
+
+    @abstractmethod
+    def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
+        """A sample of ``channels``, (C,), as the filter takes it; ``memory`` is what earlier samples left, empty at first."""
+
+    @abstractmethod
+    def new_filter(self, first: FilterStep) -> UnscentedStepper:
+        """The filter before its first sample.
+
+        Raises:
+            ConfigurationError: it has not been fitted.
+        """
+
+    def online(self) -> Stepper:
+        """A stepper that starts from the first sample it sees."""
+        self.require_fitted()
+        return SigmaPointStepper(self)
+
+
+class SigmaPointStepper(Stepper):
+    """The filter of such an estimator, one sample at a time."""
+
+    def __init__(self, estimator: SigmaPointEstimator) -> None:
+        self._estimator = estimator
+        self._filter: UnscentedStepper | None = None
+        self._memory: dict[str, Any] = {}
+
+    def step(self, sample: Mapping[str, float]) -> dict[str, float]:
+        """States at the time of the sample, and the variance of the lateral velocity [m²/s²]."""
+        estimator = self._estimator
+        step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
+        if self._filter is None:
+            self._filter = estimator.new_filter(step)
+        dtype, of_vy = self._filter.mean.dtype, estimator.states.index("vy")
+        mean = self._filter.step(step.measurement.astype(dtype), step.inputs.astype(dtype), step.process_noise, step.observation_noise)
+        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.covariance[of_vy, of_vy])}

@@ -1,0 +1,70 @@
+"""Base of estimators whose weights are those of a network: initial weights, parameters, saving, training member by member."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from vehest.data.errors import DataError
+from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.training.context import FitContext
+
+
+class Network(Estimator):
+    """An estimator with a ``network``, any ``nn.Module``.
+
+    A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
+    """
+
+    network: Any
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        self._seed = 0
+
+    @abstractmethod
+    def new_network(self) -> Any:
+        """An ``nn.Module`` as it is built, to train or to load weights into."""
+
+    def fit_member(self, data: FitData, training: Any, context: FitContext, index: int) -> FitRecord:
+        """Train this one, whose place among the members is ``index``; see `fit_members`."""
+        raise NotImplementedError(f"{type(self).__name__} has no method 'fit_member'")
+
+    @classmethod
+    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+        """Train members one after the other."""
+        return [member.fit_member(data, training, context, index) for index, member in enumerate(members)]
+
+    @property
+    def n_parameters(self) -> int:
+        """Numbers that training determines; ranges taken from the data do not count."""
+        return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)
+
+    def seed(self, seed: int) -> None:
+        """Seed of initial weights, batches and dropout."""
+        self._seed = seed
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Parameters and ranges (persistent buffers) of the network."""
+        return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take parameters and ranges back, in the precision they were trained in.
+
+        Raises:
+            DataError: a name or shape does not fit the settings.
+        """
+        network = self.new_network()
+        expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+        found = {name: tuple(np.shape(values)) for name, values in weights.items()}
+        if expected != found:
+            differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
+            raise DataError(f"weights of '{self.name}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
+        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
+        network = network.to(next(iter(tensors.values())).dtype)
+        network.load_state_dict(tensors)
+        self.network = network
