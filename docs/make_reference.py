@@ -26,20 +26,9 @@ ACROSS_START = "<!-- across vehicles: made by docs/make_reference.py from result
 ACROSS_END = "<!-- end of across vehicles -->"
 ACROSS_SOURCE = "results/ksnn/tables/overview.csv"
 
-FIGURES_START = "<!-- figures: made by docs/make_reference.py from results -->"
+FIGURES_START = re.compile(r"<!-- figures of (\w+)/(\w+): made by docs/make_reference.py from results -->")  # study and figure
 FIGURES_END = "<!-- end of figures -->"
 BASELINES = ("zero", "static_map")
-FAMILIES = {  # page -> estimators in it, study and figure that show them
-    "baselines": (("zero", "static_map", "kinematic", "data_sheet"), "ferrari_drive", "spread_test"),
-    "luenberger": (("luenberger",), "ferrari_drive", "errors_over_ay_test"),
-    "rational_ekf": ((), "heavy_ekf", "sideslip_ferrari"),
-    "ksnn": (("ksnn",), "ksnn", "figure_6"),
-    "recurrent": (("gru", "lstm"), "ferrari_drive", "zoom_test"),
-    "velocity_networks": (("velocity_gru", "velocity_lstm"), "leave_one_out", "transfer"),
-    "learned_ukf": ((), "learned_ukf", "figure_4_real"),
-    "dugoff_ukf": ((), "cnn_ukf", "figure_6"),
-    "networks_and_ukf": (("sideslip_ffnn",), "cnn_ukf", "figure_7"),
-}
 
 ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
 TABLED = ("estimator", "training", "tracking")
@@ -55,7 +44,7 @@ def pages(root: Path = ROOT) -> dict[Path, str]:
         root / "docs" / "channels.md": channels_page(),
         root / "docs" / "manoeuvres.md": manoeuvres_page(root),
         results: with_overview(with_leaderboard(results.read_text(encoding="utf-8"), root / BOARD_SOURCE), root / ACROSS_SOURCE),
-        **{root / "docs" / "estimators" / f"{name}.md": family_page(name, root) for name in FAMILIES},
+        **{path: family_page(path, root) for path in _family_pages(root)},
     }
 
 
@@ -269,12 +258,19 @@ def _arguments(described: type) -> Iterable[str]:
             yield f"{', '.join(f'`{name}`' for name in names.split(', '))}: {meaning}"
 
 
-def family_page(name: str, root: Path) -> str:
-    """The page of a family with what published studies say of it."""
-    text = (root / "docs" / "estimators" / f"{name}.md").read_text(encoding="utf-8")
-    estimators, study, figure = FAMILIES[name]
+def _family_pages(root: Path) -> list[Path]:
+    """Pages of families that show a figure of a study."""
+    return [page for page in sorted((root / "docs" / "estimators").glob("*.md")) if FIGURES_START.search(page.read_text(encoding="utf-8"))]
+
+
+def family_page(path: Path, root: Path) -> str:
+    """The page of the families that its title names, with what published studies say of them."""
+    text = path.read_text(encoding="utf-8")
+    start = FIGURES_START.search(text)
+    assert start is not None
+    estimators, (study, figure) = re.findall(r"`(\w+)`", text.partition("\n")[0]), start.groups()
     parts = [*_on_test_sets(estimators, root), *_in_study(study, root), *_shown(study, figure, root)]
-    return _between(text, FIGURES_START, FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
+    return _between(text, start.group(), FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

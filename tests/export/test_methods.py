@@ -14,13 +14,15 @@ from c_build import COMPILERS, OUTPUTS, Library, built
 
 from dugoff_drive import TYRES, dugoff_track
 from every_estimator import drive_for, fitted
+from example_package import forget_examples, install_examples
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.network import Network
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.export.method import FAMILIES, method_source
+from vehest.export.method import exportable, method_source
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 from vehest.training.sequences import PhaseSettings
@@ -33,7 +35,7 @@ ON_DUGOFF = ("dugoff_ukf", "ensemble_ukf", "cnn_ukf")
 TRACK = {"inputs": "imu", "tyres": TYRES, "noise": LEVELS}
 FULL = {"inputs": "full", "tyres": TYRES, "noise": WITH_FORCES}
 VARIANTS: list[tuple[str, dict[str, Any]]] = [
-    *((name, {}) for name in FAMILIES if name not in ON_DUGOFF),
+    *((name, {}) for name in exportable() if name not in ON_DUGOFF),
     ("kalman", {"gate": 1.0}),
     ("kalman", {"gate": 3.0, "offsets": {"ay": 0.3, "steer": 0.01}}),
     ("kalman", {"offsets": {"steer": 0.01}}),
@@ -92,7 +94,7 @@ def of_dugoff(name: str, config: dict[str, Any]) -> Estimator:
     """A filter with known tyres; a network with random weights, as sure of itself as a trained one."""
     estimator = estimator_class(name).from_config(config)
     if isinstance(estimator, NetworkUkf):
-        inputs = np.stack([dugoff_channels()[name] for name in estimator.inputs], 1)
+        inputs = np.stack([dugoff_channels()[name] for name in estimator.network_inputs], 1)
         network = estimator.network
         network.scale(inputs, dugoff_channels()["sideslip_ref"])
         network.reset([torch.Generator().manual_seed(seed) for seed in range(network.members)])
@@ -133,9 +135,8 @@ def dugoff_rows(estimator: Estimator) -> np.ndarray:
 def widened(estimator: Estimator) -> Estimator:
     """The same weights, computed in float64."""
     own = copy.deepcopy(estimator)
-    for part in ("network", "filter"):
-        if isinstance(getattr(own, part, None), torch.nn.Module):
-            setattr(own, part, getattr(own, part).double())
+    if isinstance(own, Network):
+        own.network = own.network.double()
     return own
 
 
@@ -147,20 +148,13 @@ def disturbed(estimator: Estimator, rows: np.ndarray) -> np.ndarray:
             rows[generator.random(len(rows)) < 0.05, estimator.channels.index(name)] = np.nan
     needed = [column for column, name in enumerate(estimator.channels) if name not in estimator.skippable]
     at = 2 * len(rows) // 3
-    if needed and starts_anew(estimator):
+    if needed and estimator.refuses:
         rows[at, needed[0]] = np.nan
     elif isinstance(estimator, WindowedEstimator):
         rows[at, 0] = np.nan  # it leaves the window again
-    if starts_anew(estimator) == "infinite":
+    if "infinite" in estimator.refuses:
         rows[at + 20, -1] = np.inf
     return rows
-
-
-def starts_anew(estimator: Estimator) -> str:
-    """Which values Python's stepper raises at."""
-    if estimator.name in ("zero", "static_map", "kinematic", "data_sheet"):
-        return "missing"
-    return "infinite" if "kalman" in estimator.name or "ukf" in estimator.name or "ekf" in estimator.name else ""
 
 
 def stepped(estimator: Estimator, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -209,8 +203,17 @@ def test_clang_takes_it_without_a_warning_and_computes_the_same(variant, precisi
     np.testing.assert_allclose(*said, rtol=0.0, atol=DOUBLE if precision == "double" else FLOAT)
 
 
+def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    install_examples(tmp_path / "site", monkeypatch)
+    estimator = estimator_class("sliding_mode").from_config({"gain": 4.0, "threshold": 0.05})
+    rows = disturbed(estimator, drive_for(estimator).stack(estimator.channels))
+    check(built(estimator, "double", tmp_path), estimator, rows, DOUBLE)
+    forget_examples()
+
+
 def test_every_family_but_the_factor_graph_can_be_exported():
-    assert set(FAMILIES) == set(estimator_names()) - {"factor_graph", "learned_ukf_variant"}
+    assert set(exportable()) == set(estimator_names()) - {"factor_graph", "learned_ukf_variant"}
 
 
 def test_what_cannot_be_exported_is_said_in_one_line():

@@ -184,7 +184,7 @@ def test_likelihood_teaches_the_filter_how_sure_to_be() -> None:
         made.fit(DATA, settings(through=PhaseSettings(learning_rate=5e-3, max_epochs=15), likelihood=weight))
         own = sequences_of([made.drive(recording, torch.float64) for recording in DATA.train], 40)
         with torch.no_grad():
-            mean, covariance = made.filter.believed(own, own.states[:, 0], None)
+            mean, covariance = made.filter.estimate_with_covariance(own, own.states[:, 0], None)
         error = (mean - own.states)[..., :3]
         ratios[weight] = float(gaussian_surprise(error, covariance[..., :3, :3]))
     assert ratios[0.05] < ratios[0.0] - 0.1

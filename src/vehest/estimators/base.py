@@ -6,16 +6,16 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field, make_dataclass
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
-from vehest.estimators.declared import Group, setting
 from vehest.training.context import FitContext
 
 
@@ -52,6 +52,21 @@ class FitRecord:
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
     metrics: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
+
+
+class Trial(NamedTuple):
+    """A family in the first comparison on a car that nobody has trained on (`vehest new`).
+
+    Attributes:
+        place: among the trials of all families, the most promising and cheap first; families of one place are one sweep.
+        about: text for people.
+        overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
+            family's settings have.
+    """
+
+    place: int
+    about: str
+    overrides: str = ""
 
 
 class Stepper(ABC):
@@ -92,6 +107,7 @@ class Estimator(ABC):
         covariance_of: quantities that the covariances of `run` are of.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         slow_kernel: module of a compiled function ``_transition`` that takes tens of seconds to compile; empty: none.
+        trials: in the first comparison on a new car; none: it is left out.
         notice: lines for whoever uses the method, such as a patent.
         template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
         version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
@@ -110,6 +126,7 @@ class Estimator(ABC):
     covariance_of: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
     slow_kernel: ClassVar[str] = ""
+    trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()
     template: ClassVar[str] = ""
     version: ClassVar[str] = "1"
@@ -121,8 +138,8 @@ class Estimator(ABC):
         bases = [one for one in of_bases if not any(other is not one and issubclass(other, one) for other in of_bases)]
         if not own and len(bases) == 1:
             return
-        kinds = {name: f"{cls.__annotations__[name]}{' | None' if value.default is None else ''}" for name, value in own.items()}
-        described = [(name, kinds[name], value) for name, value in own.items()]
+        kinds = {name: cls.__annotations__[name] for name in own}
+        described = [(name, _optional(kind) if own[name].default is None else kind, own[name]) for name, kind in kinds.items()]
         cls.settings_type = make_dataclass("settings_type", described, bases=tuple(bases), frozen=True)
         cls.settings_type.__module__, cls.settings_type.__qualname__ = cls.__module__, f"{cls.__qualname__}.settings_type"
         for name in own:
@@ -391,6 +408,11 @@ class RunStepper(Stepper):
             row_of_vy = estimator.covariance_of.index("vy")
             values["vy_variance"] = float(covariance[0, row_of_vy, row_of_vy])
         return values
+
+
+def _optional(kind: Any) -> Any:
+    """A type, or its name as an annotation has it, or None."""
+    return f"{kind} | None" if isinstance(kind, str) else kind | None
 
 
 def required(sample: Mapping[str, float], channels: Sequence[str]) -> list[float]:

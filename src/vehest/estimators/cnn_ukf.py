@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.declared import Group, setting
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.declared import setting
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
@@ -37,46 +37,26 @@ MOST_LOST = 0.5  # share of the sequences of a batch beyond which training stops
 
 
 @dataclass(frozen=True)
-class EndToEndSettings:
-    """Training of filter and network (Bertipaglia et al. 2024, Section III-C).
+class EndToEndSettings(Group):
+    """Training of filter and network (Bertipaglia et al. 2024, Section III-C)."""
 
-    Args:
-        pre_training: the network alone, on samples in random order.
-        pre_training_batch: samples in a batch.
-        end_to_end: network and filter, on sequences.
-        steps: samples of a training sequence.
-        batch_size: sequences in a batch.
-        identification: of the filter.
-        loss_unit: of the angles in the loss of Eq. 7, ``rad`` or ``deg``; the optimum is the same, but gradients in rad² are about as
-            small as the number that AdamW adds to their size, 1e-8, so that it takes steps far below its rate.
-        dtype: of the network, ``float32`` or ``float64``; the filter computes in double precision.
-        checkpoint_seconds: time between two checkpoints [s].
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    pre_training: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10)  # noqa: RUF009
-    pre_training_batch: int = 256
-    end_to_end: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30)  # noqa: RUF009
-    steps: int = 256
-    batch_size: int = 32
-    loss_unit: Literal["rad", "deg"] = "rad"
-    identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
-    dtype: Literal["float32", "float64"] = "float32"
-    checkpoint_seconds: float = 15.0
-
-    def __post_init__(self) -> None:
-        for name in ("pre_training_batch", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
-        if self.steps < 2:
-            raise ConfigurationError(f"training.steps must be at least 2, not {self.steps}")
-        if self.loss_unit not in ("rad", "deg"):
-            raise ConfigurationError(f"training.loss_unit '{self.loss_unit}' is not one of: rad, deg")
-        if self.dtype not in ("float32", "float64"):
-            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+    pre_training: PhaseSettings = setting(
+        PhaseSettings(learning_rate=8e-4, max_epochs=30, patience=10), "the network alone, on samples in random order"
+    )
+    pre_training_batch: int = setting(256, "samples in a batch", least=1)
+    end_to_end: PhaseSettings = setting(PhaseSettings(learning_rate=8e-4, max_epochs=200, patience=30), "network and filter, on sequences")
+    steps: int = setting(256, "samples of a training sequence", least=2)
+    batch_size: int = setting(32, "sequences in a batch", least=1)
+    loss_unit: Literal["rad", "deg"] = setting(
+        "rad",
+        "of the angles in the loss of Eq. 7; the optimum is the same, but gradients in rad² are about as small as the number that AdamW "
+        "adds to their size, 1e-8, so that it takes steps far below its rate",
+    )
+    identification: IdentificationSettings = setting(IdentificationSettings(), "of the filter")
+    dtype: Literal["float32", "float64"] = setting("float32", "precision of the network; the filter computes in double precision")
+    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
 
 class NetworkOutput(NamedTuple):
@@ -134,6 +114,16 @@ class CnnUkf(NetworkUkf):
     """
 
     name, title = "cnn_ukf", "UKF-informed network"
+    trials = (
+        Trial(
+            13,
+            "network trained through its filter; ten minutes and more",
+            "estimator.inputs=imu {car} training.identification.method=nelder_mead training.identification.grid=1 "
+            "training.identification.max_evaluations=40 training.identification.tyres_from='*' "
+            "training.identification.restarts=1 training.identification.generations=60 "
+            "training.end_to_end.max_epochs=20",
+        ),
+    )
     training_type = EndToEndSettings
     curve: Literal["plain", "smooth"] = setting("smooth", "tyres of Eq. 9 (plain) or 10 (smooth), which gradients pass")
     hidden: tuple[int, int] = setting((200, 100), "widths of the network's hidden layers")

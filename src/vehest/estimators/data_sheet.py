@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
+from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.declared import setting
+from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 
 
@@ -21,6 +22,13 @@ class DataSheet(Recursive):
     """
 
     name, title = "data_sheet", "Data sheet"
+    trials = (
+        Trial(
+            1,
+            "baseline: steady cornering from the data sheet",
+            "estimator.wheelbase={wheelbase}",
+        ),
+    )
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.constants import GRAVITY, FloatArray
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.declared import Group, setting
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.filtering.track_filter import (
@@ -135,6 +135,14 @@ class DugoffUkf(SigmaPointEstimator):
     """
 
     name, title = "dugoff_ukf", "UKF with Dugoff tyres"
+    trials = (
+        Trial(
+            9,
+            "unscented filter with Dugoff tyres; minutes",
+            "estimator.inputs=imu {car} training.method=nelder_mead training.grid=1 training.max_evaluations=40 "
+            "training.tyres_from='*' training.restarts=1 training.generations=60",
+        ),
+    )
     training_type: ClassVar[type] = IdentificationSettings
     template = "track_ukf"
     refuses = ("NaN", "infinite")

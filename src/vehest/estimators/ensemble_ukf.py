@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from vehest.constants import FloatArray
+from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.declared import setting
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
@@ -34,17 +34,13 @@ MOST_SIZE = (-12.0, 2.0)  # powers of ten that a scaled variance is kept within 
 
 @dataclass(frozen=True)
 class EnsembleSettings(SampleSettings):
-    """Training of filter, networks and scaling (Bertipaglia et al. 2024, Section IV-C).
+    """Training of filter, networks and scaling (Bertipaglia et al. 2024, Section IV-C)."""
 
-    Args:
-        phase: step size and epochs of the networks.
-        scaling_trials: evaluations of the search for p₁ and p₂ of Eq. 11 by Optuna; Nelder-Mead has its own limits in ``identification``.
-        identification: of the filter; its method is also that of the search for p₁ and p₂ (``data``: 0 and 1).
-    """
-
-    phase: PhaseSettings = PhaseSettings(learning_rate=8e-4, max_epochs=30)  # noqa: RUF009
-    scaling_trials: int = 60
-    identification: IdentificationSettings = IdentificationSettings()  # noqa: RUF009
+    phase: PhaseSettings = setting(PhaseSettings(learning_rate=8e-4, max_epochs=30), "step size and epochs of the networks")
+    scaling_trials: int = setting(60, "evaluations of Optuna for p₁ and p₂ of Eq. 11; Nelder-Mead has its limits in identification")
+    identification: IdentificationSettings = setting(
+        IdentificationSettings(), "of the filter; its method is also that of the search for p₁ and p₂ (data: 0 and 1)"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,6 +59,16 @@ class EnsembleUkf(NetworkUkf):
     """
 
     name, title = "ensemble_ukf", "UKF with a deep ensemble"
+    trials = (
+        Trial(
+            12,
+            "filter with an ensemble's angle; minutes",
+            "estimator.inputs=imu estimator.members=5 {car} training.identification.method=nelder_mead "
+            "training.identification.grid=1 training.identification.max_evaluations=40 "
+            "training.identification.tyres_from='*' training.identification.restarts=1 "
+            "training.identification.generations=60",
+        ),
+    )
     training_type = EnsembleSettings
     members: int = setting(20, "networks M of the ensemble; one alone has no spread", least=2)
     variance: Literal["models", "mixture"] = setting(

@@ -16,7 +16,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper
+from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, Trial
 from vehest.estimators.filtering.single_track import (
     SampledModel,
     SingleTrackEstimator,
@@ -96,6 +96,13 @@ class FactorGraph(SingleTrackEstimator):
 
     name = "factor_graph"
     title = "Factor graph"
+    trials = (
+        Trial(
+            10,
+            "factor graph over half a second, causal; nothing is learnt",
+            "estimator.window=0.5 {car}",
+        ),
+    )
     settings_type = FactorGraphSettings
     settings: FactorGraphSettings
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork
+from vehest.estimators.networks.recurrent import TRIAL, RecurrentEstimator, RecurrentNetwork
 
 
 class GruNetwork(RecurrentNetwork):
@@ -46,6 +46,7 @@ class Gru(RecurrentEstimator):
 
     name = "gru"
     title = "GRU"
+    trials = (TRIAL,)
     network_type = GruNetwork
 
     @classmethod

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord, Stepper
-from vehest.estimators.declared import Group, setting
+from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Gaussian
@@ -75,6 +75,13 @@ class KalmanFilter(SideslipFilter):
     """
 
     name, title = "kalman", "Kalman filter"
+    trials = (
+        Trial(
+            5,
+            "Kalman filter over a single track; only noise levels are learnt",
+            "{car}",
+        ),
+    )
     learns_from = ()
     open_weights = LEVELS
     template = "kalman"

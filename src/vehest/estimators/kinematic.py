@@ -11,8 +11,9 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from vehest.constants import FloatArray
+from vehest.data.declared import fitted
 from vehest.data.recording import Recording
-from vehest.estimators.declared import fitted
+from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 
 SHORTEST, LONGEST = 0.02, 200.0  # s, time constants that are looked at
@@ -27,6 +28,7 @@ class Kinematic(Recursive):
     """
 
     name, title = "kinematic", "Kinematic integration"
+    trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate", "ay")
     ignores_initial_state = True
     template = "kinematic"

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from vehest.data.declared import setting
 from vehest.data.recording import Recording
-from vehest.estimators.declared import setting
+from vehest.estimators.base import Trial
 from vehest.estimators.networks.windowed import WindowedEstimator
 
 GAMMA_START = 0.98
@@ -145,6 +146,18 @@ class Ksnn(WindowedEstimator):
     """
 
     name, title = "ksnn", "KS-NN"
+    trials = (
+        Trial(
+            2,
+            "the network that comes with vehest, trained on; half a minute",
+            "estimator.n_local=2 estimator.n_hidden=2 training.start_from=pretrained training.max_epochs=100 seed=range(2)",
+        ),
+        Trial(
+            3,
+            "the same family from scratch; a minute",
+            "estimator.n_hidden=0,2 estimator.bias=true training.max_epochs=100 seed=range(2)",
+        ),
+    )
     template = "ksnn"
     notice = (
         "The KS-NN is patented by its authors (PCT/IT2023/050058). Using it in a product may need their licence;",

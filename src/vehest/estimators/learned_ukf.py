@@ -6,18 +6,18 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY, FloatArray
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.declared import Group, setting
+from vehest.estimators.base import Estimator, FitData, FitRecord, Trial
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
@@ -109,6 +109,13 @@ class LearnedUkf(Network, SigmaPointEstimator):
     """
 
     name, title = "learned_ukf", "Learned UKF"
+    trials: ClassVar[tuple[Trial, ...]] = (
+        Trial(
+            14,
+            "filter with learnt dynamics, of electric cars; long",
+            "estimator.car.mass={mass} estimator.car.wheelbase={wheelbase} training.through.max_epochs=50",
+        ),
+    )
     channels = ("vx", *MEASURED, *INPUTS)
     skippable = channels
     refuses = ("infinite",)

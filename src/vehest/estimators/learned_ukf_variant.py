@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
-from vehest.estimators.declared import setting
 from vehest.estimators.filtering.car_filter import FRICTION, OBSERVATION, PROCESS, CarFilter
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.filters.diagonal_noise import DiagonalNoise, DiagonalStateDependentNoise
@@ -19,7 +19,7 @@ class LearnedUkfVariant(LearnedUkf):
     """
 
     name, title = "learned_ukf_variant", "Learned UKF, variant"
-    template = ""
+    template, trials = "", ()
     correlated_noise: bool = setting(
         True, "whether covariances of process and measurements have entries off their diagonals, as in the paper"
     )

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vehest.estimators.networks.recurrent import RecurrentEstimator, RecurrentNetwork
+from vehest.estimators.networks.recurrent import TRIAL, RecurrentEstimator, RecurrentNetwork
 
 
 class LstmNetwork(RecurrentNetwork):
@@ -45,6 +45,7 @@ class Lstm(RecurrentEstimator):
 
     name = "lstm"
     title = "LSTM"
+    trials = (TRIAL,)
     network_type = LstmNetwork
 
     @classmethod

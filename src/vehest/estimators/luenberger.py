@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from vehest.constants import FloatArray
-from vehest.estimators.declared import fitted
+from vehest.data.declared import fitted
+from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 from vehest.training.search import DirectSearchSettings
 
@@ -19,6 +20,13 @@ class Luenberger(Recursive):
     """
 
     name, title = "luenberger", "Luenberger"
+    trials = (
+        Trial(
+            4,
+            "observer; a minute",
+            "training.grid=2 training.max_evaluations=100",
+        ),
+    )
     channels = ("yaw_rate", "vx", "ay", "ax")
     training_type = DirectSearchSettings
     template = "luenberger"

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.constants import FloatArray
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord, rate
-from vehest.estimators.declared import Group, setting
+from vehest.estimators.base import FitData, FitRecord, Trial, rate
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
 from vehest.filters.gating import Gate, gate_values, in_words, suffix
@@ -100,6 +100,13 @@ class RationalFilter(SideslipFilter):
     """
 
     name, title = "rational_ekf", "EKF with tyres"
+    trials = (
+        Trial(
+            6,
+            "filter whose tyres adapt; a minute",
+            "{car} training.grid=1 training.max_evaluations=40",
+        ),
+    )
     training_type = NoiseTuningSettings
     template = "rational_ekf"
     rate_hz: float = rate(20.0)

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from vehest.constants import FloatArray
-from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.declared import setting
+from vehest.data.declared import setting
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
 from vehest.estimators.networks.sample_network import (
     INPUTS,
@@ -33,6 +33,13 @@ class SideslipFfnn(OnSamples):
     """
 
     name, title = "sideslip_ffnn", "Feed-forward network"
+    trials = (
+        Trial(
+            8,
+            "feed-forward network over single samples; a minute",
+            "estimator.inputs=imu training.phase.max_epochs=100",
+        ),
+    )
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SampleSettings
     ignores_initial_state = True

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.declared import fitted
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.declared import fitted
+from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 
 CONDITION = 1e8  # of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
@@ -25,6 +26,7 @@ class StaticMap(Recursive):
     """
 
     name, title = "static_map", "Static map"
+    trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"

@@ -7,8 +7,8 @@ from typing import Any
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vehest.estimators.declared import setting
-from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork
+from vehest.data.declared import setting
+from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
 
 
 class VelocityGruNetwork(VelocityNetwork):
@@ -41,6 +41,7 @@ class VelocityGru(RecurrentVelocityEstimator):
 
     name = "velocity_gru"
     title = "Velocity GRU"
+    trials = (TRIAL,)
     dropout: float = setting(0.075, "share of the hidden state that is hidden from the read-out in training", least=0.0, below=1.0)
     negative_slope: float = setting(0.3, "of the leaky rectifier after the read-out; assumed (the default of Keras)", above=0.0, most=1.0)
 

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vehest.estimators.declared import setting
-from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator, State, VelocityNetwork
+from vehest.data.declared import setting
+from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
 
 
 class VelocityLstmNetwork(VelocityNetwork):
@@ -56,6 +56,7 @@ class VelocityLstm(RecurrentVelocityEstimator):
 
     name = "velocity_lstm"
     title = "Velocity LSTM"
+    trials = (TRIAL,)
     dropout: float = setting(0.075, "share of the hidden state that is hidden from the dense layers in training", least=0.0, below=1.0)
     n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
 

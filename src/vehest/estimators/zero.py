@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 
 
@@ -14,6 +15,7 @@ class Zero(Recursive):
     """v = 0 at all times."""
 
     name, title = "zero", "Zero (v = 0)"
+    trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx",)
     ignores_initial_state = True
     template = "static"

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError
+from vehest.data.declared import Group, setting
 from vehest.training.sequences import Phase, PhaseSettings
 
 
@@ -33,30 +33,15 @@ class Draw(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SampleSettings:
-    """Training on samples in random order (Bertipaglia et al. 2024, Section IV-C).
+class SampleSettings(Group):
+    """Training on samples in random order (Bertipaglia et al. 2024, Section IV-C)."""
 
-    Args:
-        phase: step size, epochs, patience.
-        batch_size: samples in a batch.
-        dtype: ``float32`` or ``float64``.
-        checkpoint_seconds: time between two checkpoints [s].
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    phase: PhaseSettings = PhaseSettings(learning_rate=1e-3, max_epochs=300, patience=20)  # noqa: RUF009
-    batch_size: int = 1024
-    dtype: Literal["float32", "float64"] = "float32"
-    checkpoint_seconds: float = 15.0
-
-    def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise ConfigurationError(f"training.batch_size must be at least 1, not {self.batch_size}")
-        if self.dtype not in ("float32", "float64"):
-            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+    phase: PhaseSettings = setting(PhaseSettings(learning_rate=1e-3, max_epochs=300, patience=20), "step size, epochs, patience")
+    batch_size: int = setting(1024, "samples in a batch", least=1)
+    dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
+    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
 
 def sample_phase(

@@ -11,32 +11,22 @@ import numpy as np
 from scipy import optimize
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.declared import Group, setting
+from vehest.data.errors import MissingError
 from vehest.training.context import FitContext, Progress
 
 FIRST_STEP = 0.05
 
 
 @dataclass(frozen=True)
-class DirectSearchSettings:
-    """Nelder-Mead from a grid of starts inside a box (Da Lio et al. 2023, Appendix A).
+class DirectSearchSettings(Group):
+    """Nelder-Mead from a grid of starts inside a box (Da Lio et al. 2023, Appendix A)."""
 
-    Args:
-        grid: starts along each parameter.
-        max_evaluations: evaluations allowed from each start.
-        tolerance: relative change of the parameters at which a search ends.
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    grid: int = 4
-    max_evaluations: int = 400
-    tolerance: float = 1e-4
-
-    def __post_init__(self) -> None:
-        if self.grid < 1 or self.max_evaluations < 1:
-            raise ConfigurationError("training.grid and training.max_evaluations must be at least 1")
-        if not self.tolerance > 0:
-            raise ConfigurationError(f"training.tolerance must be positive, not {self.tolerance}")
+    grid: int = setting(4, "starts along each parameter", least=1)
+    max_evaluations: int = setting(400, "evaluations allowed from each start", least=1)
+    tolerance: float = setting(1e-4, "relative change of the parameters at which a search ends", positive=True)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, Progress
@@ -21,40 +22,17 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass(frozen=True)
-class PhaseSettings:
-    """One phase of training by gradient on sequences or pairs (`vehest.training.sequences`).
+class PhaseSettings(Group):
+    """One phase of training by gradient on sequences or pairs (`vehest.training.sequences`)."""
 
-    Args:
-        learning_rate: AdamW's step size.
-        max_epochs: epochs after which the phase ends in any case; 0 leaves it out.
-        patience: epochs without a better validation loss after which it ends; 0 never ends it early.
-        validate_every: epochs between two validations; the last epoch is always validated.
-        clip: bound on the magnitude of each element of the gradient; 0 for none.
-        weight_decay: AdamW's decoupled weight decay.
-        schedule: ``constant`` step size, or ``cosine`` from the full one to zero over ``max_epochs``.
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
-    learning_rate: float = 5e-4
-    max_epochs: int = 1000
-    patience: int = 0
-    validate_every: int = 1
-    clip: float = 1e3
-    weight_decay: float = 0.0
-    schedule: Literal["constant", "cosine"] = "constant"
-
-    def __post_init__(self) -> None:
-        if not self.learning_rate > 0:
-            raise ConfigurationError(f"training: learning_rate must be positive, not {self.learning_rate}")
-        if self.validate_every < 1:
-            raise ConfigurationError(f"training: validate_every must be at least 1, not {self.validate_every}")
-        for name in ("max_epochs", "patience", "clip", "weight_decay"):
-            if getattr(self, name) < 0:
-                raise ConfigurationError(f"training: {name} must not be negative, not {getattr(self, name)}")
-        if self.schedule not in ("constant", "cosine"):
-            raise ConfigurationError(f"training: schedule '{self.schedule}' is not one of: constant, cosine")
+    group = "training: phase"
+    learning_rate: float = setting(5e-4, "AdamW's step size", positive=True)
+    max_epochs: int = setting(1000, "epochs after which the phase ends in any case; 0 leaves it out", least=0)
+    patience: int = setting(0, "epochs without a better validation loss after which it ends; 0 never ends it early", least=0)
+    validate_every: int = setting(1, "epochs between two validations; the last epoch is always validated", least=1)
+    clip: float = setting(1e3, "bound on the magnitude of each element of the gradient; 0 for none", least=0.0)
+    weight_decay: float = setting(0.0, "AdamW's decoupled weight decay", least=0.0)
+    schedule: Literal["constant", "cosine"] = setting("constant", "step size: constant, or a cosine to zero over max_epochs")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.declared import Group, setting
+from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, Progress
@@ -20,43 +21,25 @@ from vehest.training.members import FlatParameters, constrain, fixed_state, is_p
 
 
 @dataclass(frozen=True)
-class SupervisedSettings:
-    """Supervised training of windowed networks (Da Lio et al. 2023, Section VI-B).
+class SupervisedSettings(Group):
+    """Supervised training of windowed networks (Da Lio et al. 2023, Section VI-B)."""
 
-    Args:
-        learning_rate: Adam's step size.
-        batch_size: windows in a batch.
-        max_epochs: epochs after which training ends in any case.
-        patience: epochs without a better validation loss after which a member stops.
-        averaging: decay a step of an exponential moving average of the weights, corrected for its start; it is the average that is
-            validated and kept. 0: none, the weights themselves are.
-        dtype: ``float32`` or ``float64``.
-        compiled: use the compiled recursion where the network has one; plain PyTorch otherwise.
-        start_from: a model, by its folder or the start of its name, or ``pretrained``: its weights are where training starts.
-        checkpoint_seconds: time between two checkpoints [s].
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    learning_rate: float = 1e-3
-    batch_size: int = 64
-    max_epochs: int = 1000
-    patience: int = 25
-    averaging: float = 0.0
-    dtype: Literal["float32", "float64"] = "float32"
-    compiled: bool = True
-    start_from: str | None = None
-    checkpoint_seconds: float = 15.0
-
-    def __post_init__(self) -> None:
-        if not self.learning_rate > 0:
-            raise ConfigurationError(f"training.learning_rate must be positive, not {self.learning_rate}")
-        for name in ("batch_size", "max_epochs", "patience"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
-        if not 0 <= self.averaging < 1:
-            raise ConfigurationError(f"training.averaging must be at least 0 and below 1, not {self.averaging}")
-        if self.dtype not in ("float32", "float64"):
-            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
+    learning_rate: float = setting(1e-3, "Adam's step size", positive=True)
+    batch_size: int = setting(64, "windows in a batch", least=1)
+    max_epochs: int = setting(1000, "epochs after which training ends in any case", least=1)
+    patience: int = setting(25, "epochs without a better validation loss after which a member stops", least=1)
+    averaging: float = setting(
+        0.0,
+        "decay a step of an exponential moving average of the weights, corrected for its start, which is then validated and kept; 0: none",
+        least=0.0,
+        below=1.0,
+    )
+    dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
+    compiled: bool = setting(True, "use the compiled recursion where the network has one; plain PyTorch otherwise")
+    start_from: str | None = setting(None, "model to start from, by its folder or the start of its name, or pretrained")
+    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.training.sequences import Phase, PhaseSettings
 
@@ -54,82 +55,63 @@ class Filtering(Protocol):
         """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
         ...
 
-    def believed(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+    def estimate_with_covariance(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """The same with their covariances, (B, T, n, n), both differentiable."""
         ...
 
-    def judged(self, drives: Drive) -> Tensor:
+    def estimate_for_validation(self, drives: Drive) -> Tensor:
         """Estimated states, (B, T, n), as in use: without gradients, and without knowing any true state but the first."""
         ...
 
 
 @dataclass(frozen=True)
-class ThroughFilterSettings:
-    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors' code).
+class ThroughFilterSettings(Group):
+    """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors' code)."""
 
-    Args:
-        one_step: the model as a one-step predictor.
-        one_step_batch: pairs of samples in a batch.
-        through: model and noise together, through the filter; for models that learn so.
-        noise: noise alone, through the filter, with the model as it is; for the others.
-        steps: samples T of a training sequence.
-        drop_steps: first samples of a sequence that do not count.
-        batch_size: sequences in a batch.
-        placing: ``fixed`` cuts drives into the same sequences every epoch, ``random`` draws where they start.
-        curriculum: lengths of shorter sequences to begin with, each for ``curriculum_epochs``.
-        curriculum_epochs: see there.
-        truncate_steps: samples that gradients reach back; 0: to the start of the sequence.
-        validation_steps: samples of a validation sequence.
-        validation_drop_steps: first samples of it that do not count.
-        start_spread: by how much the last state (friction) is off at the start of a training sequence, at most, up or down.
-        mirrored: share of sequences and pairs that are seen in a mirror, left for right.
-        likelihood: weight of a second term of the loss through the filter: the mean negative log-likelihood of the errors of those states
-            that epochs are judged by, under the filter's own covariance [nat]; 0 leaves it out. It is what teaches a filter how sure to be.
-        start_noise: ``residuals`` starts the noise from what the pre-trained model leaves unexplained and learns it in units of that;
-            ``given`` from the authors' values, in SI units.
-        dtype: ``float32`` or ``float64``.
-        checkpoint_seconds: time between two checkpoints [s].
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    one_step: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine")  # noqa: RUF009
-    one_step_batch: int = 2048
-    through: PhaseSettings = PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine")  # noqa: RUF009
-    noise: PhaseSettings = PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine")  # noqa: RUF009
-    steps: int = 500
-    drop_steps: int = 0
-    batch_size: int = 6
-    placing: str = "random"
-    curriculum: Sequence[int] = ()
-    curriculum_epochs: int = 100
-    truncate_steps: int = 0
-    validation_steps: int = 1000
-    validation_drop_steps: int = 200
-    start_spread: float = 0.2
-    mirrored: float = 0.5
-    likelihood: float = 0.0
-    start_noise: str = "residuals"
-    dtype: str = "float32"
-    checkpoint_seconds: float = 15.0
+    one_step: PhaseSettings = setting(
+        PhaseSettings(learning_rate=2e-3, max_epochs=500, validate_every=10, schedule="cosine"), "the model as a one-step predictor"
+    )
+    one_step_batch: int = setting(2048, "pairs of samples in a batch", least=1)
+    through: PhaseSettings = setting(
+        PhaseSettings(learning_rate=2e-3, max_epochs=300, validate_every=5, schedule="cosine"),
+        "model and noise together, through the filter; for models that learn so",
+    )
+    noise: PhaseSettings = setting(
+        PhaseSettings(learning_rate=1e-2, max_epochs=40, validate_every=5, schedule="cosine"),
+        "noise alone, through the filter, with the model as it is; for the others",
+    )
+    steps: int = setting(500, "samples T of a training sequence", least=1)
+    drop_steps: int = setting(0, "first samples of a sequence that do not count", least=0)
+    batch_size: int = setting(6, "sequences in a batch", least=1)
+    placing: Literal["fixed", "random"] = setting("random", "fixed: the same sequences every epoch; random: starts are drawn")
+    curriculum: tuple[int, ...] = setting((), "lengths of shorter sequences to begin with, each for curriculum_epochs")
+    curriculum_epochs: int = setting(100, "see curriculum", least=1)
+    truncate_steps: int = setting(0, "samples that gradients reach back; 0: to the start of the sequence", least=0)
+    validation_steps: int = setting(1000, "samples of a validation sequence", least=1)
+    validation_drop_steps: int = setting(200, "first samples of it that do not count", least=0)
+    start_spread: float = setting(
+        0.2, "by how much the last state (friction) is off at the start of a training sequence, at most, up or down", least=0.0
+    )
+    mirrored: float = setting(0.5, "share of sequences and pairs that are seen in a mirror, left for right", least=0.0, most=1.0)
+    likelihood: float = setting(
+        0.0,
+        "weight of the mean negative log-likelihood of the errors of those states that epochs are judged by, under the filter's own "
+        "covariance [nat], in the loss: it teaches a filter how sure to be; 0 leaves it out",
+        least=0.0,
+    )
+    start_noise: Literal["residuals", "given"] = setting(
+        "residuals", "residuals: noise starts from those of the pre-trained model and learns in units of them; given: the authors' values"
+    )
+    dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
+    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
-        for name in ("one_step_batch", "steps", "batch_size", "curriculum_epochs", "validation_steps"):
-            if getattr(self, name) < 1:
-                raise ConfigurationError(f"training.{name} must be at least 1, not {getattr(self, name)}")
-        for name in ("drop_steps", "validation_drop_steps", "truncate_steps", "start_spread", "likelihood"):
-            if getattr(self, name) < 0:
-                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        super().__post_init__()
         if self.drop_steps >= self.steps or self.validation_drop_steps >= self.validation_steps:
             raise ConfigurationError("training: more steps are dropped than a sequence has; lower drop_steps or validation_drop_steps")
-        if self.placing not in ("fixed", "random"):
-            raise ConfigurationError(f"training.placing '{self.placing}' is not one of: fixed, random")
-        if self.dtype not in ("float32", "float64"):
-            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
-        if not 0.0 <= self.mirrored <= 1.0:
-            raise ConfigurationError(f"training.mirrored must lie between 0 and 1, not at {self.mirrored}")
-        if self.start_noise not in ("residuals", "given"):
-            raise ConfigurationError(f"training.start_noise '{self.start_noise}' is not one of: residuals, given")
-        if any(isinstance(steps, bool) or not isinstance(steps, int) or steps <= self.drop_steps for steps in self.curriculum):
+        if any(steps <= self.drop_steps for steps in self.curriculum):
             raise ConfigurationError(f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}")
 
 
@@ -198,7 +180,7 @@ def filter_phases(
     judged_by = torch.nonzero(weights.validation).flatten()
 
     def judge() -> float:
-        estimated = filtering.judged(judged)
+        estimated = filtering.estimate_for_validation(judged)
         error = (estimated - judged.states)[:, settings.validation_drop_steps :]
         return float(_weighted(error, weights.validation))
 
@@ -231,7 +213,7 @@ def filter_phases(
             truncated, kept = settings.truncate_steps or None, slice(settings.drop_steps, None)
             if not settings.likelihood:
                 return _weighted((filtering.estimated(drives, start, truncated) - drives.states)[:, kept], weights.training)
-            estimated, covariance = filtering.believed(drives, start, truncated)
+            estimated, covariance = filtering.estimate_with_covariance(drives, start, truncated)
             error = (estimated - drives.states)[:, kept]
             surprise = gaussian_surprise(error[..., judged_by], covariance[:, kept][..., judged_by, :][..., judged_by])
             return _weighted(error, weights.training) + settings.likelihood * surprise

@@ -170,9 +170,9 @@ class CarFilter(nn.Module):
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""
-        return self.believed(drives, start, steps)[0]
+        return self.estimate_with_covariance(drives, start, steps)[0]
 
-    def believed(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+    def estimate_with_covariance(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """The same with their covariances, (B, T, 5, 5), differentiable too."""
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
@@ -191,7 +191,7 @@ class CarFilter(nn.Module):
             initial = Gaussian(filtered.mean[:, -1].detach(), filtered.covariance[:, -1].detach())
         return torch.cat(means, 1), torch.cat(covariances, 1)
 
-    def judged(self, drives: Drive) -> Tensor:
+    def estimate_for_validation(self, drives: Drive) -> Tensor:
         """Estimated states of sequences, (B, T, 5), from the true state of their first sample."""
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())

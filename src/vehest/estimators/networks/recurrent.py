@@ -10,8 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.estimators.declared import setting
+from vehest.data.declared import setting
+from vehest.estimators.base import Trial
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
+
+TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
 
 
 class RecurrentNetwork(StandardisedNetwork):

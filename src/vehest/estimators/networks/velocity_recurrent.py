@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
+from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import FitData, FitRecord
-from vehest.estimators.declared import setting
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
 from vehest.training.sequences import Phase, PhaseRecord, PhaseSettings, train_phases
@@ -28,65 +28,45 @@ ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
 """Channels and outputs that change sign in a mirror, left for right; the others stay."""
 CHUNK = 10_000  # samples that are estimated at a time
 
+TRIAL = Trial(
+    11,
+    "recurrent networks over all samples so far; minutes",
+    "estimator.inputs=[yaw_rate,ax,ay,vx,steer] estimator.outputs=[vy] estimator.rate_hz=20 training.phase.max_epochs=100",
+)
+
 State = tuple[Tensor, ...]
 
 
 @dataclass(frozen=True)
-class SequenceSettings:
-    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024, Section IV).
+class SequenceSettings(Group):
+    """Training of recurrent networks on sequences cut from recordings (Węgrzynowski et al. 2024, Section IV)."""
 
-    Args:
-        phase: the one phase of the training.
-        sequence_steps: samples in a training sequence, the dropped ones included.
-        validation_steps: samples in a validation sequence, the dropped ones included.
-        dropped_steps: first samples of every sequence, on which the hidden state settles; no loss is taken of them.
-        validation_dropped_steps: the same of validation sequences; none: as in training.
-        truncate_steps: samples that gradients reach back. Drives are then cut whole into sequences of ``sequence_steps`` and less, with no
-            remainder left out, and there is a step after every so many samples, the hidden state carried on. 0: to the start of the
-            sequence, and remainders are left out.
-        mirrored: share of training sequences that are seen in a mirror, left for right.
-        batch_size: sequences in a batch.
-        weight_vx: of the squared error of vx in the loss; likewise the others.
-        weight_vy: of vy.
-        weight_yaw_rate: of the yaw rate.
-        dtype: ``float32`` or ``float64``.
-        checkpoint_seconds: time between two checkpoints [s].
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-    """
-
+    group = "training"
     version: ClassVar[str] = "1"
-    phase: PhaseSettings = PhaseSettings()  # noqa: RUF009
-    sequence_steps: int = 300
-    validation_steps: int = 1000
-    dropped_steps: int = 200
-    validation_dropped_steps: int | None = None
-    truncate_steps: int = 0
-    mirrored: float = 0.0
-    batch_size: int = 4
-    weight_vx: float = 0.2225
-    weight_vy: float = 0.5064
-    weight_yaw_rate: float = 0.1566
-    dtype: Literal["float32", "float64"] = "float32"
-    checkpoint_seconds: float = 15.0
+    phase: PhaseSettings = setting(PhaseSettings(), "the one phase of the training")
+    sequence_steps: int = setting(300, "samples in a training sequence, the dropped ones included")
+    validation_steps: int = setting(1000, "samples in a validation sequence, the dropped ones included")
+    dropped_steps: int = setting(200, "first samples of every sequence, on which the hidden state settles, without loss", least=0)
+    validation_dropped_steps: int | None = setting(None, "the same of validation sequences; null: as in training", least=0)
+    truncate_steps: int = setting(
+        0,
+        "samples that gradients reach back: drives are then cut whole into sequences of sequence_steps and less, with a step after every "
+        "so many samples, the hidden state carried on; 0: to the start of the sequence, and remainders are left out",
+        least=0,
+    )
+    mirrored: float = setting(0.0, "share of training sequences that are seen in a mirror, left for right", least=0.0, most=1.0)
+    batch_size: int = setting(4, "sequences in a batch", least=1)
+    weight_vx: float = setting(0.2225, "of the squared error of vx in the loss", least=0.0)
+    weight_vy: float = setting(0.5064, "of vy", least=0.0)
+    weight_yaw_rate: float = setting(0.1566, "of the yaw rate", least=0.0)
+    dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
+    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
     def __post_init__(self) -> None:
-        if self.batch_size < 1:
-            raise ConfigurationError(f"training.batch_size must be at least 1, not {self.batch_size}")
-        for name in ("dropped_steps", "settling_steps", "truncate_steps"):
-            if getattr(self, name) < 0:
-                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
+        super().__post_init__()
         for name, dropped in (("sequence_steps", self.dropped_steps), ("validation_steps", self.settling_steps)):
             if getattr(self, name) <= dropped:
                 raise ConfigurationError(f"training.{name} must be more than dropped_steps ({dropped}), not {getattr(self, name)}")
-        if not 0.0 <= self.mirrored <= 1.0:
-            raise ConfigurationError(f"training.mirrored must lie between 0 and 1, not at {self.mirrored}")
-        for name in ("weight_vx", "weight_vy", "weight_yaw_rate"):
-            if getattr(self, name) < 0:
-                raise ConfigurationError(f"training.{name} must not be negative, not {getattr(self, name)}")
-        if self.dtype not in ("float32", "float64"):
-            raise ConfigurationError(f"training.dtype '{self.dtype}' is not one of: float32, float64")
 
     @property
     def settling_steps(self) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -16,7 +15,8 @@ from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording_summary import RecordingSummary
-from vehest.estimators.registry import estimator_names
+from vehest.estimators.base import Trial
+from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import Draft, draft
@@ -154,10 +154,12 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     plan, values = Plan(), _car(vehicle)
-    known = {"learned_ukf_variant"}  # only a paper's study compares it
-    for family in yaml.safe_load(Path(__file__).with_name("families.yaml").read_text(encoding="utf-8")):
-        names, overrides = family["estimators"], family.get("overrides", "")
-        known.update(names)
+    sweeps: dict[Trial, list[str]] = {}
+    for name in estimator_names():
+        for trial in estimator_class(name).trials:
+            sweeps.setdefault(trial, []).append(name)
+    for trial in sorted(sweeps):
+        names, overrides = sweeps[trial], trial.overrides
         if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
             continue  # the next entry trains the same family from scratch
         unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
@@ -167,8 +169,9 @@ def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float |
         tried = [name for name in names if not lacks[name]]
         plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
         if tried:
-            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], family["about"]))
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], trial.about))
             plan.estimators.extend(tried)
+    known = {name for names in sweeps.values() for name in names} | {"learned_ukf_variant"}  # which only a paper's study compares
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
     plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; add it as you need it"))
     return plan if plan.sweeps else Plan()
