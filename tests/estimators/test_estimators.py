@@ -11,8 +11,10 @@ import yaml
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
+from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.training.search import DirectSearchSettings
 
 
 def test_parameter_counts_are_those_of_the_paper():
@@ -124,6 +126,27 @@ def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
     gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
     with pytest.raises(DataError, match="has gaps"):
         estimator.estimate([gappy])
+
+
+def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
+    estimator = fitted("luenberger")
+    save_model(estimator, tmp_path)
+    description = tmp_path / "model.yaml"
+    description.write_text(description.read_text().replace("version: '1'\n", ""))
+    assert load_model(tmp_path).gain == estimator.gain
+    monkeypatch.setattr(type(estimator), "version", "2")
+    with pytest.raises(DataError, match=r"holds version 1 of 'luenberger'.*version 2 here; train it again"):
+        load_model(tmp_path)
+    save_model(estimator, tmp_path)
+    assert load_model(tmp_path).gain == estimator.gain
+
+
+def test_a_number_that_is_given_is_not_fitted(drive):
+    estimator = estimator_class("luenberger").from_config({"gain": 7.0})
+    assert estimator.n_parameters == 1
+    estimator.fit(FitData([drive], [drive]), DirectSearchSettings(grid=2, max_evaluations=10))
+    assert estimator.gain == 7.0
+    assert estimator.threshold >= 0.0
 
 
 def test_sideslip_is_atan2_of_estimated_vy_and_measured_vx(drive):

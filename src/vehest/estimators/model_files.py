@@ -68,6 +68,7 @@ class Description:
         variant: what the paper calls it.
         channels: measured channels that it reads.
         about: how it came to be.
+        version: of the estimator; folders older than this entry have "1".
     """
 
     format: int
@@ -76,6 +77,7 @@ class Description:
     variant: str = ""
     channels: tuple[str, ...] = ()
     about: About = field(default_factory=About)
+    version: str = "1"
 
 
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
@@ -92,6 +94,7 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
     description = {
         "format": FORMAT,
         "estimator": estimator.name,
+        "version": estimator.version,
         "variant": estimator.variant,
         "settings": asdict(estimator.settings),
         "channels": list(estimator.channels),
@@ -117,6 +120,11 @@ def load_model(folder: Path) -> Estimator:
         kind = estimator_class(description.estimator)
     except ConfigurationError as error:
         raise DataError(f"'{path}': {error}") from None
+    if description.version != kind.version:
+        raise DataError(
+            f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates differ from those of version {kind.version} "
+            f"here; train it again, or use the vehest that trained it"
+        )
     weights = _read_weights(folder)
     estimator = _built(kind, description.settings, sum(values.size for values in weights.values()), path)
     _refuse_non_finite(weights, estimator.open_weights, folder / WEIGHTS)
