@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Generic, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from vehest.constants import FloatArray
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Array, Filtered, Gaussian, stacked, symmetric
 
@@ -175,6 +177,26 @@ def smooth(model: LinearModel[Tensor], filtered: Filtered[Tensor]) -> Gaussian[T
         )
         states.append(state)
     return stacked(states[::-1], means.dim() - 2)
+
+
+def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray]) -> FloatArray:
+    """Mean states given all measurements of one sequence, (T, n).
+
+    Args:
+        model: that `kalman_scan` was given, with all its dimensions.
+        filtered: what it returned.
+
+    Raises:
+        numpy.linalg.LinAlgError: a predicted covariance is singular.
+
+    Source: Rauch, Tung & Striebel 1965.
+    """
+    ahead = filtered.predicted
+    gains = np.linalg.solve(ahead.covariance[1:], model.transition[:-1] @ filtered.filtered.covariance[:-1]).transpose(0, 2, 1)
+    means = filtered.filtered.mean.copy()
+    for k in range(len(means) - 2, -1, -1):
+        means[k] += gains[k] @ (means[k + 1] - ahead.mean[k + 1])
+    return means
 
 
 def shapes_of(n: int, m: int) -> tuple[tuple[int, ...], ...]:
