@@ -8,7 +8,6 @@ import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 STRICT = ("-std=c99", "-ffp-contract=off")
@@ -94,23 +93,18 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
             _run([target.compiler, *options, "-c", *sources, "probe.c"], folder)
             objects = [Path(name).with_suffix(".o").name for name in sources]
             sections = _sections(_run([f"{target.prefix}size", "-A", *objects], folder))
+            version = _run([target.compiler, "--version"], folder).partition("\n")[0]
             symbols = _run([f"{target.prefix}nm", "-S", "probe.o"], folder)
         except (OSError, subprocess.SubprocessError):
             return None
         graphs = [(folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources]
     stack, library = worst_stack(graphs, ENTRIES)
     state = int(next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16)
-    return Footprint(target.title, _version(target.compiler), state, *sections, stack, library)
+    return Footprint(target.title, version, state, *sections, stack, library)
 
 
 def _run(command: list[str], folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS).stdout
-
-
-@cache
-def _version(compiler: str) -> str:
-    said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    return said.partition("\n")[0]
 
 
 def _sections(said: str) -> tuple[int, int, int]:
