@@ -109,12 +109,26 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> 
     return dict(prepared_recording(model, cut).channels)
 
 
+def sizes(files: dict[str, str], target: Any, folder: Path, prefix: str) -> dict[str, int]:
+    """Bytes that an export takes on a target, and those of the method's instructions alone; none where its compiler is missing."""
+    from vehest.export.measure import STRICT, footprint
+
+    own = footprint(files, target)
+    if own is None:
+        return {}
+    subprocess.run([target.compiler, *STRICT, *target.options, "-c", "vehest_method.c"], cwd=folder, check=True)
+    said = subprocess.run([f"{target.prefix}size", "-A", "vehest_method.o"], cwd=folder, check=True, capture_output=True, text=True).stdout
+    method = sum(int(line.split()[1]) for line in said.splitlines() if line.startswith(".text"))
+    kinds = {"state": own.state, "method_code": method, "code": own.code, "tables": own.tables, "stack": own.stack}
+    return {f"{prefix}{kind}_bytes": size for kind, size in kinds.items()}
+
+
 def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[str, Any]]:
     """A row for each precision."""
     from vehest.data.errors import ConfigurationError
     from vehest.estimators.model_files import load_model
     from vehest.export.folder import refuse_unresolved
-    from vehest.export.measure import CORTEX_M4F, HOST, footprint
+    from vehest.export.measure import CORTEX_M4F, HOST
     from vehest.export.program import program_files
     from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
     from vehest.run.calibrate import trust_of
@@ -157,8 +171,8 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
                 ["./timed", "rows.bin", str(PASSES)], cwd=place, check=True, capture_output=True, text=True
             ).stdout.split()
             own = np.genfromtxt(place / "out.csv", delimiter=",", skip_header=1)
+            bytes_taken = sizes(files, HOST, place, "") | sizes(files, CORTEX_M4F, place, "m4f_")
         assert own.shape[1] == len(COLUMNS)
-        host, arm = (footprint(files, target) for target in (HOST, CORTEX_M4F))
         difference = np.abs(own[:, 0] - wanted[:, 0])
         rows.append(
             {
@@ -174,8 +188,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
                 "python_ns": 1e3 * python,
                 "python_over_c": 1e3 * python / float(said[0]),
                 "onnxruntime_ns": onnx,
-                **({f"{k}_bytes": getattr(host, k) for k in ("state", "method_code", "code", "tables", "stack")} if host else {}),
-                **({f"m4f_{k}_bytes": getattr(arm, k) for k in ("state", "method_code", "code", "tables", "stack")} if arm else {}),
+                **bytes_taken,
             }
         )
         print(rows[-1], flush=True)

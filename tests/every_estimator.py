@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from conftest import planar_drive
 from dugoff_drive import TYRES
 from single_track_drive import linear_drive
@@ -51,8 +49,6 @@ SAMPLED = {
 
 def fitted(name: str, dtype: str = "float64", **config: Any) -> Estimator:
     """Fitted for a moment to a drive that it can learn from."""
-    if name == "factor_graph":
-        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
     estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:

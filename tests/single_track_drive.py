@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.single_track import SampledModel
+from vehest.estimators.filtering.sideslip_filter import SampledModel
 from vehest.vehicle.parameters import FERRARI_250LM
 from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
 

@@ -10,9 +10,11 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from readable_filters import extended_filter, gated
 from test_estimators_rational import rational
 from test_filters_extended_scan import compiled_pendulum, measured_pendulum, pendulum_with_radar
-from test_filters_kalman import arrays, example
+from test_filters_kalman import example, tensors
+from test_filters_nonlinear import linear_as_nonlinear
 from test_kernels import STRUCTURES, _problem
 from test_planar_car import CARS, LOWER, a_car, driven
 from test_planar_car import STEP as CAR_STEP
@@ -25,10 +27,9 @@ from vehest.estimators.kernels.planar_car import CompiledPlanarCar
 from vehest.estimators.rational_ekf import KINDS
 from vehest.filters.extended_scan import extended_scan
 from vehest.filters.gating import Gate
-from vehest.filters.gaussian import Gaussian
-from vehest.filters.kalman import kalman_filter
+from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import NonlinearModel, extended_filter, unscented_filter
+from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, unscented_scan
 
@@ -58,25 +59,25 @@ def of_the_same_numbers(values: object) -> list[Tensor]:
     return [torch.as_tensor(value) for value in values]  # type: ignore[attr-defined]
 
 
-def kalman() -> Forms:
-    model, measurements, initial = example(STEPS, seed=1)
-    y = with_gaps(measurements)
-    return list(kalman_filter(model, y, initial).filtered), of_the_same_numbers(
-        kalman_scan(arrays(model), y.numpy(), arrays(initial)).filtered
-    )
+def behind(gate: Gate | None, run: Callable[[Tensor], Filtered[Tensor]], y: Tensor) -> Filtered[Tensor]:
+    return run(y) if gate is None else gated(run, y, gate)
 
 
-def gated_kalman() -> Forms:
-    model, measurements, initial = example(STEPS, seed=1)
-    y = with_outliers(measurements)
-    compiled = kalman_scan(arrays(model), y.numpy(), arrays(initial), GATE)
-    return list(kalman_filter(model, y, initial, GATE).filtered), of_the_same_numbers(compiled.filtered)
+def kalman(gate: Gate | None = None) -> Callable[[], Forms]:
+    def forms() -> Forms:
+        model, measurements, initial = example(STEPS, seed=1)
+        y = (with_gaps if gate is None else with_outliers)(torch.from_numpy(measurements))
+        readable, number = linear_as_nonlinear(tensors(model)), torch.arange(STEPS, dtype=torch.float64).unsqueeze(-1)
+        theirs = behind(gate, lambda y: extended_filter(readable, y, number, tensors(initial)), y)
+        return list(theirs.filtered), of_the_same_numbers(kalman_scan(model, y.numpy(), initial, gate).filtered)
+
+    return forms
 
 
 def extended() -> Forms:
     measurements, inputs, initial = measured_pendulum(STEPS)
     y = with_gaps(measurements[0])
-    readable = extended_filter(pendulum_with_radar(), y, inputs[0], initial).steps
+    readable = extended_filter(pendulum_with_radar(), y, inputs[0], initial)
     compiled = extended_scan(compiled_pendulum(), y.numpy(), inputs[0].numpy(), Gaussian(*(part.numpy() for part in initial)))
     return list(readable.filtered), of_the_same_numbers(compiled.filtered)
 
@@ -89,7 +90,7 @@ def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Fo
         samples[:, [0, 2]] = spoilt(torch.as_tensor(samples[:, [0, 2]])).numpy()
         first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
         y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-        readable = extended_filter(estimator.nonlinear_model(), y, u, first, gate=gate).steps.filtered
+        readable = behind(gate, lambda y: extended_filter(estimator.nonlinear_model(), y, u, first), y).filtered
         compiled = estimator.filter_samples(samples, gate=gate)
         variances = readable.covariance.diagonal(dim1=-2, dim2=-1)
         return [readable.mean, variances.clamp(min=0.0).sqrt()], of_the_same_numbers([compiled.mean, compiled.deviation])
@@ -109,7 +110,7 @@ def unscented(
     n = first.mean.shape[-1]
     rule = symmetric_rule(n, 3.0 - n)
     with torch.no_grad():
-        theirs = unscented_filter(readable, y, u, first, rule, gate=gate).steps.filtered
+        theirs = behind(gate, lambda y: unscented_filter(readable, y, u[0], first, rule).steps, y[0]).filtered
         ours = unscented_scan(compiled, y, u, first, *noises, rule, gate=gate).steps.filtered
     return list(theirs), list(ours)
 
@@ -162,13 +163,13 @@ def network(estimator: object) -> Callable[[], Forms]:
 
 
 PAIRS: dict[str, Callable[[], Forms]] = {
-    "Kalman": kalman,
+    "Kalman": kalman(),
     "extended": extended,
     **{f"rational_ekf {tyres}": rational_with(tyres=tyres) for tyres in KINDS},
     "rational_ekf held straight ahead": rational_with(adapt_above=2.0),
     **{f"learned_ukf {kind}": planar(kind) for kind in CARS},
     **{f"dugoff_ukf {tyres}": dugoff(tyres) for tyres in ("plain", "smooth")},
-    "Kalman gated": gated_kalman,
+    "Kalman gated": kalman(GATE),
     "rational_ekf gated": rational_with(GATE, tyres="rational_adaptive"),
     "learned_ukf gated": planar("PC", GATE),
     "dugoff_ukf gated": dugoff("plain", GATE),

@@ -49,8 +49,6 @@ EVERY = pytest.mark.parametrize("name", CONFIGS)
 
 def estimator(name: str, gate: float | None = None) -> Estimator:
     """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
-    if name == "factor_graph":
-        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
     made = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
     made.seed(0)
     if name in ("ensemble_ukf", "cnn_ukf"):

@@ -70,7 +70,6 @@ def test_kalman_filter_over_the_whole_ferrari_drive_is_the_published_one(ferrari
 
 def test_factor_graph_over_the_whole_ferrari_drive_is_the_published_one(ferrari):
     """Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter."""
-    pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
     batch = _over_the_whole_drive("factor_graph", ferrari)["rmse_sideslip"]
     window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
     assert batch == pytest.approx(0.57, abs=0.02)

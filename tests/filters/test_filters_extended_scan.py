@@ -6,13 +6,13 @@ import numba
 import numpy as np
 import pytest
 import torch
+from readable_filters import extended_filter
 from test_filters_kalman import example
 from test_filters_nonlinear import STEP, measured_pendulum, pendulum_with_radar
 
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import extended_filter
 
 
 @numba.njit
@@ -50,7 +50,7 @@ def test_compiled_filter_is_the_readable_one_with_and_without_measurements(missi
         y[torch.rand(y.shape, generator=torch.Generator().manual_seed(3)) < missing] = torch.nan
         y[10:13] = torch.nan
         assert y.isnan().any(1).sum() > y.isnan().all(1).sum() > 3
-    theirs = extended_filter(pendulum_with_radar(), y, inputs[0], initial).steps
+    theirs = extended_filter(pendulum_with_radar(), y, inputs[0], initial)
     ours = extended_scan(compiled_pendulum(), y.numpy(), inputs[0].numpy(), as_arrays(initial))
     for part in ("predicted", "filtered"):
         for own, their in zip(getattr(ours, part), getattr(theirs, part), strict=True):
@@ -74,16 +74,15 @@ def direct(x, u, parameters):
 
 def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with_time():
     model, measurements, initial = example(30, missing=0.3)
-    model = type(model)(*(np.array(part) for part in model))
     steps, n = 30, model.transition.shape[-1]
     A, C = np.broadcast_to(model.transition, (steps, n, n))[0].copy(), np.eye(n)[:2]
     offsets = np.broadcast_to(model.transition_offset, (steps, n)).copy()
     Q = np.broadcast_to(model.process_noise, (steps, n, n)) * np.linspace(0.5, 2.0, steps)[:, None, None]
     R = np.diag([0.2, 0.3]) * np.linspace(2.0, 0.5, steps)[:, None, None]
-    y = np.array(measurements)[:, :2]
+    y = measurements[:, :2]
     linear = type(model)(A, offsets, Q, C, np.zeros(2), R)
-    theirs = kalman_scan(linear, y, as_arrays(initial))
-    ours = extended_scan(CompiledModel(drift, direct, A.ravel(), Q, R), y, offsets, as_arrays(initial))
+    theirs = kalman_scan(linear, y, initial)
+    ours = extended_scan(CompiledModel(drift, direct, A.ravel(), Q, R), y, offsets, initial)
     assert np.abs(ours.filtered.mean - theirs.filtered.mean).max() < 1e-9
     assert np.abs(ours.filtered.covariance - theirs.filtered.covariance).max() < 1e-9
     assert np.abs(ours.log_likelihood - theirs.log_likelihood).max() < 1e-9

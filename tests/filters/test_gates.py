@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
+from readable_filters import extended_filter, gated
 from scipy.stats import chi2, norm
-from test_filters_kalman import arrays, example
-from test_filters_nonlinear import RULES, measured_pendulum, pendulum_with_radar
+from test_filters_kalman import example, tensors
+from test_filters_nonlinear import RULES, linear_as_nonlinear, measured_pendulum, pendulum_with_radar
 from torch import Tensor
 
 from vehest.filters.gating import Gate
-from vehest.filters.gaussian import Gaussian
-from vehest.filters.kalman import LinearModel, kalman_filter
+from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.nonlinear import unscented_filter
+from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
 
 PATIENCE = 5
@@ -35,6 +38,10 @@ def pendulum(y: Tensor, u: Tensor, first: Gaussian[Tensor], gate: Gate | None, r
     return unscented_scan(
         TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate, refused=refused
     )
+
+
+def by_the_filter(u: Tensor, first: Gaussian[Tensor], rule: SigmaRule, y: Tensor) -> Filtered[Tensor]:
+    return unscented_filter(pendulum_with_radar(), y, u, first, rule).steps
 
 
 def test_the_limit_is_that_of_the_chi_square_distribution() -> None:
@@ -82,8 +89,8 @@ def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back() ->
 
 def test_a_gate_that_refuses_nothing_changes_no_bit() -> None:
     model, measurements, first = example(60, seed=3, missing=0.2)
-    plain = kalman_scan(arrays(model), measurements.numpy(), arrays(first))
-    wide = kalman_scan(arrays(model), measurements.numpy(), arrays(first), Gate(1e9, PATIENCE))
+    plain = kalman_scan(model, measurements, first)
+    wide = kalman_scan(model, measurements, first, Gate(1e9, PATIENCE))
     assert np.array_equal(plain.filtered.mean, wide.filtered.mean)
     assert np.array_equal(plain.filtered.covariance, wide.filtered.covariance)
     y, u, start = measured_pendulum(60, 3)
@@ -105,9 +112,11 @@ def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule() -
     model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
     for name, rule in RULES.items():
-        readable = unscented_filter(model, y, u, first, rule, gate=gate).steps
         scanned = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate).steps
-        assert torch.equal(readable.measured, scanned.measured), name
+        for row in range(3):
+            judged = gated(partial(by_the_filter, u[row], first, rule), y[row], gate)
+            assert torch.equal(judged.measured, scanned.measured[row]), name
+        readable = by_the_filter(u, first, rule, torch.where(scanned.measured, y, torch.nan))
         assert not scanned.measured[0, 15 : 15 + PATIENCE, 1].any(), "shut"
         assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
         for a, b in zip(readable.filtered, scanned.filtered, strict=True):
@@ -132,8 +141,8 @@ def test_gradients_through_a_gate_are_those_of_missing_measurements() -> None:
         assert torch.isfinite(a).all()
         assert torch.equal(a, b)
     assert (found[0][0][~taken] == 0.0).all(), "what is refused teaches nothing"
-    readable = y.clone().requires_grad_()
-    mean = unscented_filter(model, readable, u, first, RULES["symmetric"], gate=Gate(4.0, PATIENCE)).steps.filtered.mean
+    readable = torch.where(taken, y, torch.nan).requires_grad_()
+    mean = by_the_filter(u, first, RULES["symmetric"], readable).filtered.mean
     (theirs,) = torch.autograd.grad((mean * weights).sum(), readable)
     assert torch.allclose(theirs, found[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))
 
@@ -192,17 +201,15 @@ def test_every_sequence_has_its_own_gate_however_they_are_shared_out() -> None:
     assert torch.equal(shared.filtered.mean, together.filtered.mean)
 
 
-def test_the_readable_kalman_filter_has_the_same_gate() -> None:
+def test_the_gate_of_the_kalman_filter_judges_by_its_innovations() -> None:
     model, measurements, first = example(60, seed=5, missing=0.1)
     measurements[20, 0], measurements[40:, 1] = 1e3, 1e3
-    gate = Gate(4.0, PATIENCE)
-    readable, compiled = (
-        kalman_filter(model, measurements, first, gate),
-        kalman_scan(arrays(model), measurements.numpy(), arrays(first), gate),
-    )
-    assert np.array_equal(readable.measured.numpy(), compiled.measured)
+    readable, number, gate = linear_as_nonlinear(tensors(model)), torch.arange(60.0).unsqueeze(-1), Gate(4.0, PATIENCE)
+    judged = gated(lambda y: extended_filter(readable, y, number, tensors(first)), torch.from_numpy(measurements), gate)
+    compiled = kalman_scan(model, measurements, first, gate)
+    assert np.array_equal(judged.measured, compiled.measured)
     assert not compiled.measured.all()
-    assert readable.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
+    assert judged.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
 
 
 def test_half_a_second_of_patience_is_counted_in_samples() -> None:

@@ -15,7 +15,6 @@ PIECES = (
     "rosbags.typesys",
     "mlflow",
     "optuna",
-    "gtsam",
     "can.interfaces.virtual",
     "can.io.asc",
     "can.io.blf",

@@ -24,8 +24,6 @@ def test_every_family_source_and_stage_is_recorded():
 
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_numbers_are_those_recorded(name):
-    if name == "factor_graph":
-        pytest.importorskip("gtsam")
     here = RECORDED["machine"] == this_machine()
     complaint = moved(name, RECORDED["subjects"][name], now(name), None if here else SUBJECTS[name].tolerance)
     assert not complaint, complaint

@@ -217,13 +217,13 @@ def test_doctor_finds_this_machine_fit(place):
 
 def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "gtsam" else find(name, *rest) or find("vehest"))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"))
     code, out, _ = place("doctor", "--json")
     assert code == 0
     (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
     assert (extras["level"], extras["message"]) == (
         "warning",
-        "factor graphs need 'vehest[factor-graph]': pip install it where you need it",
+        "noise levels tuned by Optuna need 'vehest[tuning]': pip install it where you need it",
     )
 
 

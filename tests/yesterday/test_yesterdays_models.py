@@ -26,8 +26,6 @@ def drive_file(channels: tuple[str, ...], rate_hz: float) -> Path:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
-    if name == "factor_graph":
-        pytest.importorskip("gtsam", reason="the factor graph needs gtsam: pip install 'vehest[factor-graph]'")
     folder, model, trust = open_model(str(HERE / "models" / name), HERE, print)
     drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
     then = read_estimate(folder / "estimate.parquet")

@@ -413,15 +413,3 @@ class RunStepper(Stepper):
 def _optional(kind: Any) -> Any:
     """A type, or its name as an annotation has it, or None."""
     return f"{kind} | None" if isinstance(kind, str) else kind | None
-
-
-def required(sample: Mapping[str, float], channels: Sequence[str]) -> list[float]:
-    """Values of the channels in this order.
-
-    Raises:
-        DataError: one is missing.
-    """
-    try:
-        return [float(sample[name]) for name in channels]
-    except KeyError as error:
-        raise DataError(f"the sample has no channel {error}; it needs {', '.join(channels)}") from None

@@ -188,12 +188,12 @@ class Recursive(Estimator):
         """Take the numbers back.
 
         Raises:
-            DataError: one is missing.
+            DataError: one is missing or unknown.
         """
-        try:
-            self.values = {name: float(weights[name][0]) for name in self.values}
-        except (KeyError, IndexError):
-            raise DataError(f"weights of '{self.name}' must be {', '.join(self.values)}, not {', '.join(weights)}") from None
+        expected = self.weights()
+        if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
+            raise DataError(f"weights of '{self.name}' must be {', '.join(expected) or 'none'}, not {', '.join(weights)}")
+        self.values = {name: float(weights[name][0]) for name in self.values}
 
 
 class _FittedNumber:

@@ -7,8 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 
 STRICT = ("-std=c99", "-ffp-contract=off")
@@ -53,8 +52,7 @@ class Footprint:
         target: title of the target.
         compiler: first line of what it says of itself.
         state: bytes of ``vehest_state``.
-        method_code: bytes of instructions of the method alone.
-        code: bytes of all instructions.
+        code: bytes of instructions.
         tables: bytes of constants.
         data: bytes of variables, which an export has none of.
         stack: bytes of the deepest chain of calls, without what the C library takes.
@@ -64,15 +62,14 @@ class Footprint:
     target: str
     compiler: str
     state: int
-    method_code: int
     code: int
     tables: int
     data: int
     stack: int
-    library: tuple[str, ...] = field(default=())
+    library: tuple[str, ...]
 
     def figures(self) -> dict[str, int]:
-        """What people ask for first, by name."""
+        """What the command prints, by name."""
         return {f"{self.target}, bytes of {name}": getattr(self, name) for name in ("state", "code", "tables", "stack")}
 
 
@@ -96,24 +93,18 @@ def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
             _run([target.compiler, *options, "-c", *sources, "probe.c"], folder)
             objects = [Path(name).with_suffix(".o").name for name in sources]
             sections = _sections(_run([f"{target.prefix}size", "-A", *objects], folder))
-            method = _sections(_run([f"{target.prefix}size", "-A", "vehest_method.o"], folder))[0]
+            version = _run([target.compiler, "--version"], folder).partition("\n")[0]
             symbols = _run([f"{target.prefix}nm", "-S", "probe.o"], folder)
         except (OSError, subprocess.SubprocessError):
             return None
         graphs = [(folder / name).with_suffix(".ci").read_text(encoding="utf-8") for name in sources]
     stack, library = worst_stack(graphs, ENTRIES)
     state = int(next(line.split()[1] for line in symbols.splitlines() if line.endswith("probe")), 16)
-    return Footprint(target.title, _version(target.compiler), state, method, *sections, stack, library)
+    return Footprint(target.title, version, state, *sections, stack, library)
 
 
 def _run(command: list[str], folder: Path) -> str:
     return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True, timeout=SECONDS).stdout
-
-
-@cache
-def _version(compiler: str) -> str:
-    said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
-    return said.partition("\n")[0]
 
 
 def _sections(said: str) -> tuple[int, int, int]:

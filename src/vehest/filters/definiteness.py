@@ -1,4 +1,4 @@
-"""Cholesky factors of covariances that may have lost their definiteness: repaired and counted, or left to diverge."""
+"""Cholesky factors of covariances that may have lost their definiteness: repaired and counted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Factor(NamedTuple):
     Attributes:
         covariance: the repaired one, (..., n, n); NaN where it could not be.
         factor: L with L Lᵀ = covariance, lower triangular, (..., n, n).
-        repaired: bool, (...); with repair switched off, where it would have been needed.
+        repaired: bool, (...).
     """
 
     covariance: Tensor
@@ -25,7 +25,7 @@ class Factor(NamedTuple):
     repaired: Tensor
 
 
-def factorised(covariance: Tensor, *, repair: bool = True) -> Factor:
+def factorised(covariance: Tensor) -> Factor:
     """Cholesky factor of a covariance, lifted first where it is not positive definite.
 
     Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in
@@ -33,11 +33,9 @@ def factorised(covariance: Tensor, *, repair: bool = True) -> Factor:
 
     Args:
         covariance: symmetric, (..., n, n).
-        repair: whether to lift; otherwise what is not positive definite becomes NaN.
     """
-    n = covariance.shape[-1]
     finite = torch.isfinite(covariance).all(-1).all(-1)
-    identity = torch.eye(n, dtype=covariance.dtype, device=covariance.device)
+    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
     safe = torch.where(finite[..., None, None], covariance, identity)
     factor, info = torch.linalg.cholesky_ex(safe)
     lost = info > 0
@@ -45,9 +43,7 @@ def factorised(covariance: Tensor, *, repair: bool = True) -> Factor:
         with torch.no_grad():
             eigenvalues = torch.linalg.eigvalsh(safe)
             lift = MARGIN * eigenvalues.abs().amax(-1) - eigenvalues[..., 0]
-        if repair:
-            safe = safe + torch.where(lost, lift, 0.0)[..., None, None] * identity
-        # what stays not definite is replaced before it is factorised: NaN made later has no part in the others' gradients
-        factor, info = torch.linalg.cholesky_ex(torch.where((lost & (not repair))[..., None, None], identity, safe))
-    whole = (finite & (info == 0) & (~lost if not repair else torch.ones_like(lost)))[..., None, None]
+        safe = safe + torch.where(lost, lift, 0.0)[..., None, None] * identity
+        factor, info = torch.linalg.cholesky_ex(safe)
+    whole = (finite & (info == 0))[..., None, None]
     return Factor(torch.where(whole, safe, torch.nan), torch.where(whole, factor, torch.nan), lost & finite)

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of `vehest.filters.nonlinear` for one long sequence, compiled with any model: no gradients."""
+"""The extended Kalman filter of one sequence, compiled with any model."""
 
 from __future__ import annotations
 

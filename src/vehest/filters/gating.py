@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numba
-import torch
-from torch import Tensor
 
 PATIENCE = 0.5  # s
 
@@ -33,25 +31,6 @@ class Gate(NamedTuple):
     def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:
         """A gate that opens again after 0.5 s; none: no gate."""
         return None if deviations is None else cls(deviations, max(1, round(PATIENCE * rate_hz)))
-
-    def apply(self, y: Tensor, expected: Tensor, variance: Tensor, refused: Tensor) -> tuple[Tensor, Tensor]:
-        """Measurements with NaN where they are refused; the decision has no gradient.
-
-        Args:
-            y: (..., m), NaN where nothing was measured.
-            expected: ŷ, (..., m).
-            variance: of y - ŷ, (..., m).
-            refused: how often on end each one was too far off, before this sample, int64 (..., m).
-
-        Returns:
-            What is left of y, and ``refused`` after this sample.
-        """
-        with torch.no_grad():
-            far = (y - expected).square() > self.deviations**2 * variance
-            agreed = torch.where(refused > self.patience, refused - 1, 0)
-            count = torch.where(far, (refused + 1).clamp(max=2 * self.patience), torch.where(torch.isnan(y), refused, agreed))
-            gone = far & (count <= self.patience)
-        return torch.where(gone, torch.nan, y), count
 
 
 @numba.njit(inline="always")

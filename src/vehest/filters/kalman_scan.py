@@ -1,4 +1,4 @@
-"""The Kalman filter of `vehest.filters.kalman` for one long sequence, compiled: the same numbers, no gradients."""
+"""The Kalman filter of one sequence, compiled."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def kalman_scan(
     """Filter one sequence in float64; what is NaN was not measured and is skipped.
 
     Args:
-        model: as for `kalman_filter`, without a batch; what is constant over time needs no dimension for it.
+        model: see `LinearModel`.
         measurements: y, (T, m).
         initial: state at the first sample before its measurement, mean (n,).
         gate: which measurements are refused; none: all are taken.
@@ -33,6 +33,8 @@ def kalman_scan(
     Raises:
         ValueError: shapes do not fit each other.
         numpy.linalg.LinAlgError: an innovation covariance is not positive definite.
+
+    Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive.
     """
     if measurements.ndim != 2 or len(measurements) == 0:
         raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")

@@ -1,4 +1,4 @@
-"""Covariances of noise that can be learnt: constant, linear in the state, or fixed; and a floor for their entropy."""
+"""Covariances of noise that can be learnt: constant or linear in the state; and a floor for their entropy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ConstantNoise(nn.Module):
 
     def __init__(self, variances: Sequence[float], floor: float = FLOOR) -> None:
         super().__init__()
-        start = _checked(variances)
+        start = torch.tensor(list(variances))
         self.floor = floor
         self.n = len(start)
         self.factor = nn.Parameter(start.sqrt().diag()[_lower(self.n)])
@@ -99,24 +99,6 @@ class StateDependentNoise(nn.Module):
         return self.constant(state, inputs) + self.scale * _product(factor, self.constant.n, 0.0)
 
 
-class FixedNoise(nn.Module):
-    """A diagonal covariance that is not learnt.
-
-    Args:
-        variances: n of them.
-    """
-
-    covariance: Tensor
-
-    def __init__(self, variances: Sequence[float]) -> None:
-        super().__init__()
-        self.register_buffer("covariance", _checked(variances).diag())
-
-    def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
-        """The covariance, (..., n, n)."""
-        return self.covariance.expand(*state.shape[:-1], *self.covariance.shape)
-
-
 def entropy(covariance: Tensor) -> Tensor:
     """Differential entropy of a normal distribution [nat], (..., n, n) -> (...)."""
     n = covariance.shape[-1]
@@ -140,10 +122,3 @@ def _product(factor: Tensor, n: int, floor: float) -> Tensor:
 def _lower(n: int) -> tuple[Tensor, Tensor]:
     rows, columns = torch.tril_indices(n, n)
     return rows, columns
-
-
-def _checked(variances: Sequence[float]) -> Tensor:
-    values = torch.as_tensor(list(variances), dtype=torch.get_default_dtype())
-    if values.ndim != 1 or not len(values) or not bool((values > 0).all()):
-        raise ValueError(f"variances must be positive numbers, not {list(variances)}")
-    return values

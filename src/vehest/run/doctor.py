@@ -17,7 +17,6 @@ from vehest.run.config_files import packaged_conf
 
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),
-    "factor-graph": ("gtsam", "factor graphs"),
     "mdf": ("asammdf", "MDF measurements"),
     "bus": ("cantools", "CAN logs and replays"),
     "tuning": ("optuna", "noise levels tuned by Optuna"),

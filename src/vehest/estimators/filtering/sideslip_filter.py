@@ -117,11 +117,11 @@ class SideslipFilter(Recursive):
     def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
         """State before the first sample; see `first_state`."""
 
-    @abstractmethod
     def filter_samples(
         self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
     ) -> FilteredStates:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement; ``refused``: see `Gate`."""
+        raise NotImplementedError(f"{type(self).__name__} has neither 'filter_samples' nor its own 'run'")
 
     def quantities(self, states: FloatArray) -> dict[str, FloatArray]:
         """What further states, (T, n), say: name -> (T,)."""
