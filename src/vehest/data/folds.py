@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.laps import laps_of
@@ -30,34 +31,25 @@ class FoldsFile:
         gap_seconds: taken off training and validation where they border on another fold [s], since filters and windows reach across.
     """
 
-    number: int = 5
+    number: Annotated[int, Field(ge=FEWEST)] = 5
     of: Literal["recordings", "laps", "seconds"] = "laps"
     recordings: str = "*"
-    block_seconds: float = 30.0
-    gap_seconds: float = 2.0
-
-    def __post_init__(self) -> None:
-        if self.number < FEWEST:
-            raise ValueError(f"number must be {FEWEST} or more (test, validation, training), not {self.number}")
-        if not self.block_seconds > 0.0:
-            raise ValueError(f"block_seconds must be positive, not {self.block_seconds:g}")
-        if not self.gap_seconds >= 0.0:
-            raise ValueError(f"gap_seconds must not be negative, not {self.gap_seconds:g}")
+    block_seconds: PositiveFloat = 30.0
+    gap_seconds: NonNegativeFloat = 2.0
 
 
-def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str] | None], Recording]]) -> list[Span]:
+def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
     """The blocks of recordings in order, each with its start and stop.
 
     Args:
         folds: with the unit that is never cut in two.
-        recordings: a span that names a recording -> its reader.
+        recordings: spans that name a recording, with it.
 
     Raises:
         DataError: laps are asked for and a recording lacks speed or yaw rate.
     """
     blocks = []
-    for whole, read in recordings.items():
-        recording = read(None)
+    for whole, recording in recordings:
         bounds = [recording.start_time, recording.end_time]
         if folds.of == "laps":  # the rest before the first or after the last belongs to that lap
             bounds += [stop for _, stop in laps_of(recording)[:-1]]
