@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import scipy
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
@@ -17,25 +18,14 @@ from vehest.data.recording import Recording
 WHEELS = ("fl", "fr", "rl", "rr")
 
 
-def require_channel(name: str, what: str) -> None:
-    """Refuse a channel that is not in the table.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
+def _known(name: str) -> str:
     if name not in CHANNELS:
-        raise ConfigurationError(f"{what} of '{name}': there is no such channel; 'vehest data channels' lists them")
+        raise ValueError(f"there is no channel '{name}'; 'vehest data channels' lists them")
+    return name
 
 
-def require_positive(what: str, **values: float) -> None:
-    """Refuse values that are not positive.
-
-    Raises:
-        ConfigurationError: one is zero, negative or not finite.
-    """
-    for name, value in values.items():
-        if not 0.0 < value < math.inf:
-            raise ConfigurationError(f"{what}: {name} must be a positive number, not {value!r}")
+ChannelName = Annotated[str, AfterValidator(_known)]
+"""Name of a channel of the table."""
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -55,12 +45,11 @@ class SteeringRatio:
 
     ratio: float
     offset: float = 0.0
-    channel: str = "handwheel"
+    channel: ChannelName = "handwheel"
 
     def __post_init__(self) -> None:
         if self.ratio == 0.0:
             raise ConfigurationError("a steering ratio must be a number other than zero")
-        require_channel(self.channel, "steering ratio")
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``; it has gaps where the angle has them.
@@ -84,12 +73,11 @@ class SteeringCurve:
 
     inputs: tuple[float, ...]
     angles: tuple[float, ...]
-    channel: str = "steer"
+    channel: ChannelName = "steer"
 
     def __post_init__(self) -> None:
         if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
             raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
-        require_channel(self.channel, "steering curve")
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``steer``; it has gaps where the channel has them.
@@ -124,19 +112,13 @@ class SpeedFromWheels:
         Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
     """
 
-    wheel_radius: float
-    track_front: float = 0.0
-    track_rear: float = 0.0
-    tolerance: float = 0.3
-    most_acceleration: float = 12.0
-    hold_seconds: float = 2.0
+    wheel_radius: PositiveFloat
+    track_front: NonNegativeFloat = 0.0
+    track_rear: NonNegativeFloat = 0.0
+    tolerance: PositiveFloat = 0.3
+    most_acceleration: PositiveFloat = 12.0
+    hold_seconds: PositiveFloat = 2.0
     relative_tolerance: ClassVar[float] = 0.05
-
-    def __post_init__(self) -> None:
-        require_positive("speed from wheels", wheel_radius=self.wheel_radius, tolerance=self.tolerance)
-        require_positive("speed from wheels", most_acceleration=self.most_acceleration, hold_seconds=self.hold_seconds)
-        if not min(self.track_front, self.track_rear) >= 0.0:
-            raise ConfigurationError(f"speed from wheels: tracks must be zero or positive, not {self.track_front} and {self.track_rear}")
 
     def corrected(self, recording: Recording) -> FloatArray:
         """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
@@ -217,11 +199,8 @@ class AccelerationFromSpeed:
     """
 
     channel: Literal["vx", "vx_ref"] = "vx"
-    cutoff_hz: float = 5.0
+    cutoff_hz: PositiveFloat = 5.0
     direction: Literal["causal", "zero_phase"] = "causal"
-
-    def __post_init__(self) -> None:
-        require_positive("acceleration from speed", cutoff_hz=self.cutoff_hz)
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.
@@ -299,11 +278,8 @@ class ScaleToWheelbase:
         testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
     """
 
-    wheelbase: float
-    to: float
-
-    def __post_init__(self) -> None:
-        require_positive("scale to wheelbase", wheelbase=self.wheelbase, to=self.to)
+    wheelbase: PositiveFloat
+    to: PositiveFloat
 
     def __call__(self, recording: Recording) -> Recording:
         """Scale rate, start time and channels."""

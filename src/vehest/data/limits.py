@@ -8,6 +8,8 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import PositiveInt
+
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 
@@ -25,17 +27,12 @@ class Limits:
         text_bytes: length of a configuration, manifest or other text that describes something [bytes].
     """
 
-    samples: int = 20_000_000
-    columns: int = 10_000
-    memory: int = 1_600_000_000
-    filter_samples: int = 1_000_000
-    jobs: int = 10_000
-    text_bytes: int = 16 * 2**20
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value < 1:
-                raise ConfigurationError(f"limits.{name} must be a whole number from 1 on, not {value}")
+    samples: PositiveInt = 20_000_000
+    columns: PositiveInt = 10_000
+    memory: PositiveInt = 1_600_000_000
+    filter_samples: PositiveInt = 1_000_000
+    jobs: PositiveInt = 10_000
+    text_bytes: PositiveInt = 16 * 2**20
 
 
 _DEFAULTS = Limits()

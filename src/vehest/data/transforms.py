@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import scipy
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import (
     AccelerationFromSpeed,
+    ChannelName,
     ScaleToWheelbase,
     SideslipFromVelocity,
     SpeedFromWheels,
@@ -22,8 +24,6 @@ from vehest.data.derived import (
     SteeringRatio,
     VelocityFromSideslip,
     derivative,
-    require_channel,
-    require_positive,
     speed_of_reference,
 )
 from vehest.data.errors import ConfigurationError, DataError
@@ -63,7 +63,8 @@ class Resample:
     cutoff: ClassVar[float] = 0.86  # of the slower Nyquist frequency, where the stop band has then begun
 
     def __post_init__(self) -> None:
-        require_positive("resampling", rate_hz=self.rate_hz)
+        if not 0.0 < self.rate_hz < math.inf:
+            raise ConfigurationError(f"resampling: rate_hz must be a positive number, not {self.rate_hz:g}")
 
     def __call__(self, recording: Recording) -> Recording:
         """Resample every channel.
@@ -147,12 +148,11 @@ class LowPass:
     channels: tuple[str, ...] = ()
     direction: Literal["causal", "zero_phase"] = "zero_phase"
     design: Literal["butterworth", "fir"] = "butterworth"
-    reach: float = 0.3
+    reach: PositiveFloat = 0.3
 
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
-        require_positive("low-pass", reach=self.reach)
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels.
@@ -200,12 +200,9 @@ class RemoveOutliers:
         Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
     """
 
-    half_window: int = 5
-    threshold: float = 6.0
+    half_window: PositiveInt = 5
+    threshold: PositiveFloat = 6.0
     channels: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_positive("outlier removal", half_window=self.half_window, threshold=self.threshold)
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -359,13 +356,7 @@ class OffsetCorrection:
         offsets: channel -> offset of its sensor, in the channel's unit.
     """
 
-    offsets: dict[str, float] = field(hash=False)
-
-    def __post_init__(self) -> None:
-        if not self.offsets:
-            raise ConfigurationError("offsets are a mapping from channels to values, such as {ax: 0.1}, and name none")
-        for name in self.offsets:
-            require_channel(name, "offset")
+    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)
 
     def __call__(self, recording: Recording) -> Recording:
         """Subtract the offsets.
