@@ -35,17 +35,11 @@ def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class SteeringRatio:
-    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio.
+    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio."""
 
-    Args:
-        ratio: how far the angle turns for a unit of ``steer``; negative if it counts the other way.
-        offset: what it shows going straight ahead [rad].
-        channel: the angle; ``steer`` itself may be it.
-    """
-
-    ratio: float
-    offset: float = 0.0
-    channel: ChannelName = "handwheel"
+    ratio: float  # how far the angle turns for a unit of ``steer``; negative if it counts the other way
+    offset: float = 0.0  # what it shows going straight ahead [rad]
+    channel: ChannelName = "handwheel"  # the angle; ``steer`` itself may be it
 
     def __post_init__(self) -> None:
         if self.ratio == 0.0:
@@ -63,17 +57,11 @@ class SteeringRatio:
 
 @dataclass(frozen=True)
 class SteeringCurve:
-    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear.
+    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear."""
 
-    Args:
-        inputs: values of the channel at the corners, increasing.
-        angles: road-wheel angle at each [rad]; beyond the first and last corner the curve is flat.
-        channel: that the curve is applied to; it may be ``steer``.
-    """
-
-    inputs: tuple[float, ...]
-    angles: tuple[float, ...]
-    channel: ChannelName = "steer"
+    inputs: tuple[float, ...]  # values of the channel at the corners, increasing
+    angles: tuple[float, ...]  # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
+    channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
 
     def __post_init__(self) -> None:
         if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
@@ -100,24 +88,16 @@ class SpeedFromWheels:
     ``hold_seconds``; after them the median counts, since something must. Wheels that the recording does not have do not count; one
     alone counts as it is. Without ``steer`` the front wheels point straight ahead.
 
-    Args:
-        wheel_radius: rolling radius R [m].
-        track_front: t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up.
-        track_rear: t_R [m]; the same.
-        tolerance: absolute part of it [m/s]; 5 % of the median come on top.
-        most_acceleration: of the car, forwards or backwards [m/s²].
-        hold_seconds: for how long ``vx`` goes on without two wheels [s].
-
     Source:
         Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
     """
 
-    wheel_radius: PositiveFloat
-    track_front: NonNegativeFloat = 0.0
-    track_rear: NonNegativeFloat = 0.0
-    tolerance: PositiveFloat = 0.3
-    most_acceleration: PositiveFloat = 12.0
-    hold_seconds: PositiveFloat = 2.0
+    wheel_radius: PositiveFloat  # rolling radius R [m]
+    track_front: NonNegativeFloat = 0.0  # t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up
+    track_rear: NonNegativeFloat = 0.0  # t_R [m]; the same
+    tolerance: PositiveFloat = 0.3  # absolute part of it [m/s]; 5 % of the median come on top
+    most_acceleration: PositiveFloat = 12.0  # of the car, forwards or backwards [m/s²]
+    hold_seconds: PositiveFloat = 2.0  # for how long ``vx`` goes on without two wheels [s]
     relative_tolerance: ClassVar[float] = 0.05
 
     def corrected(self, recording: Recording) -> FloatArray:
@@ -189,18 +169,13 @@ class AccelerationFromSpeed:
     An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
     v = 0.5 m/s and r = 0.4 rad/s.
 
-    Args:
-        channel: the speed; ``vx`` or ``vx_ref``.
-        cutoff_hz: of a Butterworth filter of second order [Hz].
-        direction: ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``.
-
     Source:
         Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
     """
 
-    channel: Literal["vx", "vx_ref"] = "vx"
-    cutoff_hz: PositiveFloat = 5.0
-    direction: Literal["causal", "zero_phase"] = "causal"
+    channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
+    cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
+    direction: Literal["causal", "zero_phase"] = "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
 
     def __call__(self, recording: Recording) -> Recording:
         """Set ``ax``.
@@ -269,17 +244,13 @@ class ScaleToWheelbase:
     that are geometrically similar on similar tyres then drive the same manoeuvre. Channels that are no lengths, times or angles
     (forces, torques, currents, pressures) are left out.
 
-    Args:
-        wheelbase: of the car [m].
-        to: of the car that it is seen as [m].
-
     Source:
         Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
         testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
     """
 
-    wheelbase: PositiveFloat
-    to: PositiveFloat
+    wheelbase: PositiveFloat  # of the car [m]
+    to: PositiveFloat  # of the car that it is seen as [m]
 
     def __call__(self, recording: Recording) -> Recording:
         """Scale rate, start time and channels."""

@@ -22,11 +22,9 @@ ASIDE_PREFIX = ".writing-"
 _ASIDE = re.compile(rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?")  # process and host before the name
 FOREIGN_SECONDS = 24 * 3600.0  # after which files of another host count as left over, whose processes cannot be seen from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-_NO_ROOM_WORDS = {
-    **{os.strerror(number): number for number in sorted(NO_ROOM)},
-    "os error 28": errno.ENOSPC,
-    "database or disk is full": errno.ENOSPC,
-}
+_NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.fromkeys(
+    ("os error 28", "database or disk is full"), errno.ENOSPC
+)
 
 
 @contextmanager
@@ -46,7 +44,7 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
         yield aside
         _flush(aside)
         if replace_folder and path.is_dir() and not path.is_symlink():
-            replaced = path.with_name(_aside_name("replaced"))
+            replaced = aside_of(path, "replaced")
             os.rename(path, replaced)
             os.rename(aside, path)
             shutil.rmtree(replaced, ignore_errors=True)
@@ -55,10 +53,8 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
     except OSError as error:
         named = Path(error.filename) if isinstance(error.filename, str) else aside
         raise writing_error(path if named.is_relative_to(aside) or ASIDE_PREFIX in str(named) else named, error) from error
-    except VehestError:
-        raise
     except Exception as error:
-        full = no_room(error)
+        full = None if isinstance(error, VehestError) else no_room(error)
         if full is None:
             raise
         raise writing_error(path, full) from error
@@ -156,26 +152,18 @@ def is_left_over(path: Path) -> bool:
         return False
 
 
-def aside_of(path: Path) -> Path:
-    """A free place beside ``path`` for this process; files that stay there are removed later."""
-    return path.with_name(_aside_name(path.name))
+def aside_of(path: Path, name: str = "") -> Path:
+    """A free place beside ``path`` for this process, for ``path`` itself or another name; files that stay there are removed later."""
+    return path.with_name(f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}")
 
 
 def sha256_of(path: Path) -> str:
-    """Hex digest of a file's bytes.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
+    """Hex digest of a file's bytes; raises a `DataError` where it cannot be read."""
     try:
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
-
-
-def _aside_name(name: str) -> str:
-    return f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name}"
 
 
 @cache
@@ -195,8 +183,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
-    files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
-    for file in files:
+    for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
         descriptor = os.open(file, os.O_RDONLY)
         try:
             os.fsync(descriptor)

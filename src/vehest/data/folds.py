@@ -21,21 +21,13 @@ FEWEST = 3  # one to test, one to stop on, the rest to learn from
 
 @dataclass(frozen=True)
 class FoldsFile:
-    """How a split is cross-validated.
+    """How a split is cross-validated."""
 
-    Args:
-        number: of folds, three or more.
-        of: unit that is never cut in two: a recording, a lap, or ``block_seconds`` of driving.
-        recordings: pattern of those that take part.
-        block_seconds: length of a block for ``of: seconds`` [s].
-        gap_seconds: taken off training and validation where they border on another fold [s], since filters and windows reach across.
-    """
-
-    number: Annotated[int, Field(ge=FEWEST)] = 5
-    of: Literal["recordings", "laps", "seconds"] = "laps"
-    recordings: str = "*"
-    block_seconds: PositiveFloat = 30.0
-    gap_seconds: NonNegativeFloat = 2.0
+    number: Annotated[int, Field(ge=FEWEST)] = 5  # of folds, three or more
+    of: Literal["recordings", "laps", "seconds"] = "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
+    recordings: str = "*"  # pattern of those that take part
+    block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
+    gap_seconds: NonNegativeFloat = 2.0  # taken off training and validation where they border on another fold [s]
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:

@@ -51,19 +51,12 @@ class Span:
 
 @dataclass(frozen=True)
 class Kept:
-    """Amount of driving that meets a condition.
+    """Amount of driving that meets a condition."""
 
-    Args:
-        n_recordings: number of recordings.
-        n_spans: number of stretches that were kept.
-        seconds: their time [s].
-        of_seconds: time of the recordings, or of their ranges [s].
-    """
-
-    n_recordings: int
-    n_spans: int
-    seconds: float
-    of_seconds: float
+    n_recordings: int  # number of recordings
+    n_spans: int  # number of stretches that were kept
+    seconds: float  # their time [s]
+    of_seconds: float  # time of the recordings, or of their ranges [s]
 
     def describe(self) -> str:
         """For messages and reports, for example ``61.2 of 90.0 min in 402 stretches of 161 recordings``."""

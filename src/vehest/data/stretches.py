@@ -33,16 +33,12 @@ class Bounds:
 class Condition:
     """What must hold at every sample of a stretch, and how long for.
 
-    Args:
-        magnitude: channel -> bounds of its magnitude.
-        at_least_seconds: shortest stretch [s].
-
     Raises:
         ValueError: there is no channel, or an unknown one.
     """
 
-    magnitude: dict[str, Bounds]
-    at_least_seconds: NonNegativeFloat = 0.0
+    magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
+    at_least_seconds: NonNegativeFloat = 0.0  # shortest stretch [s]
 
     def __post_init__(self) -> None:
         if not self.magnitude:
