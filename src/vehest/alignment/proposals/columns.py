@@ -76,12 +76,7 @@ def si_factor(unit: str, channel: str) -> float:
 
 
 def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -> list[Candidate]:
-    """Columns that change, are mostly there, and are neither clocks nor distances.
-
-    Args:
-        columns: name, unit as vehest spells it (empty where unknown), values on an even clock, (T,) each.
-        rate_hz: of that clock.
-    """
+    """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
     found = []
     for name, unit, values in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)

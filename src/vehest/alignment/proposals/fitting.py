@@ -217,16 +217,7 @@ def longitudinal(known: Motion, column: Candidate, units: Sequence[str] = ()) ->
 
 
 def agreement(known: Motion, column: Candidate, channel: str, unit: str, left: str, *, offset: float = 0.0) -> Agreement:
-    """Agreement of a column with a motion.
-
-    Args:
-        known: the motion.
-        column: to be compared.
-        channel: that it may be.
-        unit: of the column.
-        left: side of the relation that it is compared by.
-        offset: taken off the column first, in its unit.
-    """
+    """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
     samples = (column.values - offset) * si_factor(unit, channel)
     velocity = channel if channel in ("vy_ref", "sideslip_ref") else ""
     with np.errstate(all="ignore"):
