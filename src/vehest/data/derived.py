@@ -46,11 +46,7 @@ class SteeringRatio:
             raise ConfigurationError("a steering ratio must be a number other than zero")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the angle has them.
-
-        Raises:
-            DataError: the channel is missing.
-        """
+        """Set ``steer``; it has gaps where the angle has them. Raises `DataError`: the channel is missing."""
         steer = (recording[self.channel] - self.offset) / self.ratio
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
@@ -68,11 +64,7 @@ class SteeringCurve:
             raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the channel has them.
-
-        Raises:
-            DataError: the channel is missing.
-        """
+        """Set ``steer``; it has gaps where the channel has them. Raises `DataError`: the channel is missing."""
         steer = np.interp(recording[self.channel], self.inputs, self.angles)
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
@@ -178,11 +170,7 @@ class AccelerationFromSpeed:
     direction: Literal["causal", "zero_phase"] = "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``ax``.
-
-        Raises:
-            DataError: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate.
-        """
+        """Set ``ax``. Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate."""
         speed, rate = recording[self.channel], recording.rate_hz
         if np.isnan(speed).any():
             raise DataError(f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it")

@@ -31,9 +31,7 @@ _NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.from
 def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]:
     """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
 
-    Args:
-        path: file or folder to write.
-        replace_folder: whether a folder that is there already may go; a file may always be replaced.
+    A file that is there may always be replaced, a folder by ``replace_folder``.
 
     Raises:
         MissingError: the disk is full or the folder cannot be written to.
@@ -83,11 +81,8 @@ def regular_file(path: Path) -> Path:
 
 
 def file_name(name: str, ending: str = "") -> str:
-    """A name as one component of a path, another for another name.
-
-    Letters, digits, ``_``, ``-``, ``+``, ``=`` and ``.`` stay; of a name that holds anything else, begins with a dot or is long, the rest
-    is followed by the start of its hash.
-    """
+    """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
+    at 100 bytes, and the start of its hash added."""
     kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
     if kept != name or not name or len(kept.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]

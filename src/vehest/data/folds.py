@@ -31,11 +31,7 @@ class FoldsFile:
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
-    """The blocks of recordings in order, each with its start and stop.
-
-    Args:
-        folds: with the unit that is never cut in two.
-        recordings: spans that name a recording, with it.
+    """The blocks of recordings, each with the span that names it, in order, with start and stop.
 
     Raises:
         DataError: laps are asked for and a recording lacks speed or yaw rate.
@@ -54,15 +50,9 @@ def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) ->
 
 
 def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
-    """Training, validation and test of one fold: blocks stay in order and folds last about as long as each other.
+    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
-
-    Args:
-        blocks: from `blocks_of`.
-        folds: their number, and the gap between them.
-        fold: which of them is tested, from 0.
-        where: the split, for messages.
 
     Raises:
         ConfigurationError: there is no such fold, or too few blocks to fill them.

@@ -70,11 +70,7 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 
 
 def write_recording(recording: Recording, path: Path) -> None:
-    """Store one recording; the file appears complete or not at all.
-
-    Raises:
-        MissingError: the file cannot be written.
-    """
+    """Store one recording; the file appears complete or not at all. Raises `MissingError`: the file cannot be written."""
     about = _attributes(recording, _OF_RECORDING) | {"gappy": sorted(recording.gappy), "provenance": dict(recording.provenance)}
     _write(path, recording.channels, "recording", about)
 

@@ -15,11 +15,7 @@ from vehest.data.runs import true_runs
 
 @dataclass(frozen=True)
 class Bounds:
-    """Smallest and largest magnitude of a channel, both included, in its unit.
-
-    Raises:
-        ValueError: no magnitude lies between them.
-    """
+    """Smallest and largest magnitude of a channel, both included, in its unit. Raises `ValueError`: no magnitude lies between them."""
 
     at_least: float = 0.0
     at_most: float = math.inf
@@ -31,11 +27,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Condition:
-    """What must hold at every sample of a stretch, and how long for.
-
-    Raises:
-        ValueError: there is no channel, or an unknown one.
-    """
+    """What must hold at every sample of a stretch, and how long for. Raises `ValueError`: there is no channel, or an unknown one."""
 
     magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
     at_least_seconds: NonNegativeFloat = 0.0  # shortest stretch [s]
@@ -52,18 +44,12 @@ class Condition:
         return ", ".join([*bounds, f"{self.at_least_seconds:g} s or longer"])
 
 
-def stretches_where(recording: Recording, condition: Condition, first: int = 0, end: int | None = None) -> list[tuple[int, int]]:
+def stretches_where(recording: Recording, condition: Condition, first: int, end: int) -> list[tuple[int, int]]:
     """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not.
-
-    Args:
-        recording: as it is, at its own rate and unfiltered.
-        condition: what must hold.
-        first, end: samples to look at; by default all.
 
     Raises:
         DataError: the recording lacks a channel of the condition.
     """
-    end = len(recording) if end is None else end
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])

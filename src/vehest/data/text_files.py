@@ -43,11 +43,7 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Plain values of YAML.
-
-    Raises:
-        DataError: it is not YAML, nests too deep, or repeats itself into too many values.
-    """
+    """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
     try:
         _check_size(text, where)
         return yaml.load(text, _Loader)
@@ -81,11 +77,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Plain values of JSON.
-
-    Raises:
-        DataError: it is not JSON, too long, or nests too deep.
-    """
+    """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
     check_limit("text_bytes", len(text), f"{where} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)

@@ -222,11 +222,7 @@ class MountingCorrection:
     yaw: float = 0.0  # rotation of the sensor's axes against the vehicle's, counter-clockwise [rad]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct ax and ay.
-
-        Raises:
-            DataError: ax, ay or yaw_rate is missing or has gaps.
-        """
+        """Correct ax and ay. Raises `DataError`: ax, ay or yaw_rate is missing or has gaps."""
         ax, ay, yaw_rate = (recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate")))
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
@@ -316,11 +312,7 @@ class OffsetCorrection:
     offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)  # by channel, in its unit
 
     def __call__(self, recording: Recording) -> Recording:
-        """Subtract the offsets.
-
-        Raises:
-            DataError: a channel is missing.
-        """
+        """Subtract the offsets. Raises `DataError`: a channel is missing."""
         return recording.with_channels({name: recording[name] - value for name, value in self.offsets.items()})
 
 
@@ -363,11 +355,7 @@ class Preparation:
 
 
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
-    """Build a transform from plain values: its ``name`` and its arguments.
-
-    Raises:
-        ConfigurationError: an unknown name or argument.
-    """
+    """Build a transform from plain values: its ``name`` and its arguments. Raises `ConfigurationError`: an unknown name or argument."""
     if not isinstance(config, Mapping):
         raise ConfigurationError(f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}")
     arguments = {str(key): value for key, value in config.items() if key != "name"}
@@ -396,7 +384,6 @@ def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ..
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
     for name in chosen:
         if name in recording.gappy:
-            raise DataError(
-                f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out, or resample with method=decimate"
-            )
+            what = f"channel '{name}' has gaps and cannot be filtered"
+            raise DataError(f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate")
     return chosen
