@@ -8,8 +8,7 @@ from typing import Any
 
 from vehest.data.derived import WHEELS, AccelerationFromSpeed
 
-SHARE_OF_RATE = 0.2
-"""Cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate."""
+SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate
 
 UNKNOWN = {"wheel_radius": "rolling radius of the tyres [m]", "ratio": "of the handwheel's angle to the road wheels'"}
 """Options that only the user knows, with their meaning."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
@@ -24,8 +25,7 @@ def _known(name: str) -> str:
     return name
 
 
-ChannelName = Annotated[str, AfterValidator(_known)]
-"""Name of a channel of the table."""
+ChannelName = Annotated[str, AfterValidator(_known)]  # name of a channel of the table
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -117,7 +117,8 @@ class SpeedFromWheels:
             DataError: a channel is missing, or no wheel was ever measured.
         """
         speeds = self.corrected(recording)
-        medians = _known_median(speeds)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where no wheel was measured the median is NaN
+            medians = np.nanmedian(speeds, axis=0)
         counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(medians)
         if not np.isfinite(speeds).any():
             raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
@@ -143,15 +144,6 @@ class SpeedFromWheels:
             raise DataError(f"recording '{recording.id}': no speed comes of the wheels; check wheel_radius and the tracks")
         vx[: int(np.isnan(vx).sum())] = vx[np.isfinite(vx)][0]  # before the first wheel was measured
         return recording.with_channels({"vx": vx}, made_of=())
-
-
-def _known_median(speeds: FloatArray) -> FloatArray:
-    """Median of the wheels that were measured, (4, T) -> (T,); NaN where none was."""
-    ranked = np.sort(speeds, axis=0)  # NaN last
-    number = np.isfinite(speeds).sum(0)
-    column = np.arange(speeds.shape[1])
-    middle: FloatArray = 0.5 * (ranked[np.maximum(number - 1, 0) // 2, column] + ranked[np.minimum(number // 2, 3), column])
-    return np.where(number > 0, middle, np.nan)
 
 
 @dataclass(frozen=True)

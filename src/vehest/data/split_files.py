@@ -19,10 +19,8 @@ from vehest.data.schema import validated
 from vehest.data.splits import VALIDATION, Kept, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
-Reader = Callable[[Iterable[str] | None], Recording]
-"""Reads the named channels of one recording, or all."""
-Catalogue = Callable[[str], Mapping[str, Reader]]
-"""Of the name of a data set: its recordings as ingested, by id."""
+Reader = Callable[[Iterable[str] | None], Recording]  # reads the named channels of one recording, or all
+Catalogue = Callable[[str], Mapping[str, Reader]]  # of the name of a data set: its recordings as ingested, by id
 
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")

@@ -15,11 +15,7 @@ TRAINING = "training"
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that cannot be part of a file's name.
-
-    Raises:
-        ConfigurationError: it holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot.
-    """
+    """Refuse, by a `ConfigurationError`, a name that holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot."""
     if not re.fullmatch(r"[\w-][\w.-]*", name):
         raise ConfigurationError(f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names")
 
@@ -92,10 +88,8 @@ class Split:
     def __post_init__(self) -> None:
         if not (self.train or self.validation or self.tests):
             raise ConfigurationError(f"split '{self.name}' has no ranges at all")
-        if self.validation and not self.train:
-            raise ConfigurationError(f"split '{self.name}' has nothing to train on")
-        if self.train and not self.validation:
-            raise ConfigurationError(f"split '{self.name}' has nothing to validate on")
+        if bool(self.train) != bool(self.validation):
+            raise ConfigurationError(f"split '{self.name}' has nothing to {'validate' if self.train else 'train'} on")
         check_name(self.name, "split")
         for name, spans in self.tests.items():
             check_name(name, f"split '{self.name}': test set")

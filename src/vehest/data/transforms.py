@@ -31,10 +31,8 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = 8192
-"""Taps up to which a filter is summed sample by sample; longer ones through their spectra."""
-VALUES_AT_ONCE = 1 << 20
-"""Samples that are compared at a time, windows included."""
+LONGEST_DIRECT = 8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
+VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
 
 
 Transform = Callable[[Recording], Recording]
