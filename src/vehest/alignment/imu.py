@@ -31,13 +31,10 @@ ComplexArray = NDArray[np.complex128]
 IMU_CHANNELS = ("ax", "ay", "yaw_rate")
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
-TILT_GAIN = 0.1
-"""Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
-TILT_LIKENESS = 0.3
-"""Assumed correlation of the remaining tilt of body and road with the effect of a parameter."""
+TILT_GAIN = 0.1  # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g
+TILT_LIKENESS = 0.3  # assumed correlation of the remaining tilt of body and road with the effect of a parameter
 
-ROAD_CUTOFF = 0.2
-"""Bank and grade of the road change more slowly than that [Hz]."""
+ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
 
 N_BLOCKS = 12
 SHORTEST_BLOCK = 2.0  # s, longer than residuals of the band remember
@@ -55,8 +52,7 @@ SUSPICIOUS = 3.0  # standard uncertainties
 MORE_MOTION = "more turning, braking and accelerating"
 
 TILT_PRIOR = {"tilt_gain_x": TILT_GAIN, "tilt_gain_y": TILT_GAIN, "tilt_lag_x": TILT_LAG_GAIN, "tilt_lag_y": TILT_LAG_GAIN}
-NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
-"""All parameters of a sensor that is aligned."""
+NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)  # all parameters of a sensor that is aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -547,11 +543,7 @@ class Smoothing:
 
 
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
-    """The filter whose response is -3 dB at a frequency.
-
-    Raises:
-        ConfigurationError: its kernel would be too narrow to be sampled, or longer than the limit.
-    """
+    """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to be sampled, or longer than the limit."""
     length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
     what = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
     check_limit("filter_samples", length, what, ConfigurationError)

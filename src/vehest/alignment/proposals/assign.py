@@ -10,7 +10,7 @@ import numpy as np
 
 from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import UNITS, Candidate, candidates, correlation, largest, si_factor, slow_of
-from vehest.alignment.proposals.fitting import CLEAR, Agreement, fitting_channels, longitudinal, may_be_ax
+from vehest.alignment.proposals.fitting import CLEAR, REFERENCES, Agreement, fitting_channels, longitudinal, may_be_ax
 from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered, is_reference
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
@@ -27,7 +27,6 @@ RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 40
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
-REFERENCES = {"vy_ref", "sideslip_ref"}
 USUAL = {  # 99th percentile of the motion's channels, SI
     "vx": (1.0, 90.0),
     "yaw_rate": (0.03, 3.0),
@@ -38,8 +37,7 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "vy_ref": (0.02, 8.0),
     "sideslip_ref": (0.002, 0.8),
 }
-ONE_UNIT = "motor_current"
-BY_NAME_ALONE = (ONE_UNIT, "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
+BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
 """Channels that no relation is known of."""
 
 
@@ -67,7 +65,7 @@ def propose(
     proposals = _assigned(found, search, wheels)
     notes = [*proposals.notes]
     known = search.known if search else None
-    if not REFERENCES & set(proposals.by_channel):
+    if not set(REFERENCES) & set(proposals.by_channel):
         proposals = replace(proposals, pose=find_pose(found, known))
         named = [f"'{one.name}'" for one in named_pose(found)]
         if len(named) == 3 and not proposals.pose:
@@ -193,7 +191,7 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
             found[channel] = _by_name(best, channel)
     for column in columns:
         for channel in BY_NAME_ALONE:
-            is_sure = (column.unit or channel == ONE_UNIT) and column.measures(channel)
+            is_sure = (column.unit or channel == "motor_current") and column.measures(channel)
             if is_sure and channel in column.hints and channel not in {*held, *found}:
                 evidence = "its name and unit" if column.unit else "its name"
                 found[channel] = Proposal(column.name, channel, column.unit or CHANNELS[channel].unit, 1, (evidence,))

@@ -1,7 +1,4 @@
-"""Roles that a column's name suggests: English and German, in full and as loggers shorten them. A name is a hint and decides little alone.
-
-They are names of channels, and ``heading``, ``latitude``, ``longitude``, ``position_x``, ``position_y`` and ``other``.
-"""
+"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x`` and ``_y``, ``other``."""
 
 from __future__ import annotations
 

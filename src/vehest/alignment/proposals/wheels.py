@@ -25,8 +25,7 @@ AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
 APART = 0.25
 
-Wheels = Mapping[str, Candidate]
-"""Corner -> the column that is named as its speed."""
+Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 
 
 def find_wheels(columns: Sequence[Candidate]) -> Wheels:
