@@ -134,7 +134,7 @@ def test_planted_set_up_comes_back_from_a_simulated_drive(motion: Motion, delay:
     truth = PLANTED | {"delay": delay}
     found = align(recorded(motion, truth, reference_rate=reference_rate), AlignmentSettings(IMU))
     assert_recovered(found, truth, tuple(PLANTED))
-    assert found.kind == "simulated"
+    assert found.recording.kind == "simulated"
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
@@ -152,7 +152,7 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion: Mot
     assert_recovered(found, PLANTED, tuple(PLANTED))
     assert any(re.search(r"3\.[567] % of it in ax and 5\.[789] % in ay", note) for note in found.notes)
     for residual in found.residuals[:2]:
-        assert residual.rms_rest < 0.045 < residual.rms_after  # the tilt of the body is not corrected, and the table says so
+        assert residual.rms["rest"] < 0.045 < residual.rms["after"]  # the tilt of the body is not corrected, and the table says so
     if not reference_rate:
         level = align(recording, AlignmentSettings(IMU, tilt=0.0))
         assert level["yaw"].value > PLANTED["yaw"] + 0.003
@@ -172,8 +172,8 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
     clean = align(recorded(motion, {}), AlignmentSettings(("delay",)))
     found = align(recorded(motion, PLANTED), AlignmentSettings(IMU))
     for aligned, residual in zip(clean.residuals, found.residuals, strict=True):
-        assert residual.rms_before > 5 * aligned.rms_before
-        assert residual.rms_after == pytest.approx(aligned.rms_before, rel=0.1)
+        assert residual.rms["before"] > 5 * aligned.rms["before"]
+        assert residual.rms["after"] == pytest.approx(aligned.rms["before"], rel=0.1)
     assert [transform["name"] for transform in found.transforms] == ["delay_correction", "offset_correction", "mounting_correction"]
 
 
@@ -443,7 +443,7 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
-    with pytest.raises(DataError, match=r"no channel 'steer'.*needs handwheel or steer"):
+    with pytest.raises(DataError, match="no channel 'steer'"):
         align(road.select(["vx", "yaw_rate", "ay"]), settings)
     with pytest.raises(DataError, match="no channel 'roll'"):
         align(road, replace(settings, steering_channel="roll"))

@@ -145,7 +145,7 @@ def test_a_split_may_have_tests_only_but_not_nothing() -> None:
         ({"train": "a"}, 'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"'),
         ({"tests": [{"recording": "a"}]}, "split.tests must be a mapping"),
         ({"tests": {"wet": {"recording": "a"}}}, "split.tests.wet must be a list"),
-        ({"dataset": None}, "needs a recording and a dataset"),
+        ({"dataset": None}, "each range needs a dataset"),
     ],
 )
 def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], what: str) -> None:
@@ -283,7 +283,7 @@ CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
     ("entry", "what"),
     [
         ({"recordings": "lap_*"}, "no recording of data set 'd' matches 'lap_*' (it has train_1)"),
-        ({"recordings": "train_*", "recording": "train_1"}, "needs a recording and a dataset (or recordings, a pattern)"),
+        ({"recordings": "train_*", "recording": "train_1"}, "needs a recording or recordings, a pattern of several"),
         ({"recording": "train_9", "keep": CONDITION}, "no recording 'train_9'"),
         ({"keep": "slow"}, "split.train.0.keep must be a group of options, not 'slow'"),
         ({"keep": {}}, "split.train.0.keep.magnitude is missing"),
@@ -291,13 +291,12 @@ CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
         ({"keep": {"magnitude": "ay"}}, "keep.magnitude must be a mapping, not 'ay'"),
         ({"keep": {"magnitude": {"lateral": {"at_most": 7.0}}}}, "there is no channel 'lateral'"),
         ({"keep": {"magnitude": {"ay": 7.0}}}, "keep.magnitude.ay must be a group of options, not 7.0"),
-        ({"keep": {"magnitude": {"ay": {}}}}, "keep.magnitude.ay: needs at_least, at_most or both"),
         ({"keep": {"magnitude": {"ay": {"most": 7.0}}}}, "magnitude.ay; options: at_least, at_most"),
         ({"keep": {"magnitude": {"ay": {"at_most": "seven"}}}}, "magnitude.ay.at_most must be a number, not 'seven'"),
         ({"keep": {"magnitude": {"ay": {"at_most": True}}}}, "magnitude.ay.at_most must be a number, not True"),
         ({"keep": {"magnitude": {"ay": {"at_most": -7.0}}}}, "keep.magnitude.ay: no magnitude lies between 0 and -7"),
         ({"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}}, "keep.magnitude.ay: no magnitude lies between 8 and 7"),
-        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds must be zero or positive, not -1"),
+        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds: input should be greater than or equal to 0, not -1"),
         ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
     ],
 )
@@ -488,7 +487,10 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
         ({"train": [{"recording": "lap", "laps": "some"}]}, "laps are first, last, first 3"),
         ({"train": [{"recording": "lap", "laps": "1", "stop": 3}]}, "a range has laps, or start and stop, not both"),
         ({"folds": {"number": 3}}, "folds make training, validation and test; leave train"),
-        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 2}}, "split.folds: number must be 3 or more"),
+        (
+            {"train": [], "validation": [], "tests": {}, "folds": {"number": 2}},
+            "split.folds.number: input should be greater than or equal to 3, not 2",
+        ),
         ({"train": [], "validation": [], "tests": {}, "folds": {"number": 9}}, "do not fill 9 folds"),
         ({"train": [], "validation": [], "tests": {}, "folds": {"number": 3}, "fold": 3}, "fold 3 is not one of 0 to 2"),
         ({"train": [], "validation": [], "tests": {}, "folds": {"of": "corners"}}, "folds.of 'corners' is not one of"),

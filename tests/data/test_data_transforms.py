@@ -206,8 +206,8 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length: i
 
 @pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
 def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
-    with pytest.raises(ConfigurationError, match="must be a positive number"):
-        RemoveOutliers(**arguments)  # type: ignore[arg-type]
+    with pytest.raises(ConfigurationError, match="greater than 0"):
+        transform_from_config({"name": "remove_outliers", **arguments})
 
 
 def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, np.ndarray, np.ndarray]:
@@ -299,7 +299,10 @@ def test_transforms_are_built_from_plain_values() -> None:
         ({"name": "low_pass", "cutoff_hz": 5.0, "cutof": 1}, "cutof"),
         ({"name": "low_pass", "cutoff_hz": 5.0, "direction": "backward"}, "causal, zero_phase"),
         ({"name": "resample", "rate_hz": "fast"}, "resample"),
-        ({"name": "speed_from_wheels", "wheel_radius": 0, "track_front": 2, "track_rear": 2}, "wheel_radius must be a positive number"),
+        (
+            {"name": "speed_from_wheels", "wheel_radius": 0, "track_front": 2, "track_rear": 2},
+            "wheel_radius: input should be greater than 0",
+        ),
     ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:

@@ -169,7 +169,10 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
             check_limit("samples", 6, "'f' holds 6 samples")
     assert current_limits() == Limits()
     for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
-        with pytest.raises(ConfigurationError, match=r"limits\.(samples must be a whole number|values is not an option .*samples)"):
+        with pytest.raises(
+            ConfigurationError,
+            match=r"limits\.(samples must be a whole number|samples: input should be greater than 0|values is not an option .*samples)",
+        ):
             limits_from_config(wrong)
 
 

@@ -99,19 +99,10 @@ class Residual:
     rest: FloatArray | None = None  # without the part that follows the accelerations, as roll and pitch do; None where not fitted, (U,)
 
     @property
-    def rms_before(self) -> float:
-        """Root mean square as recorded."""
-        return rms(self.before)
-
-    @property
-    def rms_after(self) -> float:
-        """Root mean square with the transforms applied."""
-        return rms(self.after)
-
-    @property
-    def rms_rest(self) -> float:
-        """Root mean square of the rest; NaN where there is none."""
-        return math.nan if self.rest is None else rms(self.rest)
+    def rms(self) -> dict[str, float]:
+        """Root mean square ``before``, ``after`` and of the ``rest``; NaN where there is none."""
+        rest = math.nan if self.rest is None else rms(self.rest)
+        return {"before": rms(self.before), "after": rms(self.after), "rest": rest}
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +118,7 @@ class Steering:
 class Alignment:
     """Alignment of a measuring set-up by a drive."""
 
-    recording_id: str
-    kind: str  # ``real`` or ``simulated``
-    rate_hz: float
-    duration: float  # [s]
+    recording: Recording  # as it was
     settings: AlignmentSettings
     parameters: tuple[Parameter, ...]  # in the order of `UNITS`
     transforms: tuple[Mapping[str, Any], ...]  # configurations of the transforms that would correct it, in the order of their application
@@ -140,16 +128,12 @@ class Alignment:
     notes: tuple[str, ...] = ()  # a sentence or two each
 
     def __getitem__(self, name: str) -> Parameter:
-        """A parameter by its name.
-
-        Raises:
-            KeyError: it was not asked for.
-        """
+        """A parameter by its name. Raises `KeyError`: it was not asked for."""
         return {parameter.name: parameter for parameter in self.parameters}[name]
 
 
 def in_words(name: str, value: float) -> str:
-    """A value with the unit that people read: angles in degrees, delays in milliseconds."""
+    """A value in degrees or milliseconds, with its unit."""
     factor, unit = READ_AS.get(UNITS[name], (1.0, UNITS[name]))
     shown = f"{factor * value:.3g}"
     return shown if unit == "1" else f"{shown} {unit}"
@@ -187,19 +171,7 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     if "steering_ratio" in settings.estimate:
         found, transform, steering, note = _align_steering(corrected, settings)
         parameters, transforms, notes = [*parameters, *found], [*transforms, transform], [*notes, note]
-    return Alignment(
-        recording.id,
-        recording.kind,
-        recording.rate_hz,
-        recording.duration,
-        settings,
-        tuple(parameters),
-        tuple(transforms),
-        residuals,
-        correlation,
-        steering,
-        tuple(notes),
-    )
+    return Alignment(recording, settings, tuple(parameters), tuple(transforms), residuals, correlation, steering, tuple(notes))
 
 
 def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
@@ -246,7 +218,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
     if fit.suspects:
         found = listed([f"{name} {in_words(name, value)} ± {in_words(name, sigma)}" for name, (value, sigma) in fit.suspects.items()])
         notes.append(
-            f"The residuals suggest quantities that were not asked for, each taken alone: {found}. With them the other figures may change."
+            f"The residuals suggest quantities that were not asked for, each taken alone: {found}. The others may change with them."
         )
     unproven = [parameter.name for parameter in parameters if parameter.low <= 0.0 <= parameter.high]
     if unproven:
@@ -255,23 +227,19 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
         notes.append("There is no vx_ref: vx serves as the reference's forward velocity, taken to be on its clock.")
     if signals.reference_rate is None:
         notes.append(
-            "There is no yaw_rate_ref: delay and yaw rate offset come from the accelerations, where they are known less well, "
-            "and a road that is banked where the car is slow looks like a yaw rate offset."
+            "There is no yaw_rate_ref: delay and yaw rate offset come from the accelerations, less well, and a banked road shows in them."
         )
     if "offset_ax" in fit.names:
         angles = (math.degrees(math.asin(min(abs(values[name]) / GRAVITY, 1.0))) for name in ("offset_ax", "offset_ay"))
         notes.append(
-            "An accelerometer that is mounted with a pitch or roll angle shows a constant part of gravity: the offsets of ax and ay may as "
-            "well be {:.2f}° and {:.2f}° of it, and no drive separates the two.".format(*angles)
+            "The offsets of ax and ay may as well be {:.2f}° and {:.2f}° of pitch and roll of the mounting: no drive tells.".format(*angles)
         )
     if signals.gravity is not None:
         notes.append("Gravity is taken off the accelerations by the measured roll and pitch for this estimate.")
     if settings.tilt > 0:
-        notes.append(
-            f"Beyond the acceleration of the reference the sensor shows {_percent(values['tilt_gain_x'])} of it in ax and "
-            f"{_percent(values['tilt_gain_y'])} in ay: gravity through pitch and roll of the body (1 % is 0.57° at 1 g), or a scale "
-            f"error. It is fitted beside the others, and no transform takes it off."
-        )
+        gains = f"{_percent(values['tilt_gain_x'])} of it in ax and {_percent(values['tilt_gain_y'])} in ay"
+        causes = "gravity by pitch and roll of the body (1 % is 0.57° at 1 g), or a scale error; no transform takes it off"
+        notes.append(f"Beyond the acceleration of the reference the sensor shows {gains}: {causes}.")
     return notes
 
 
@@ -285,11 +253,6 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     """
     assert settings.wheelbase is not None
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")
-    if source not in recording:
-        held = ", ".join(recording.channels)
-        raise DataError(
-            f"recording '{recording.id}' has no channel '{source}' (it has {held}): the steering ratio needs handwheel or steer"
-        )
     yaw_rate = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
     require_complete(recording, [source, "vx", yaw_rate, "ay"], "steering_ratio")
     smoothing = smoothing_of(recording, STEERING_CUTOFF * settings.cutoff_hz)
@@ -304,10 +267,8 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     calm = (low(recording["vx"]) >= settings.min_speed) & (np.abs(low(recording["ay"])) <= settings.max_ay)
     seconds, least = float(calm.sum()) * smoothing.step / recording.rate_hz, FEWEST_BLOCKS * SHORTEST_BLOCK
     if seconds < least:
-        raise DataError(
-            f"recording '{recording.id}': only {seconds:.3g} s are above {settings.min_speed:g} m/s and below {settings.max_ay:g} m/s² "
-            f"of lateral acceleration; the steering ratio needs at least {least:g} s"
-        )
+        calm_is = f"above {settings.min_speed:g} m/s with less than {settings.max_ay:g} m/s² of ay"
+        raise DataError(f"recording '{recording.id}': only {seconds:.3g} s are {calm_is}; the steering ratio needs at least {least:g} s")
     columns = np.stack([low(angle), np.ones(len(calm)), low(recording["ay"]), low(angle, 1)])[:, calm]
     measured = low(recording[source])[calm]
     names = ["steering_ratio", "steering_offset", "understeer_gradient", "lead"]
@@ -323,15 +284,11 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     values = zip(names[:3], (ratio, offset, slope / ratio), scatter[:3].tolist(), strict=True)
     found = [_parameter(name, value, size, 0.0, blocks - 1) for name, value, size in values]
     if found[0].low <= 0.0 <= found[0].high:
-        raise DataError(
-            f"recording '{recording.id}': '{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g}); "
-            f"check the channel and its sign, or use a drive with slow turns"
-        )
+        what = f"'{source}' does not follow the curvature of the path (ratio {ratio:.3g} ± {scatter[0]:.2g})"
+        raise DataError(f"recording '{recording.id}': {what}; check its sign, or use a drive with slow turns")
     transform = {"name": "steering_ratio", "ratio": _rounded(ratio), "offset": _rounded(offset), "channel": source}
-    note = (
-        f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m, from "
-        f"{seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
-    )
+    ratio_of = f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
+    note = f"{ratio_of}, from {seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
     return found, transform, Steering(source, (solution @ columns - offset) / ratio, measured), note
 
 

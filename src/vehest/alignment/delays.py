@@ -97,13 +97,7 @@ def spectra_of(motion: Motion) -> CrossSpectra | None:
 
 
 def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = frozenset()) -> list[Delay]:
-    """Every delay that the drive shows, established or not.
-
-    Args:
-        motion: the drive.
-        spectra: of its signals.
-        slow: channels that are low-passed; their delays are unknown.
-    """
+    """Every delay that the drive shows, established or not, but for those of ``slow``, low-passed channels."""
     found: list[Delay] = []
     if not slow & {"ay", "yaw_rate"}:
         found += _lateral(motion)

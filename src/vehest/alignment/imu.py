@@ -31,13 +31,10 @@ ComplexArray = NDArray[np.complex128]
 IMU_CHANNELS = ("ax", "ay", "yaw_rate")
 IMU_PARAMETERS = ("lever_x", "lever_y", "yaw", "delay", "offset_ax", "offset_ay", "offset_yaw_rate")
 
-TILT_GAIN = 0.1
-"""Prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g."""
-TILT_LIKENESS = 0.3
-"""Assumed correlation of the remaining tilt of body and road with the effect of a parameter."""
+TILT_GAIN = 0.1  # prior standard deviation of the part of an acceleration that gravity adds through roll or pitch; 0.1 is 5.8° at 1 g
+TILT_LIKENESS = 0.3  # assumed correlation of the remaining tilt of body and road with the effect of a parameter
 
-ROAD_CUTOFF = 0.2
-"""Bank and grade of the road change more slowly than that [Hz]."""
+ROAD_CUTOFF = 0.2  # bank and grade of the road change more slowly than that [Hz]
 
 N_BLOCKS = 12
 SHORTEST_BLOCK = 2.0  # s, longer than residuals of the band remember
@@ -55,8 +52,7 @@ SUSPICIOUS = 3.0  # standard uncertainties
 MORE_MOTION = "more turning, braking and accelerating"
 
 TILT_PRIOR = {"tilt_gain_x": TILT_GAIN, "tilt_gain_y": TILT_GAIN, "tilt_lag_x": TILT_LAG_GAIN, "tilt_lag_y": TILT_LAG_GAIN}
-NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)
-"""All parameters of a sensor that is aligned."""
+NOTHING = dict.fromkeys([*IMU_PARAMETERS, *TILT_PRIOR], 0.0)  # all parameters of a sensor that is aligned
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +63,7 @@ class Correlation:
     lag: FloatArray  # by which the sensor is late [s], (L,)
     value: FloatArray  # between -1 and 1, (L,)
     peak: float  # lag of the largest value, between samples by a parabola [s]
-
-    @property
-    def highest(self) -> float:
-        """The largest value."""
-        return float(self.value.max())
+    highest: float  # the largest value
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +81,7 @@ class ImuFit:
 
 
 def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[str]) -> ImuFit:
-    """Fit parameters of the sensor to a drive; the others are zero.
-
-    Args:
-        recording: with ``ax``, ``ay``, ``yaw_rate``, ``vy_ref`` and ``vx_ref`` or ``vx``.
-        settings: of the estimation.
-        names: some of `IMU_PARAMETERS`.
-
-    Raises:
-        DataError: see `vehest.alignment.align.align`.
-    """
+    """Fit some of `IMU_PARAMETERS` to a drive; the others are zero. Needs and errors are those of `vehest.alignment.align.align`."""
     signals = signals_of(recording, settings)
     model = ImuModel(signals)
     start, (predicted, columns) = dict(NOTHING), model(NOTHING)
@@ -114,11 +97,8 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     _require_identified(signals, fit, names, noise)
     if "delay" in names and abs(fit.values["delay"]) > settings.max_delay:
         raise DataError(f"recording '{recording.id}': the delay is longer than {settings.max_delay:g} s; raise max_delay")
-    blocks = n_blocks(signals.duration)
-    columns = model(fit.values)[1]
-    uncertainties = partial(
-        _uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=signals.rate_hz / signals.smoothing.step
-    )
+    blocks, columns, rate_hz = n_blocks(signals.duration), model(fit.values)[1], signals.rate_hz / signals.smoothing.step
+    uncertainties = partial(_uncertainties, columns=columns, tilt=settings.tilt, blocks=blocks, rate_hz=rate_hz)
     scatter, tilt = (sizes[: len(names)] for sizes in uncertainties(fit))
     return ImuFit(names, fit.values, scatter, tilt, blocks, _suspects(fit, columns, uncertainties), correlation, signals)
 
@@ -130,8 +110,8 @@ class Signals:
     recording: Recording
     speed: str  # channel of the reference's forward velocity
     measured: ComplexArray  # ax + i·ay of the sensor, (T,)
-    gyro: FloatArray  # its yaw rate, (T,)
     velocity: ComplexArray  # vx + i·vy of the reference, (T,)
+    gyro: FloatArray  # yaw rate of the sensor, (T,)
     reference_rate: FloatArray | None  # yaw rate of the reference if there is one, (T,)
     gravity: ComplexArray | None  # in the accelerometer by measured roll and pitch; None where they are not measured or not used, (T,)
     smoothing: Smoothing
@@ -192,17 +172,9 @@ def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
     what = f"recording '{recording.id}': a delay of {settings.max_delay:g} s is {lags:.6g} samples"
     check_limit("filter_samples", lags, what, ConfigurationError)
     shift = math.ceil(lags) if "delay" in settings.estimate else 0
-    signals = Signals(
-        recording,
-        speed,
-        measured=recording["ax"] + 1j * recording["ay"],
-        gyro=recording["yaw_rate"],
-        velocity=recording[speed] + 1j * recording["vy_ref"],
-        reference_rate=recording.channels.get("yaw_rate_ref"),
-        gravity=gravity,
-        smoothing=smoothing,
-        margin=smoothing.reach + shift,
-    )
+    measured, velocity = recording["ax"] + 1j * recording["ay"], recording[speed] + 1j * recording["vy_ref"]
+    rates = recording["yaw_rate"], recording.channels.get("yaw_rate_ref")
+    signals = Signals(recording, speed, measured, velocity, *rates, gravity, smoothing, margin=smoothing.reach + shift)
     require_length(recording, signals.duration, 2 * signals.margin / recording.rate_hz)
     return signals
 
@@ -340,20 +312,15 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
         before, at, after = value[top - 1 : top + 2]
         bend = before - 2.0 * at + after
         shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return Correlation(what, lags / signals.rate_hz, value, float(lags[top] + shift) / signals.rate_hz)
+    return Correlation(what, lags / signals.rate_hz, value, float(lags[top] + shift) / signals.rate_hz, float(value[top]))
 
 
 def _require_peak(recording: Recording, correlation: Correlation, settings: AlignmentSettings) -> None:
-    """See that sensor and reference have something in common.
-
-    Raises:
-        DataError: they have not, or no further than at the end of the delays that are searched.
-    """
+    """Refuse a sensor and a reference with nothing in common, or only at the end of the delays that are searched."""
     if correlation.highest < LEAST_CORRELATION:
-        raise DataError(
-            f"recording '{recording.id}': {correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most; "
-            f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
-        )
+        what = f"{correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most"
+        fix = f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
+        raise DataError(f"recording '{recording.id}': {what}; {fix}")
     if np.argmax(correlation.value) in (0, len(correlation.value) - 1):
         raise DataError(f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay")
 
@@ -381,18 +348,12 @@ def _most_likely(model: ImuModel, start: Mapping[str, float], names: Sequence[st
             damping = max(damping, 1e-4) * 10.0
         if settled:
             return fit
-    raise DataError(
-        f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; ask for fewer quantities, lower the "
-        f"cut-off, or use a drive with {MORE_MOTION}"
-    )
+    fix = f"ask for fewer quantities, lower the cut-off, or use a drive with {MORE_MOTION}"
+    raise DataError(f"recording '{model.signals.recording.id}': the estimate of {listed(asked)} does not settle; {fix}")
 
 
 def require_condition(recording: Recording, information: FloatArray, names: Sequence[str], asked: Sequence[str]) -> None:
-    """Refuse parameters that the drive cannot tell apart.
-
-    Raises:
-        DataError: the condition number of the scaled problem is too large.
-    """
+    """Refuse, by a `DataError`, parameters that the drive cannot tell apart: the condition number of the scaled problem is too large."""
     scale = np.sqrt(np.diag(information))
     silent = [name for name, size in zip(names, scale, strict=True) if size == 0.0]
     if silent:
@@ -400,14 +361,11 @@ def require_condition(recording: Recording, information: FloatArray, names: Sequ
     condition = condition_of(information)
     if condition <= LARGEST_CONDITION:
         return
-    vectors = np.linalg.eigh(information / scale / scale[:, None])[1]
-    confused = [
-        name if name in asked else "tilt of the body" for name, part in zip(names, np.abs(vectors[:, 0]), strict=True) if part > 0.3
-    ]
-    raise DataError(
-        f"recording '{recording.id}': this drive cannot tell {listed(list(dict.fromkeys(confused)))} apart (condition number "
-        f"{condition:.2g}, at most {LARGEST_CONDITION:g}); ask for fewer quantities, or use a drive with varying speed and turns both ways"
-    )
+    weakest = np.linalg.eigh(information / scale / scale[:, None])[1][:, 0]
+    confused = [name if name in asked else "tilt of the body" for name, part in zip(names, weakest, strict=True) if abs(part) > 0.3]
+    what = f"{listed(list(dict.fromkeys(confused)))} apart (condition number {condition:.2g}, at most {LARGEST_CONDITION:g})"
+    fix = "ask for fewer quantities, or use a drive with varying speed and turns both ways"
+    raise DataError(f"recording '{recording.id}': this drive cannot tell {what}; {fix}")
 
 
 def condition_of(information: FloatArray) -> float:
@@ -448,21 +406,14 @@ def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
 
 
 def _require_identified(signals: Signals, fit: Fit, asked: Sequence[str], noise: Mapping[str, tuple[float, float, float]]) -> None:
-    """Refuse parameters that would be fitted to the noise of the yaw rate and of the reference rather than to motion.
-
-    A parameter's column without the share of the other parameters must stand well above the noise in it.
-
-    Raises:
-        DataError: it does not.
-    """
+    """Refuse parameters whose column, without the share of the others, does not stand well above the noise of yaw rate and reference."""
     unique = 1.0 / np.diag(np.linalg.inv(fit.information[: len(asked), : len(asked)]))
     for index, name in enumerate(asked):
         share = fit.error.shape[1] * float(fit.weights @ np.square(noise[name][: len(fit.weights)])) / unique[index]
         if share > LARGEST_NOISE_SHARE:
-            raise DataError(
-                f"recording '{signals.recording.id}': {name} cannot be estimated: {100 * min(share, 1.0):.0f} % of its effect in this "
-                f"drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %); lower the cut-off, or use a drive with {MORE_MOTION}"
-            )
+            what = f"{100 * min(share, 1.0):.0f} % of its effect in this drive is noise (at most {100 * LARGEST_NOISE_SHARE:g} %)"
+            fix = f"lower the cut-off, or use a drive with {MORE_MOTION}"
+            raise DataError(f"recording '{signals.recording.id}': {name} cannot be estimated: {what}; {fix}")
 
 
 def _noise(samples: FloatArray) -> float:
@@ -471,17 +422,11 @@ def _noise(samples: FloatArray) -> float:
 
 
 def require_length(recording: Recording, usable: float, lost: float) -> None:
-    """See that there is enough for the uncertainty.
-
-    Raises:
-        DataError: there is not.
-    """
+    """Refuse, by a `DataError`, what is too short for an uncertainty."""
     least = FEWEST_BLOCKS * SHORTEST_BLOCK
     if usable < least:
-        raise DataError(
-            f"recording '{recording.id}' lasts {recording.duration:.3g} s; an uncertainty needs at least {least + lost:.3g} s, "
-            f"of which {lost:.2g} s for filtering and shifting"
-        )
+        needed = f"an uncertainty needs at least {least + lost:.3g} s, of which {lost:.2g} s for filtering and shifting"
+        raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s; {needed}")
 
 
 def n_blocks(seconds: float) -> int:
@@ -575,14 +520,7 @@ class Smoothing:
         return max(math.floor(self.deviation / SHORTEST_KERNEL), 1)
 
     def __call__(self, samples: NDArray[Any], order: int = 0, *, margin: int, step: int = 0) -> NDArray[Any]:
-        """A derivative of the low-passed samples, from ``margin`` (at least the reach) to as many before the end.
-
-        Args:
-            samples: (T,), real or complex.
-            order: of the derivative.
-            margin: samples left out at either end.
-            step: another step than the own one.
-        """
+        """A derivative of the low-passed samples (T,), real or complex, from ``margin`` (at least the reach) to as many before the end."""
         if np.iscomplexobj(samples):  # faster than a real kernel on complex samples
             ahead, aside = (self(part, order, margin=margin, step=step) for part in (samples.real, samples.imag))
             return ahead + 1j * aside
@@ -605,29 +543,21 @@ class Smoothing:
 
 
 def smoothing_of(recording: Recording, cutoff_hz: float) -> Smoothing:
-    """The filter whose response is -3 dB at a frequency.
-
-    Raises:
-        ConfigurationError: its kernel would be too narrow to be sampled, or longer than the limit.
-    """
+    """The filter of -3 dB at a frequency. Raises `ConfigurationError`: its kernel is too narrow to be sampled, or longer than the limit."""
     length = 2 * KERNEL_REACH * _deviation(cutoff_hz, recording.rate_hz)
     what = f"recording '{recording.id}': a low-pass at {cutoff_hz:g} Hz reaches over {length:.6g} samples"
     check_limit("filter_samples", length, what, ConfigurationError)
     limit = LARGEST_CUTOFF * recording.rate_hz
     if cutoff_hz > limit:
+        fix = f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
         raise ConfigurationError(
-            f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for {recording.rate_hz:g} Hz; "
-            f"use at most {math.floor(100 * limit) / 100:g} Hz, or a recording at its native rate"
+            f"recording '{recording.id}': a cut-off of {cutoff_hz:g} Hz is too high for {recording.rate_hz:g} Hz; {fix}"
         )
     return Smoothing(_deviation(cutoff_hz, recording.rate_hz), recording.rate_hz)
 
 
 def require_complete(recording: Recording, names: Sequence[str], asked: str) -> None:
-    """See that channels are there without gaps.
-
-    Raises:
-        DataError: one is not.
-    """
+    """Refuse, by a `DataError`, channels that are not there or have gaps."""
     for name in names:
         if np.isnan(recording[name]).any():
             raise DataError(f"recording '{recording.id}': channel '{name}' has gaps; cut a range without them to estimate {asked}")

@@ -25,11 +25,7 @@ QUANTITIES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Quantities to estimate, and how.
-
-    Raises:
-        ConfigurationError: nothing or something unknown is asked for, or a value makes no sense.
-    """
+    """Quantities to estimate, and how. Raises `ConfigurationError`: nothing or something unknown is asked for, or a value is wrong."""
 
     estimate: tuple[str, ...]  # names in `QUANTITIES`
     cutoff_hz: float = 2.0  # -3 dB frequency of the low-pass filter that both sides go through [Hz]

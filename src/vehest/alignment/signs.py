@@ -44,8 +44,7 @@ WRONG_FACTORS = {
     "sideslip_ref": _DEGREES,
 }
 """Channel -> factor and unit of each mistake."""
-UNSAFE = {"yaw_rate": "deg/s", "sideslip_ref": "deg"}
-"""Units that stop an ingest: no estimator survives them."""
+UNSAFE = {"yaw_rate": "deg/s", "sideslip_ref": "deg"}  # units that stop an ingest: no estimator survives them
 
 
 @dataclass(frozen=True)
@@ -212,13 +211,7 @@ def turned_channels(relations: Sequence[Relation], motion: Motion) -> list[tuple
 
 
 def sign_findings(relations: Sequence[Relation], motion: Motion, explanations: Sequence[tuple[str, ...]]) -> list[Finding]:
-    """Contradictions in sign, and the channel that points the other way where steering or heading decides.
-
-    Args:
-        relations: between the channels.
-        motion: of the drive.
-        explanations: `turned_channels` of both.
-    """
+    """Contradictions in sign, with `turned_channels`, and the channel that points the other way where steering or heading decides."""
     against = [relation for relation in relations if relation.correlation < 0.0]
     if not against:
         return []

@@ -135,12 +135,7 @@ class Measured:
 
 
 def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -> list[Measured]:
-    """Values of a fit, with intervals from leaving out one group after another (Student's).
-
-    Args:
-        groups: sums over G groups, (G, ...).
-        fit: of a sum of groups to P values.
-    """
+    """Values of a fit to a sum of groups (G, ...), with intervals from leaving out one group after another (Student's)."""
     whole, number = groups.sum(axis=0), len(groups)
     left_out = np.stack([fit(whole - group) for group in groups])
     spread = np.sqrt((number - 1) / number * np.square(left_out - left_out.mean(axis=0)).sum(axis=0))
@@ -169,14 +164,7 @@ def lag_of(spectra: CrossSpectra, source: str, follower: str, *, low_pass: bool)
     The phase alone is fitted: noise in either signal changes the ratio of their amplitudes, and not the mean phase. Each bin has the
     weight of maximum likelihood, coherence² / (1 - coherence²) (Hannan & Thomson, Biometrika 60 (3), 1973).
 
-    Args:
-        spectra: of both signals.
-        source: signal that is followed.
-        follower: signal that may be late.
-        low_pass: whether T is fitted too.
-
-    Returns:
-        None where one is missing, or the two are hardly coherent.
+    ``low_pass`` says whether T is fitted too. None where a signal is missing, or the two are hardly coherent.
     """
     if not {source, follower} <= set(spectra.names):
         return None

@@ -16,23 +16,14 @@ REFERENCE_SUFFIX = "_ref"
 
 @dataclass(frozen=True)
 class Channel:
-    """One quantity of a recording.
+    """One quantity of a recording."""
 
-    Args:
-        name: canonical name.
-        unit: SI unit, ``1`` where the quantity has none.
-        meaning: measured quantity, with its sign convention.
-        low: smallest value that a road vehicle can produce [unit].
-        high: largest value that a road vehicle can produce [unit].
-        rests: whether it may stay at exactly zero while the car moves, as the pressure of a brake does.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    low: float
-    high: float
-    rests: bool = False
+    name: str  # canonical name
+    unit: str  # SI unit, ``1`` where the quantity has none
+    meaning: str  # measured quantity, with its sign convention
+    low: float  # smallest value that a road vehicle can produce [unit]
+    high: float  # largest value that a road vehicle can produce [unit]
+    rests: bool = False  # whether it may stay at exactly zero while the car moves, as the pressure of a brake does
 
     @property
     def is_reference(self) -> bool:
@@ -83,11 +74,7 @@ CHANNELS: dict[str, Channel] = _table()
 
 
 def channel(name: str) -> Channel:
-    """Look up a channel.
-
-    Raises:
-        DataError: the name is not in the table.
-    """
+    """Look up a channel. Raises `DataError`: the name is not in the table."""
     if name not in CHANNELS:
         raise DataError(f"channel '{name}' is not known to vehest; known channels: {', '.join(sorted(CHANNELS))}")
     return CHANNELS[name]

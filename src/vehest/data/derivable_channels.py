@@ -8,8 +8,10 @@ from typing import Any
 
 from vehest.data.derived import WHEELS, AccelerationFromSpeed
 
-SHARE_OF_RATE = 0.2
-"""Cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate."""
+SHARE_OF_RATE = 0.2  # cut-off of a derived acceleration over the sampling rate, where the usual one does not lie below half of that rate
+
+UNKNOWN = {"wheel_radius": "rolling radius of the tyres [m]", "ratio": "of the handwheel's angle to the road wheels'"}
+"""Options that only the user knows, with their meaning."""
 
 MAKES = {
     "acceleration_from_speed": "ax",
@@ -23,19 +25,15 @@ MAKES = {
 
 @dataclass(frozen=True)
 class Derivation:
-    """How a channel is made of others.
+    """How a channel is made of others."""
 
-    Args:
-        channel: that is made.
-        of: channels of the log that it is made of, in the end.
-        transforms: entries of a data set's ``transforms``, in order; None stands for a value that only the user knows.
-        meanings: option that is None -> its meaning, with its unit.
-    """
+    of: tuple[str, ...]  # channels of the log that it is made of, in the end
+    transforms: tuple[Mapping[str, Any], ...]  # entries of a data set's ``transforms``, in order; None: a value that only the user knows
 
-    channel: str
-    of: tuple[str, ...]
-    transforms: tuple[Mapping[str, Any], ...]
-    meanings: Mapping[str, str]
+    @property
+    def meanings(self) -> dict[str, str]:
+        """Option that is None -> its meaning, with its unit."""
+        return {option: UNKNOWN[option] for entry in self.transforms for option, value in entry.items() if value is None}
 
     def in_words(self) -> str:
         """For messages, for example ``transforms: [{name: steering_ratio, ratio: …}] of handwheel (ratio: of …)``."""
@@ -47,35 +45,26 @@ class Derivation:
 
 
 def derivation_of(channel: str, channels: Collection[str], gappy: Collection[str], rate_hz: float) -> Derivation | None:
-    """Derivation of a missing channel from those that are there; None where nothing makes it.
-
-    Args:
-        channel: that is missing.
-        channels: that are there.
-        gappy: those of them with gaps.
-        rate_hz: sampling rate [Hz].
-    """
-    entry: dict[str, Any]
+    """Derivation of a missing channel from those that are there, some with gaps; None where nothing makes it."""
     wheels = tuple(name for wheel in WHEELS if (name := f"wheel_speed_{wheel}") in channels)
     if channel == "vx" and wheels:
-        entry = {"name": "speed_from_wheels", "wheel_radius": None}
-        return Derivation(channel, wheels, (entry,), {"wheel_radius": "rolling radius of the tyres [m]"})
+        return Derivation(wheels, ({"name": "speed_from_wheels", "wheel_radius": None},))
     if channel == "steer" and "handwheel" in channels:
-        entry = {"name": "steering_ratio", "ratio": None}
-        return Derivation(channel, ("handwheel",), (entry,), {"ratio": "of the handwheel's angle to the road wheels'"})
+        return Derivation(("handwheel",), ({"name": "steering_ratio", "ratio": None},))
+    of: tuple[str, ...] = ()
+    speed, entry = "vx", dict[str, Any](name="acceleration_from_speed")
     if channel == "ax" and "vx" not in gappy:
-        usual = AccelerationFromSpeed.cutoff_hz < rate_hz / 2
-        entry = {"name": "acceleration_from_speed"} | ({} if usual else {"cutoff_hz": SHARE_OF_RATE * rate_hz})
+        if rate_hz <= 2.0 * AccelerationFromSpeed.cutoff_hz:
+            entry["cutoff_hz"] = SHARE_OF_RATE * rate_hz
     elif channel == "vy_ref" and "sideslip_ref" in channels:
+        of, speed = ("sideslip_ref",), "vx_ref" if "vx_ref" in channels else "vx"
         entry = {"name": "velocity_from_sideslip"}
     else:
         return None
-    of = ("sideslip_ref",) if channel == "vy_ref" else ()
-    speed = "vx_ref" if channel == "vy_ref" and "vx_ref" in channels else "vx"
     if speed in channels:
-        return Derivation(channel, (*of, speed), (entry,), {})
+        return Derivation((*of, speed), (entry,))
     made = derivation_of("vx", channels, (), rate_hz)
-    return None if made is None else Derivation(channel, (*of, *made.of), (*made.transforms, entry), made.meanings)
+    return None if made is None else Derivation((*of, *made.of), (*made.transforms, entry))
 
 
 def made_by(transforms: Iterable[Mapping[str, Any]]) -> frozenset[str]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import scipy
+from pydantic import AfterValidator, NonNegativeFloat, PositiveFloat
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
@@ -17,25 +19,13 @@ from vehest.data.recording import Recording
 WHEELS = ("fl", "fr", "rl", "rr")
 
 
-def require_channel(name: str, what: str) -> None:
-    """Refuse a channel that is not in the table.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
+def _known(name: str) -> str:
     if name not in CHANNELS:
-        raise ConfigurationError(f"{what} of '{name}': there is no such channel; 'vehest data channels' lists them")
+        raise ValueError(f"there is no channel '{name}'; 'vehest data channels' lists them")
+    return name
 
 
-def require_positive(what: str, **values: float) -> None:
-    """Refuse values that are not positive.
-
-    Raises:
-        ConfigurationError: one is zero, negative or not finite.
-    """
-    for name, value in values.items():
-        if not 0.0 < value < math.inf:
-            raise ConfigurationError(f"{what}: {name} must be a positive number, not {value!r}")
+ChannelName = Annotated[str, AfterValidator(_known)]  # name of a channel of the table
 
 
 def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
@@ -45,58 +35,36 @@ def derivative(samples: FloatArray, rate_hz: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class SteeringRatio:
-    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio.
+    """Make the road-wheel angle ``steer`` from another angle: steer = (angle - offset) / ratio."""
 
-    Args:
-        ratio: how far the angle turns for a unit of ``steer``; negative if it counts the other way.
-        offset: what it shows going straight ahead [rad].
-        channel: the angle; ``steer`` itself may be it.
-    """
-
-    ratio: float
-    offset: float = 0.0
-    channel: str = "handwheel"
+    ratio: float  # how far the angle turns for a unit of ``steer``; negative if it counts the other way
+    offset: float = 0.0  # what it shows going straight ahead [rad]
+    channel: ChannelName = "handwheel"  # the angle; ``steer`` itself may be it
 
     def __post_init__(self) -> None:
         if self.ratio == 0.0:
             raise ConfigurationError("a steering ratio must be a number other than zero")
-        require_channel(self.channel, "steering ratio")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the angle has them.
-
-        Raises:
-            DataError: the channel is missing.
-        """
+        """Set ``steer``; it has gaps where the angle has them. Raises `DataError`: the channel is missing."""
         steer = (recording[self.channel] - self.offset) / self.ratio
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
 
 @dataclass(frozen=True)
 class SteeringCurve:
-    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear.
+    """Make the road-wheel angle ``steer`` from a command or an angle by a curve of straight pieces, as of a linkage that is not linear."""
 
-    Args:
-        inputs: values of the channel at the corners, increasing.
-        angles: road-wheel angle at each [rad]; beyond the first and last corner the curve is flat.
-        channel: that the curve is applied to; it may be ``steer``.
-    """
-
-    inputs: tuple[float, ...]
-    angles: tuple[float, ...]
-    channel: str = "steer"
+    inputs: tuple[float, ...]  # values of the channel at the corners, increasing
+    angles: tuple[float, ...]  # road-wheel angle at each [rad]; beyond the first and last corner the curve is flat
+    channel: ChannelName = "steer"  # that the curve is applied to; it may be ``steer``
 
     def __post_init__(self) -> None:
         if len(self.inputs) != len(self.angles) or len(self.inputs) < 2 or not np.all(np.diff(self.inputs) > 0):
             raise ConfigurationError("a steering curve needs two corners or more: inputs that increase, and as many angles")
-        require_channel(self.channel, "steering curve")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``steer``; it has gaps where the channel has them.
-
-        Raises:
-            DataError: the channel is missing.
-        """
+        """Set ``steer``; it has gaps where the channel has them. Raises `DataError`: the channel is missing."""
         steer = np.interp(recording[self.channel], self.inputs, self.angles)
         return recording.with_channels({"steer": steer}, made_of=(self.channel,))
 
@@ -112,31 +80,17 @@ class SpeedFromWheels:
     ``hold_seconds``; after them the median counts, since something must. Wheels that the recording does not have do not count; one
     alone counts as it is. Without ``steer`` the front wheels point straight ahead.
 
-    Args:
-        wheel_radius: rolling radius R [m].
-        track_front: t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up.
-        track_rear: t_R [m]; the same.
-        tolerance: absolute part of it [m/s]; 5 % of the median come on top.
-        most_acceleration: of the car, forwards or backwards [m/s²].
-        hold_seconds: for how long ``vx`` goes on without two wheels [s].
-
     Source:
         Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
     """
 
-    wheel_radius: float
-    track_front: float = 0.0
-    track_rear: float = 0.0
-    tolerance: float = 0.3
-    most_acceleration: float = 12.0
-    hold_seconds: float = 2.0
+    wheel_radius: PositiveFloat  # rolling radius R [m]
+    track_front: NonNegativeFloat = 0.0  # t_F [m]; 0 where it is not known, for which the mean of a left and a right wheel makes up
+    track_rear: NonNegativeFloat = 0.0  # t_R [m]; the same
+    tolerance: PositiveFloat = 0.3  # absolute part of it [m/s]; 5 % of the median come on top
+    most_acceleration: PositiveFloat = 12.0  # of the car, forwards or backwards [m/s²]
+    hold_seconds: PositiveFloat = 2.0  # for how long ``vx`` goes on without two wheels [s]
     relative_tolerance: ClassVar[float] = 0.05
-
-    def __post_init__(self) -> None:
-        require_positive("speed from wheels", wheel_radius=self.wheel_radius, tolerance=self.tolerance)
-        require_positive("speed from wheels", most_acceleration=self.most_acceleration, hold_seconds=self.hold_seconds)
-        if not min(self.track_front, self.track_rear) >= 0.0:
-            raise ConfigurationError(f"speed from wheels: tracks must be zero or positive, not {self.track_front} and {self.track_rear}")
 
     def corrected(self, recording: Recording) -> FloatArray:
         """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
@@ -163,7 +117,8 @@ class SpeedFromWheels:
             DataError: a channel is missing, or no wheel was ever measured.
         """
         speeds = self.corrected(recording)
-        medians = _known_median(speeds)
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where no wheel was measured the median is NaN
+            medians = np.nanmedian(speeds, axis=0)
         counts = np.abs(speeds - medians) <= self.tolerance + self.relative_tolerance * np.abs(medians)
         if not np.isfinite(speeds).any():
             raise DataError(f"recording '{recording.id}': no wheel speed was measured together with yaw_rate and steer; vx cannot be made")
@@ -191,15 +146,6 @@ class SpeedFromWheels:
         return recording.with_channels({"vx": vx}, made_of=())
 
 
-def _known_median(speeds: FloatArray) -> FloatArray:
-    """Median of the wheels that were measured, (4, T) -> (T,); NaN where none was."""
-    ranked = np.sort(speeds, axis=0)  # NaN last
-    number = np.isfinite(speeds).sum(0)
-    column = np.arange(speeds.shape[1])
-    middle: FloatArray = 0.5 * (ranked[np.maximum(number - 1, 0) // 2, column] + ranked[np.minimum(number // 2, 3), column])
-    return np.where(number > 0, middle, np.nan)
-
-
 @dataclass(frozen=True)
 class AccelerationFromSpeed:
     """Make the longitudinal acceleration ``ax`` from a speed: ax ≈ dvx/dt, low-passed.
@@ -207,28 +153,16 @@ class AccelerationFromSpeed:
     An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
     v = 0.5 m/s and r = 0.4 rad/s.
 
-    Args:
-        channel: the speed; ``vx`` or ``vx_ref``.
-        cutoff_hz: of a Butterworth filter of second order [Hz].
-        direction: ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``.
-
     Source:
         Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
     """
 
-    channel: Literal["vx", "vx_ref"] = "vx"
-    cutoff_hz: float = 5.0
-    direction: Literal["causal", "zero_phase"] = "causal"
-
-    def __post_init__(self) -> None:
-        require_positive("acceleration from speed", cutoff_hz=self.cutoff_hz)
+    channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
+    cutoff_hz: PositiveFloat = 5.0  # of a Butterworth filter of second order [Hz]
+    direction: Literal["causal", "zero_phase"] = "causal"  # ``causal``, late by 1.41/(2π·cutoff_hz) and half a sample, or ``zero_phase``
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``ax``.
-
-        Raises:
-            DataError: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate.
-        """
+        """Set ``ax``. Raises `DataError`: the speed is missing or has gaps, or the cut-off lies beyond half the sampling rate."""
         speed, rate = recording[self.channel], recording.rate_hz
         if np.isnan(speed).any():
             raise DataError(f"recording '{recording.id}': channel '{self.channel}' has gaps, so no ax can be made of it")
@@ -290,20 +224,13 @@ class ScaleToWheelbase:
     that are geometrically similar on similar tyres then drive the same manoeuvre. Channels that are no lengths, times or angles
     (forces, torques, currents, pressures) are left out.
 
-    Args:
-        wheelbase: of the car [m].
-        to: of the car that it is seen as [m].
-
     Source:
         Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
         testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
     """
 
-    wheelbase: float
-    to: float
-
-    def __post_init__(self) -> None:
-        require_positive("scale to wheelbase", wheelbase=self.wheelbase, to=self.to)
+    wheelbase: PositiveFloat  # of the car [m]
+    to: PositiveFloat  # of the car that it is seen as [m]
 
     def __call__(self, recording: Recording) -> Recording:
         """Scale rate, start time and channels."""

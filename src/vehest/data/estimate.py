@@ -78,10 +78,8 @@ class Estimate:
             raise DataError(f"{where}: quantities must have one common length, not {sorted(lengths)}")
         n_rows, shape = len(self.covariance_of), None if self.covariance is None else self.covariance.shape
         if shape != ((len(self), n_rows, n_rows) if n_rows else None) or len(QUANTITIES.keys() & set(self.covariance_of)) != n_rows:
-            names = ", ".join(self.covariance_of)
-            raise DataError(
-                f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, not {shape} and ({names})"
-            )
+            what = f"not {shape} and ({', '.join(self.covariance_of)})"
+            raise DataError(f"{where}: a covariance must be of shape (T, n, n) and covariance_of name n quantities, {what}")
 
     def __len__(self) -> int:
         return len(next(iter(self.channels.values())))
@@ -98,27 +96,12 @@ class Estimate:
         return self.start_time + np.arange(len(self)) / self.rate_hz
 
     def held_at(self, times: FloatArray, name: str) -> FloatArray:
-        """Values of ``name`` at other times: the latest that is not in the future, NaN outside the estimate.
-
-        Args:
-            times: shape (K,) [s].
-            name: quantity.
-
-        Returns:
-            Shape (K,).
-        """
+        """Values (K,) of ``name`` at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate."""
         index = self._held_index(times)
         return np.where(index < 0, np.nan, self[name][index])
 
     def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
-        """Covariance of some quantities at other times: the latest one that is not in the future, NaN outside the estimate.
-
-        Args:
-            times: shape (K,) [s].
-            names: n quantities, in the order that is wanted.
-
-        Returns:
-            Shape (K, n, n).
+        """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate.
 
         Raises:
             DataError: the estimate has no covariance of one of them.

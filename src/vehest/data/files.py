@@ -22,20 +22,16 @@ ASIDE_PREFIX = ".writing-"
 _ASIDE = re.compile(rf"{re.escape(ASIDE_PREFIX)}(\d+)-(?:([0-9a-f]{{8}})[0-9a-f]{{8}}-)?")  # process and host before the name
 FOREIGN_SECONDS = 24 * 3600.0  # after which files of another host count as left over, whose processes cannot be seen from here
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-_NO_ROOM_WORDS = {
-    **{os.strerror(number): number for number in sorted(NO_ROOM)},
-    "os error 28": errno.ENOSPC,
-    "database or disk is full": errno.ENOSPC,
-}
+_NO_ROOM_WORDS = {os.strerror(number): number for number in NO_ROOM} | dict.fromkeys(
+    ("os error 28", "database or disk is full"), errno.ENOSPC
+)
 
 
 @contextmanager
 def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]:
     """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
 
-    Args:
-        path: file or folder to write.
-        replace_folder: whether a folder that is there already may go; a file may always be replaced.
+    A file that is there may always be replaced, a folder by ``replace_folder``.
 
     Raises:
         MissingError: the disk is full or the folder cannot be written to.
@@ -46,7 +42,7 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
         yield aside
         _flush(aside)
         if replace_folder and path.is_dir() and not path.is_symlink():
-            replaced = path.with_name(_aside_name("replaced"))
+            replaced = aside_of(path, "replaced")
             os.rename(path, replaced)
             os.rename(aside, path)
             shutil.rmtree(replaced, ignore_errors=True)
@@ -55,10 +51,8 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
     except OSError as error:
         named = Path(error.filename) if isinstance(error.filename, str) else aside
         raise writing_error(path if named.is_relative_to(aside) or ASIDE_PREFIX in str(named) else named, error) from error
-    except VehestError:
-        raise
     except Exception as error:
-        full = no_room(error)
+        full = None if isinstance(error, VehestError) else no_room(error)
         if full is None:
             raise
         raise writing_error(path, full) from error
@@ -87,11 +81,8 @@ def regular_file(path: Path) -> Path:
 
 
 def file_name(name: str, ending: str = "") -> str:
-    """A name as one component of a path, another for another name.
-
-    Letters, digits, ``_``, ``-``, ``+``, ``=`` and ``.`` stay; of a name that holds anything else, begins with a dot or is long, the rest
-    is followed by the start of its hash.
-    """
+    """A name as one component of a path, another for another name: what is no letter, digit or one of ``_-+=.`` is replaced, a name cut
+    at 100 bytes, and the start of its hash added."""
     kept = re.sub(r"[^\w.+=-]", "_", name).lstrip(".")
     if kept != name or not name or len(kept.encode()) > 120:
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
@@ -156,26 +147,18 @@ def is_left_over(path: Path) -> bool:
         return False
 
 
-def aside_of(path: Path) -> Path:
-    """A free place beside ``path`` for this process; files that stay there are removed later."""
-    return path.with_name(_aside_name(path.name))
+def aside_of(path: Path, name: str = "") -> Path:
+    """A free place beside ``path`` for this process, for ``path`` itself or another name; files that stay there are removed later."""
+    return path.with_name(f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name or path.name}")
 
 
 def sha256_of(path: Path) -> str:
-    """Hex digest of a file's bytes.
-
-    Raises:
-        DataError: the file cannot be read.
-    """
+    """Hex digest of a file's bytes; raises a `DataError` where it cannot be read."""
     try:
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
-
-
-def _aside_name(name: str) -> str:
-    return f"{ASIDE_PREFIX}{os.getpid()}-{_host()}{uuid.uuid4().hex[:8]}-{name}"
 
 
 @cache
@@ -195,8 +178,7 @@ def _is_alive(process: int) -> bool:
 
 
 def _flush(path: Path) -> None:
-    files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
-    for file in files:
+    for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
         descriptor = os.open(file, os.O_RDONLY)
         try:
             os.fsync(descriptor)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.laps import laps_of
@@ -20,44 +21,23 @@ FEWEST = 3  # one to test, one to stop on, the rest to learn from
 
 @dataclass(frozen=True)
 class FoldsFile:
-    """How a split is cross-validated.
+    """How a split is cross-validated."""
 
-    Args:
-        number: of folds, three or more.
-        of: unit that is never cut in two: a recording, a lap, or ``block_seconds`` of driving.
-        recordings: pattern of those that take part.
-        block_seconds: length of a block for ``of: seconds`` [s].
-        gap_seconds: taken off training and validation where they border on another fold [s], since filters and windows reach across.
-    """
-
-    number: int = 5
-    of: Literal["recordings", "laps", "seconds"] = "laps"
-    recordings: str = "*"
-    block_seconds: float = 30.0
-    gap_seconds: float = 2.0
-
-    def __post_init__(self) -> None:
-        if self.number < FEWEST:
-            raise ValueError(f"number must be {FEWEST} or more (test, validation, training), not {self.number}")
-        if not self.block_seconds > 0.0:
-            raise ValueError(f"block_seconds must be positive, not {self.block_seconds:g}")
-        if not self.gap_seconds >= 0.0:
-            raise ValueError(f"gap_seconds must not be negative, not {self.gap_seconds:g}")
+    number: Annotated[int, Field(ge=FEWEST)] = 5  # of folds, three or more
+    of: Literal["recordings", "laps", "seconds"] = "laps"  # unit that is never cut in two; seconds: ``block_seconds`` of driving
+    recordings: str = "*"  # pattern of those that take part
+    block_seconds: PositiveFloat = 30.0  # length of a block for ``of: seconds`` [s]
+    gap_seconds: NonNegativeFloat = 2.0  # taken off training and validation where they border on another fold [s]
 
 
-def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str] | None], Recording]]) -> list[Span]:
-    """The blocks of recordings in order, each with its start and stop.
-
-    Args:
-        folds: with the unit that is never cut in two.
-        recordings: a span that names a recording -> its reader.
+def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
+    """The blocks of recordings, each with the span that names it, in order, with start and stop.
 
     Raises:
         DataError: laps are asked for and a recording lacks speed or yaw rate.
     """
     blocks = []
-    for whole, read in recordings.items():
-        recording = read(None)
+    for whole, recording in recordings:
         bounds = [recording.start_time, recording.end_time]
         if folds.of == "laps":  # the rest before the first or after the last belongs to that lap
             bounds += [stop for _, stop in laps_of(recording)[:-1]]
@@ -70,15 +50,9 @@ def blocks_of(folds: FoldsFile, recordings: Mapping[Span, Callable[[Iterable[str
 
 
 def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> tuple[tuple[Span, ...], tuple[Span, ...], tuple[Span, ...]]:
-    """Training, validation and test of one fold: blocks stay in order and folds last about as long as each other.
+    """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
-
-    Args:
-        blocks: from `blocks_of`.
-        folds: their number, and the gap between them.
-        fold: which of them is tested, from 0.
-        where: the split, for messages.
 
     Raises:
         ConfigurationError: there is no such fold, or too few blocks to fill them.

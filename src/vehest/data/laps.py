@@ -11,19 +11,13 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
-POINTS = 8192
-"""Of the path at most."""
-LEAST_CORRELATION = 0.6
-"""Between the curvatures of a lap and of the next; drivers take other lines, the course stays."""
-LEAST_SHARE_OF_BEST = 0.9
-"""Of the best correlation, from which the shorter of two periods is taken: two laps repeat too."""
+POINTS = 8192  # of the path at most
+LEAST_CORRELATION = 0.6  # between the curvatures of a lap and of the next; drivers take other lines, the course stays
+LEAST_SHARE_OF_BEST = 0.9  # of the best correlation, from which the shorter of two periods is taken: two laps repeat too
 MOST_TURN_OFF = 0.8  # rad; by how much the heading may miss a whole number of turns after a lap, gyro drift included
-STEADY = 0.2
-"""Spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn."""
-INCOMPLETE = 0.005
-"""Share of a lap that a last one may lack and count as complete."""
-SEARCH = 0.04
-"""Share of a lap by which the next boundary is looked for before and after where it is expected."""
+STEADY = 0.2  # spread of the curvature over its mean, below which the path is a circle, of which a lap is a turn
+INCOMPLETE = 0.005  # share of a lap that a last one may lack and count as complete
+SEARCH = 0.04  # share of a lap by which the next boundary is looked for before and after where it is expected
 
 
 def laps_of(recording: Recording) -> list[tuple[float, float]]:

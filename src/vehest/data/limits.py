@@ -8,34 +8,22 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
+from pydantic import PositiveInt
+
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds on what one input may take; an hour of 55 channels at 1 kHz stays below each.
+    """Bounds on what one input may take; an hour of 55 channels at 1 kHz stays below each."""
 
-    Args:
-        samples: samples of one channel of a recording, also after its clock has been made even and after resampling.
-        columns: columns that the header of a table may name.
-        memory: what reading one file may take beyond ten times its size [bytes].
-        filter_samples: reach of a filter, or length of an estimator's window, in samples.
-        jobs: trainings of one sweep or study.
-        text_bytes: length of a configuration, manifest or other text that describes something [bytes].
-    """
-
-    samples: int = 20_000_000
-    columns: int = 10_000
-    memory: int = 1_600_000_000
-    filter_samples: int = 1_000_000
-    jobs: int = 10_000
-    text_bytes: int = 16 * 2**20
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value < 1:
-                raise ConfigurationError(f"limits.{name} must be a whole number from 1 on, not {value}")
+    samples: PositiveInt = 20_000_000  # samples of one channel of a recording, also after its clock has been made even and after resampling
+    columns: PositiveInt = 10_000  # columns that the header of a table may name
+    memory: PositiveInt = 1_600_000_000  # what reading one file may take beyond ten times its size [bytes]
+    filter_samples: PositiveInt = 1_000_000  # reach of a filter, or length of an estimator's window, in samples
+    jobs: PositiveInt = 10_000  # trainings of one sweep or study
+    text_bytes: PositiveInt = 16 * 2**20  # length of a configuration, manifest or other text that describes something [bytes]
 
 
 _DEFAULTS = Limits()
@@ -58,25 +46,15 @@ def use_limits(limits: Limits) -> Iterator[None]:
 
 
 def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
-    """Limits from ``limits`` of a configuration; the others keep their defaults.
-
-    Raises:
-        ConfigurationError: an unknown name, or a value that is no whole number from 1 on.
-    """
+    """Limits from ``limits`` of a configuration; raises a `ConfigurationError` where a name or a value is none."""
     return validated(Limits, config or {}, "", error=ConfigurationError, group="limits")
 
 
 def check_limit(name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError) -> None:
-    """Refuse a number above the limit ``name``.
-
-    Args:
-        name: field of `Limits`.
-        value: that is asked for.
-        what: for the message, ``"'lap.csv' would hold 4000000000 samples"``.
-        error: what to raise.
+    """Refuse a number above the limit ``name``, a field of `Limits`.
 
     Raises:
-        DataError: it is above (or ``error``).
+        DataError: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:
@@ -84,10 +62,6 @@ def check_limit(name: str, value: float, what: str, error: type[ConfigurationErr
 
 
 def check_unpacked(file: object, packed: float, unpacked: float) -> None:
-    """Refuse a file that unpacks to more than ``limits.memory`` and ten times its packed size [bytes].
-
-    Raises:
-        DataError: it does.
-    """
+    """Refuse, by a `DataError`, a file that unpacks to more than ``limits.memory`` and ten times its packed size [bytes]."""
     beyond = unpacked - 10.0 * packed
     check_limit("memory", beyond, f"'{file}' unpacks to {unpacked:.0f} bytes, {beyond:.0f} beyond ten times its size")

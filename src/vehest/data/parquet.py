@@ -46,12 +46,7 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers, float64 of shape (T,) each; what is missing is NaN.
-
-    Args:
-        path: for messages.
-        file: opened by `parquet_file`, inside its block.
-        names: of columns that are there once each.
+    """Columns of numbers that are there once each, inside the block of `parquet_file`: float64 of shape (T,); what is missing is NaN.
 
     Raises:
         DataError: a column holds something else than numbers, the file is more than the limits, or holds other rows than it says.

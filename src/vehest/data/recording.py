@@ -15,8 +15,7 @@ from vehest.data.errors import DataError
 
 Kind = Literal["real", "simulated"]
 
-LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e9
-"""Between which a sampling rate lies [Hz]."""
+LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e9  # between which a sampling rate lies [Hz]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +77,7 @@ class Recording:
         return len(next(iter(self.channels.values())))
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (T,).
-
-        Raises:
-            DataError: the recording does not have it.
-        """
+        """Samples of one channel, shape (T,). Raises `DataError`: the recording does not have it."""
         if name not in self.channels:
             raise DataError(f"recording '{self.id}' has no channel '{name}' (it has {', '.join(self.channels)})")
         return self.channels[name]
@@ -106,11 +101,7 @@ class Recording:
         return self.start_time + self.duration
 
     def stack(self, names: Iterable[str]) -> FloatArray:
-        """Channels as columns, shape (T, C).
-
-        Raises:
-            DataError: one of them is missing.
-        """
+        """Channels as columns, shape (T, C). Raises `DataError`: one of them is missing."""
         return np.stack([self[name] for name in names], axis=1)
 
     def select(self, names: Iterable[str]) -> Recording:
@@ -118,12 +109,7 @@ class Recording:
         return replace(self, channels={name: self[name] for name in names})
 
     def with_channels(self, changed: Mapping[str, FloatArray], made_of: Iterable[str] | None = None) -> Recording:
-        """The same drive with channels replaced or added.
-
-        Args:
-            changed: channel -> samples, shape (T,).
-            made_of: channels that they were made of: they may have gaps where one of these may. None: the gaps stay as they were.
-        """
+        """The same drive with channels (T,) replaced or added: gappy where one that they were made of is; None: as they were."""
         gappy = self.gappy
         if made_of is not None:
             gappy = gappy | set(changed) if gappy & set(made_of) else gappy - set(changed)
@@ -137,11 +123,7 @@ class Recording:
         return self.select(kept)
 
     def cut(self, start: float, stop: float) -> Recording:
-        """The samples taken in [start, stop) seconds.
-
-        Raises:
-            DataError: the range holds no samples.
-        """
+        """The samples taken in [start, stop) seconds. Raises `DataError`: the range holds no samples."""
         first, last = self.index_range(start, stop)
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"

@@ -15,19 +15,12 @@ from vehest.data.store import RecordingDescription, description_of
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """Channels and rate of a recording.
+    """Channels and rate of a recording."""
 
-    Args:
-        id: name, unique within its data set.
-        rate_hz: sampling rate [Hz].
-        channels: that it has.
-        gappy: those of them that were not measured throughout.
-    """
-
-    id: str
-    rate_hz: float
-    channels: frozenset[str]
-    gappy: frozenset[str] = frozenset()
+    id: str  # name, unique within its data set
+    rate_hz: float  # sampling rate [Hz]
+    channels: frozenset[str]  # that it has
+    gappy: frozenset[str] = frozenset()  # those of them that were not measured throughout
 
 
 def summary_of(recording: Recording) -> RecordingSummary:

@@ -27,11 +27,11 @@ LARGEST = 10**300  # whole number
 
 
 def validated(kind: type[Schema], content: Any, where: str, *, error: type[VehestError] = DataError, group: str = "") -> Schema:
-    """Build a dataclass from plain values.
+    """Build a dataclass from plain values: mappings, lists, text, numbers, truth values, nothing.
 
     Args:
         kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or ``ValueError``.
-        content: of a file: mappings, lists, text, numbers, truth values, nothing.
+        content: plain values.
         where: first words of a message, ``"'model.yaml'"``; may be empty.
         error: what to raise.
         group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
@@ -68,19 +68,10 @@ def _without_names(content: Any, kind: Any) -> Any:
 
 
 def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int:
-    """Check the version of a file's layout.
-
-    Args:
-        found: the version that the file states.
-        newest: the version that is written now.
-        where: the file, for messages.
-        oldest: the oldest one that can still be read.
-
-    Returns:
-        The version.
+    """The version of a file's layout, as the file states it.
 
     Raises:
-        DataError: it is no version, a newer one, or one that is no longer read.
+        DataError: it is no version, a newer one than is written now, or one that is no longer read.
     """
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
         raise DataError(f"{where}: format must be a whole number, not {str(found)[:40]!r}")

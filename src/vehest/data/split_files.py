@@ -5,32 +5,36 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
+
+from pydantic import Field, PositiveFloat
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
-from vehest.data.limit_minutes import limit_minutes
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 from vehest.data.splits import VALIDATION, Kept, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
-Reader = Callable[[Iterable[str] | None], Recording]
-"""Reads the named channels of one recording, or all."""
-Catalogue = Callable[[str], Mapping[str, Reader]]
-"""Of the name of a data set: its recordings as ingested, by id."""
+Reader = Callable[[Iterable[str] | None], Recording]  # reads the named channels of one recording, or all
+Catalogue = Callable[[str], Mapping[str, Reader]]  # of the name of a data set: its recordings as ingested, by id
 
 PERCENT = re.compile(r"\s*(\d+(?:\.\d+)?)\s*%\s*")
 LAPS = re.compile(r"\s*(?:(first|last)(?:\s+(\d+))?|(\d+)(?:\s*(?:to|-)\s*(\d+))?)(?:\s+laps?)?\s*")
 SECONDS_OR_SHARE = 'a number of seconds or a percentage such as "60 %"'
+LEAST_SECONDS = 3.0  # of a piece of limited minutes; shorter ones hold no window after the start that is not scored
 
 
 @dataclass(frozen=True)
 class RangeFile:
-    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps."""
+    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps.
+
+    Raises:
+        ValueError: it names no recording, or one and a pattern; or it has laps and times.
+    """
 
     dataset: str | None = None
     recording: str | None = None
@@ -39,6 +43,12 @@ class RangeFile:
     stop: Annotated[float | str, SECONDS_OR_SHARE] = math.inf
     laps: str | None = None
     keep: Condition | None = None
+
+    def __post_init__(self) -> None:
+        if (self.recording is None) == (self.recordings is None):
+            raise ValueError("a range needs a recording or recordings, a pattern of several")
+        if self.laps is not None and (self.start, self.stop) != (-math.inf, math.inf):
+            raise ValueError("a range has laps, or start and stop, not both")
 
 
 @dataclass(frozen=True)
@@ -49,13 +59,20 @@ class SplitFile:
     name: str = "unnamed"
     title: str | None = None
     dataset: str | None = None
-    train: tuple[RangeFile, ...] | None = None
-    validation: tuple[RangeFile, ...] | None = None
-    tests: dict[str, tuple[RangeFile, ...]] | None = None
+    train: tuple[RangeFile, ...] = ()
+    validation: tuple[RangeFile, ...] = ()
+    tests: dict[str, tuple[RangeFile, ...]] = field(default_factory=dict)
     folds: FoldsFile | None = None
     fold: int = 0
-    minutes: float | None = None
-    minutes_at: float = 0.0
+    minutes: PositiveFloat | None = None
+    minutes_at: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+
+    def dataset_of(self, entry: RangeFile | None = None) -> str:
+        """Data set of a range, or of the folds."""
+        dataset = (entry.dataset if entry else None) or self.dataset
+        if dataset is None:
+            raise ConfigurationError(f"split '{self.name}': each range needs a dataset, or the split has one for all")
+        return dataset
 
 
 def _read(config: Any) -> SplitFile:
@@ -83,10 +100,11 @@ def _spelt_out(config: Mapping[str, Any], where: str) -> dict[str, Any]:
         what = f'a list of ranges, a percentage such as "60 %" or laps such as "last lap", not \'{entries[:60]}\''
         raise ConfigurationError(f"{where}: {role} must be {what}")
 
-    spelt = {role: ranges(role, config[role]) for role in ("train", VALIDATION) if role in config}
-    if isinstance(tests := config.get("tests"), Mapping):
-        spelt["tests"] = {name: ranges(f"tests.{name}", entries) for name, entries in tests.items()}
-    return {**config, **spelt}
+    given = {key: value for key, value in config.items() if value is not None}
+    given |= {role: ranges(role, given[role]) for role in ("train", VALIDATION) if role in given}
+    if isinstance(tests := given.get("tests"), Mapping):
+        given["tests"] = {name: ranges(f"tests.{name}", entries) for name, entries in tests.items()}
+    return given
 
 
 def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = None) -> Split:
@@ -101,10 +119,8 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
             none meets; or one of them without a catalogue.
         DataError: a recording lacks a channel that a condition looks at.
     """
-    file = _read(config)
-    ranges = _Ranges(file, catalogue)
-    split = ranges.fold(file.folds) if file.folds is not None else ranges.split()
-    return split if file.minutes is None else ranges.limited(split, file.minutes)
+    ranges = _Ranges(_read(config), catalogue)
+    return ranges.limited(ranges.split())
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
@@ -114,31 +130,43 @@ def dataset_names(config: Mapping[str, Any]) -> list[str]:
         ConfigurationError: as `split_from_config`, where a range names none.
     """
     file = _read(config)
-    entries = [*(file.train or ()), *(file.validation or ()), *(entry for entries in (file.tests or {}).values() for entry in entries)]
-    if file.folds is not None:
-        entries = [RangeFile(recordings=file.folds.recordings)]
-    return sorted({_dataset_of(entry, file) for entry in entries})
+    entries = [entry for entries in (file.train, file.validation, *file.tests.values()) for entry in entries]
+    return [file.dataset_of()] if file.folds else sorted({file.dataset_of(entry) for entry in entries})
 
 
-def _dataset_of(entry: RangeFile, file: SplitFile) -> str:
-    dataset = entry.dataset or file.dataset
-    if dataset is None or (entry.recording is None) == (entry.recordings is None):
-        needed = "each range needs a recording and a dataset (or recordings, a pattern)"
-        raise ConfigurationError(f"split '{file.name}': {needed}, not {_shown(entry)}")
-    return dataset
+def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
+    """A stretch of ranges laid end to end; it goes on at their start where it reaches their end. Ends of a few seconds are left out.
+
+    Args:
+        spans: ranges with ends.
+        seconds: time to keep [s], less than there is.
+        at: share of the ranges after which to begin, 0 to 1.
+    """
+    total = _seconds_of(spans)
+    begin = at * total
+    kept = _between(spans, begin, min(begin + seconds, total))
+    pieces = (*_between(spans, 0.0, begin + seconds - total), *kept)
+    return tuple(piece for piece in pieces if piece.stop - piece.start >= LEAST_SECONDS) or pieces
 
 
-def _shown(entry: RangeFile) -> dict[str, Any]:
-    return {key: value for key, value in asdict(entry).items() if value not in (None, -math.inf, math.inf)}
+def _seconds_of(spans: Iterable[Span]) -> float:
+    return sum(span.stop - span.start for span in spans)
+
+
+def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
+    """Pieces of ranges laid end to end that lie between two times of that line [s]."""
+    found, position = [], 0.0
+    for span in spans:
+        length = span.stop - span.start
+        start, stop = max(begin - position, 0.0), min(end - position, length)
+        if stop - start > 1e-9:
+            found.append(replace(span, start=span.start + start, stop=span.start + stop))
+        position += length
+    return found
 
 
 class _Ranges:
-    """Makes spans of the ranges of a configuration.
-
-    Args:
-        file: the configuration.
-        catalogue: the recordings.
-    """
+    """Makes spans of the ranges of a configuration."""
 
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
@@ -146,60 +174,51 @@ class _Ranges:
         self._kept: dict[str, Kept] = {}
 
     def split(self) -> Split:
-        """The split of the ranges."""
-        train, validation = self._spans("train", self._file.train or ()), self._spans(VALIDATION, self._file.validation or ())
-        tests = {test: self._spans(test, entries) for test, entries in (self._file.tests or {}).items()}
-        return Split(self._file.name, train, validation, tests, self._kept)
-
-    def fold(self, folds: FoldsFile) -> Split:
-        """The split of one fold of a cross-validation."""
-        file = self._file
+        """The split of the ranges, or of one fold of a cross-validation."""
+        file, folds = self._file, self._file.folds
+        if folds is None:
+            train, validation = self._spans("train", file.train), self._spans(VALIDATION, file.validation)
+            tests = {test: self._spans(test, entries) for test, entries in file.tests.items()}
+            return Split(file.name, train, validation, tests, self._kept)
         if file.train or file.validation or file.tests:
             raise ConfigurationError(f"{self._where}: folds make training, validation and test; leave train, validation and tests out")
-        dataset = _dataset_of(RangeFile(recordings=folds.recordings), file)
-        readers = {Span(dataset, name): self._reader(dataset, name) for name in self._matching(dataset, folds.recordings)}
-        train, validation, test = fold_of(blocks_of(folds, readers), folds, file.fold, self._where)
+        dataset = file.dataset_of()
+        recordings = ((Span(dataset, name), self._recording(dataset, name)) for name in self._matching(dataset, folds.recordings))
+        train, validation, test = fold_of(blocks_of(folds, recordings), folds, file.fold, self._where)
         return Split(f"{file.name}_fold_{file.fold + 1}", train, validation, {"test": test})
 
-    def limited(self, split: Split, minutes: float) -> Split:
+    def limited(self, split: Split) -> Split:
         """The split with fewer minutes to learn from, of which validation keeps its share."""
+        minutes, at = self._file.minutes, self._file.minutes_at
+        if minutes is None:
+            return split
+        train, validation = (tuple(self._with_ends(span) for span in spans) for spans in (split.train, split.validation))
+        share = 60.0 * minutes / (_seconds_of(train) + _seconds_of(validation))
+        named = replace(split, name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""))
+        if share >= 1.0:
+            return named
+        train, validation = (limit_minutes(spans, share * _seconds_of(spans), at) for spans in (train, validation))
+        return replace(named, train=train, validation=validation)
 
-        def bounds_of(span: Span) -> tuple[float, float]:
-            recording = self._reader(span.dataset, span.recording)(None)
-            return recording.start_time, recording.end_time
-
-        def length(spans: Sequence[Span]) -> float:
-            return sum(min(span.stop, bounds_of(span)[1]) - max(span.start, bounds_of(span)[0]) for span in spans)
-
-        at = self._file.minutes_at
-        train, validation = length(split.train), length(split.validation)
-        share = 60.0 * minutes / (train + validation)
-        return replace(
-            split,
-            name=f"{split.name}_{minutes:g}min" + (f"_at_{at:g}" if at else ""),
-            train=limit_minutes(split.train, share * train, at, bounds_of),
-            validation=limit_minutes(split.validation, share * validation, at, bounds_of),
-        )
+    def _with_ends(self, span: Span) -> Span:
+        recording = self._recording(span.dataset, span.recording)
+        return replace(span, start=max(span.start, recording.start_time), stop=min(span.stop, recording.end_time))
 
     def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
         """The spans of one role."""
         spans: list[Span] = []
         for entry in entries:
-            dataset = _dataset_of(entry, self._file)
+            dataset = self._file.dataset_of(entry)
             names = [entry.recording] if entry.recording is not None else self._matching(dataset, str(entry.recordings))
             whole = [Span(dataset, name, *self._bounds(dataset, name, entry)) for name in names]
-            if entry.keep is not None:
-                whole = self._cut(role, whole, entry.keep)
-            spans += whole
+            spans += whole if entry.keep is None else self._cut(role, whole, entry.keep)
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
         """Start and stop of an entry in one recording [s]."""
-        if entry.laps is None:
-            return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)
-        if (entry.start, entry.stop) != (-math.inf, math.inf):
-            raise ConfigurationError(f"{self._where}: a range has laps, or start and stop, not both: {_shown(entry)}")
-        return self._laps(dataset, name, entry.laps)
+        if entry.laps is not None:
+            return self._laps(dataset, name, entry.laps)
+        return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)
 
     def _time(self, dataset: str, name: str, bound: float | str) -> float:
         if not isinstance(bound, str):
@@ -210,7 +229,7 @@ class _Ranges:
             raise ConfigurationError(f"{self._where}: start and stop are {SECONDS_OR_SHARE}, not '{bound[:60]}'")
         if share in (0.0, 100.0):
             return -math.inf if share == 0.0 else math.inf
-        recording = self._reader(dataset, name)(None)
+        recording = self._recording(dataset, name)
         return recording.start_time + round(share / 100.0 * len(recording)) / recording.rate_hz
 
     def _laps(self, dataset: str, name: str, words: str) -> tuple[float, float]:
@@ -218,7 +237,7 @@ class _Ranges:
         if found is None:
             raise ConfigurationError(f"{self._where}: laps are first, last, first 3, last 2, a number, or 2 to 4, not '{words[:60]}'")
         end, number, first, last = found.groups()
-        laps = laps_of(self._reader(dataset, name)(None))
+        laps = laps_of(self._recording(dataset, name))
         count = int(number or 1)
         begin = int(first) if first else 1 if end == "first" else len(laps) - count + 1
         stop = int(last or first) if first else begin + count - 1
@@ -227,12 +246,11 @@ class _Ranges:
             raise ConfigurationError(f"{self._where}: recording '{name}' has no '{words.strip()}': {there}; name times instead")
         return laps[begin - 1][0], laps[stop - 1][1]
 
-    def _reader(self, dataset: str, name: str) -> Reader:
-        """Reads a recording that the data set has."""
+    def _recording(self, dataset: str, name: str, channels: Iterable[str] | None = None) -> Recording:
         recordings = self._recordings(dataset)
         if name not in recordings:
             raise ConfigurationError(f"{self._where}: data set '{dataset}' has no recording '{name}'")
-        return recordings[name]
+        return recordings[name](channels)
 
     def _matching(self, dataset: str, pattern: str) -> list[str]:
         """Names of a data set's recordings that fit a pattern, sorted."""
@@ -255,7 +273,7 @@ class _Ranges:
         spans: list[Span] = []
         seconds = of_seconds = 0.0
         for span in whole:
-            recording = self._reader(span.dataset, span.recording)(condition.magnitude)
+            recording = self._recording(span.dataset, span.recording, condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
             of_seconds += (end - first) / recording.rate_hz
             for begin, after in stretches_where(recording, condition, first, end):

@@ -15,11 +15,7 @@ TRAINING = "training"
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that cannot be part of a file's name.
-
-    Raises:
-        ConfigurationError: it holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot.
-    """
+    """Refuse, by a `ConfigurationError`, a name that holds anything but letters, digits, ``_``, ``-`` and ``.``, or starts with a dot."""
     if not re.fullmatch(r"[\w-][\w.-]*", name):
         raise ConfigurationError(f"{what}: '{name}' must be made of letters, digits, '_', '-' and '.', it becomes part of file names")
 
@@ -51,19 +47,12 @@ class Span:
 
 @dataclass(frozen=True)
 class Kept:
-    """Amount of driving that meets a condition.
+    """Amount of driving that meets a condition."""
 
-    Args:
-        n_recordings: number of recordings.
-        n_spans: number of stretches that were kept.
-        seconds: their time [s].
-        of_seconds: time of the recordings, or of their ranges [s].
-    """
-
-    n_recordings: int
-    n_spans: int
-    seconds: float
-    of_seconds: float
+    n_recordings: int  # number of recordings
+    n_spans: int  # number of stretches that were kept
+    seconds: float  # their time [s]
+    of_seconds: float  # time of the recordings, or of their ranges [s]
 
     def describe(self) -> str:
         """For messages and reports, for example ``61.2 of 90.0 min in 402 stretches of 161 recordings``."""
@@ -99,10 +88,8 @@ class Split:
     def __post_init__(self) -> None:
         if not (self.train or self.validation or self.tests):
             raise ConfigurationError(f"split '{self.name}' has no ranges at all")
-        if self.validation and not self.train:
-            raise ConfigurationError(f"split '{self.name}' has nothing to train on")
-        if self.train and not self.validation:
-            raise ConfigurationError(f"split '{self.name}' has nothing to validate on")
+        if bool(self.train) != bool(self.validation):
+            raise ConfigurationError(f"split '{self.name}' has nothing to {'validate' if self.train else 'train'} on")
         check_name(self.name, "split")
         for name, spans in self.tests.items():
             check_name(name, f"split '{self.name}': test set")

@@ -70,11 +70,7 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 
 
 def write_recording(recording: Recording, path: Path) -> None:
-    """Store one recording; the file appears complete or not at all.
-
-    Raises:
-        MissingError: the file cannot be written.
-    """
+    """Store one recording; the file appears complete or not at all. Raises `MissingError`: the file cannot be written."""
     about = _attributes(recording, _OF_RECORDING) | {"gappy": sorted(recording.gappy), "provenance": dict(recording.provenance)}
     _write(path, recording.channels, "recording", about)
 
@@ -95,11 +91,7 @@ def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recordi
 
 
 def is_stored_recording(path: Path) -> bool:
-    """Whether ``path`` is a Parquet file that vehest wrote as a recording.
-
-    Raises:
-        DataError: it is one, and its description is damaged.
-    """
+    """Whether ``path`` is a Parquet file that vehest wrote as a recording. Raises `DataError`: its description is damaged."""
     try:
         with parquet_file(path) as file:
             schema = file.schema_arrow
@@ -109,11 +101,7 @@ def is_stored_recording(path: Path) -> bool:
 
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
-    """Store one estimate, with its time column, so that other tools can read it as it is.
-
-    Raises:
-        MissingError: the file cannot be written.
-    """
+    """Store one estimate, with its time column, so that other tools can read it. Raises `MissingError`: the file cannot be written."""
     about = _attributes(estimate, _OF_ESTIMATE)
     columns = {"time": estimate.time, **estimate.channels}
     if estimate.covariance is not None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import NonNegativeFloat
 
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
@@ -14,77 +15,45 @@ from vehest.data.runs import true_runs
 
 @dataclass(frozen=True)
 class Bounds:
-    """Smallest and largest magnitude of a channel, both included, in its unit; None is no bound.
+    """Smallest and largest magnitude of a channel, both included, in its unit. Raises `ValueError`: no magnitude lies between them."""
 
-    Raises:
-        ValueError: there is none, or no magnitude lies between them.
-    """
-
-    at_least: float | None = None
-    at_most: float | None = None
+    at_least: float = 0.0
+    at_most: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.at_least is None and self.at_most is None:
-            raise ValueError("needs at_least, at_most or both")
-        if not 0.0 <= self.low <= self.high:
-            raise ValueError(f"no magnitude lies between {self.low:g} and {self.high:g}")
-
-    @property
-    def low(self) -> float:
-        """Smallest magnitude."""
-        return self.at_least or 0.0
-
-    @property
-    def high(self) -> float:
-        """Largest magnitude."""
-        return math.inf if self.at_most is None else self.at_most
+        if not 0.0 <= self.at_least <= self.at_most:
+            raise ValueError(f"no magnitude lies between {self.at_least:g} and {self.at_most:g}")
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What must hold at every sample of a stretch, and how long for.
+    """What must hold at every sample of a stretch, and how long for. Raises `ValueError`: there is no channel, or an unknown one."""
 
-    Args:
-        magnitude: channel -> bounds of its magnitude.
-        at_least_seconds: shortest stretch [s].
-
-    Raises:
-        ValueError: there is no channel, an unknown one, or the time is negative.
-    """
-
-    magnitude: dict[str, Bounds]
-    at_least_seconds: float = 0.0
+    magnitude: dict[str, Bounds]  # channel -> bounds of its magnitude
+    at_least_seconds: NonNegativeFloat = 0.0  # shortest stretch [s]
 
     def __post_init__(self) -> None:
         if not self.magnitude:
             raise ValueError("magnitude maps channels to {at_least, at_most}, and names none")
         for channel in self.magnitude.keys() - CHANNELS.keys():
             raise ValueError(f"there is no channel '{channel}'; see 'vehest data channels'")
-        if self.at_least_seconds < 0.0:
-            raise ValueError(f"at_least_seconds must be zero or positive, not {self.at_least_seconds:g}")
 
     def describe(self) -> str:
         """For messages, for example ``0 <= |ay| <= 7, 2 s or longer``."""
-        bounds = [f"{bounds.low:g} <= |{channel}| <= {bounds.high:g}" for channel, bounds in self.magnitude.items()]
+        bounds = [f"{bounds.at_least:g} <= |{channel}| <= {bounds.at_most:g}" for channel, bounds in self.magnitude.items()]
         return ", ".join([*bounds, f"{self.at_least_seconds:g} s or longer"])
 
 
-def stretches_where(recording: Recording, condition: Condition, first: int = 0, end: int | None = None) -> list[tuple[int, int]]:
+def stretches_where(recording: Recording, condition: Condition, first: int, end: int) -> list[tuple[int, int]]:
     """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not.
-
-    Args:
-        recording: as it is, at its own rate and unfiltered.
-        condition: what must hold.
-        first, end: samples to look at; by default all.
 
     Raises:
         DataError: the recording lacks a channel of the condition.
     """
-    end = len(recording) if end is None else end
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])
-        holds &= (size >= bounds.low) & (size <= bounds.high)
+        holds &= (size >= bounds.at_least) & (size <= bounds.at_most)
     edges = true_runs(holds) + first
     shortest = max(math.ceil(condition.at_least_seconds * recording.rate_hz - 1e-9), 1)
     return [(begin, after) for begin, after in edges.tolist() if after - begin >= shortest]

@@ -38,21 +38,12 @@ def read_text(path: Path) -> str:
 
 
 def read_yaml(path: Path) -> Any:
-    """Plain values of a YAML file.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is not YAML, nests too deep, or repeats itself into too many values.
-    """
+    """Plain values of a YAML file; raises what `read_text` and `parse_yaml` do."""
     return parse_yaml(read_text(path), f"'{path}'")
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Plain values of YAML.
-
-    Raises:
-        DataError: it is not YAML, nests too deep, or repeats itself into too many values.
-    """
+    """Plain values of YAML. Raises `DataError`: it is not YAML, nests too deep, or repeats itself into too many values."""
     try:
         _check_size(text, where)
         return yaml.load(text, _Loader)
@@ -81,21 +72,12 @@ def _check_size(text: str, where: str) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Plain values of a JSON file.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is not JSON, or nests too deep.
-    """
+    """Plain values of a JSON file; raises what `read_text` and `parse_json` do."""
     return parse_json(read_text(path), f"'{path}'")
 
 
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Plain values of JSON.
-
-    Raises:
-        DataError: it is not JSON, too long, or nests too deep.
-    """
+    """Plain values of JSON. Raises `DataError`: it is not JSON, too long, or nests too deep."""
     check_limit("text_bytes", len(text), f"{where} holds a description of {len(text)} bytes")
     try:
         return json.loads(text)
@@ -107,17 +89,16 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
     """Rows of a CSV file whose first line names its columns, such as vehest writes them.
 
     Raises:
-        MissingError: there is no such file.
-        DataError: it is not CSV, lacks a column, or a row is of another length.
+        DataError: it is not CSV, lacks a column, or a row is of another length; and what `read_text` raises.
     """
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
         rows, header = list(reader), list(reader.fieldnames or [])
     except (csv.Error, ValueError) as error:
         raise DataError(f"'{path}' cannot be read as CSV ({first_line(error)})") from None
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise DataError(f"'{path}' has no column '{missing[0]}'")
+    for name in columns:
+        if name not in header:
+            raise DataError(f"'{path}' has no column '{name}'")
     for number, row in enumerate(rows, start=1):
         if None in row or None in row.values():
             raise DataError(f"'{path}': data row {number} has not {len(header)} columns, as the first line has")
@@ -125,11 +106,7 @@ def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
 
 
 def number_in(row: Mapping[str, str], column: str, path: Path) -> float:
-    """A number in a row of `read_rows`.
-
-    Raises:
-        DataError: it is none.
-    """
+    """A number in a row of `read_rows`; raises a `DataError` where it is none."""
     try:
         return float(row[column])
     except ValueError:

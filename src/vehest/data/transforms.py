@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import scipy
+from pydantic import Field, PositiveFloat, PositiveInt
 
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derived import (
     AccelerationFromSpeed,
+    ChannelName,
     ScaleToWheelbase,
     SideslipFromVelocity,
     SpeedFromWheels,
@@ -22,8 +24,6 @@ from vehest.data.derived import (
     SteeringRatio,
     VelocityFromSideslip,
     derivative,
-    require_channel,
-    require_positive,
     speed_of_reference,
 )
 from vehest.data.errors import ConfigurationError, DataError
@@ -31,10 +31,8 @@ from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
 
-LONGEST_DIRECT = 8192
-"""Taps up to which a filter is summed sample by sample; longer ones through their spectra."""
-VALUES_AT_ONCE = 1 << 20
-"""Samples that are compared at a time, windows included."""
+LONGEST_DIRECT = 8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
+VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
 
 
 Transform = Callable[[Recording], Recording]
@@ -48,22 +46,19 @@ class Resample:
     nothing is shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th
     sample as it is (integer ratios only), as a slower sensor or a naive logger would.
 
-    Args:
-        rate_hz: the new rate [Hz].
-        method: ``polyphase`` or ``decimate``.
-
     Source:
         Crochiere & Rabiner, Multirate Digital Signal Processing, 1983; `scipy.signal.resample_poly`.
     """
 
-    rate_hz: float
-    method: Literal["polyphase", "decimate"] = "polyphase"
+    rate_hz: float  # the new rate [Hz]
+    method: Literal["polyphase", "decimate"] = "polyphase"  # ``polyphase`` or ``decimate``
     zero_crossings: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
     cutoff: ClassVar[float] = 0.86  # of the slower Nyquist frequency, where the stop band has then begun
 
     def __post_init__(self) -> None:
-        require_positive("resampling", rate_hz=self.rate_hz)
+        if not 0.0 < self.rate_hz < math.inf:
+            raise ConfigurationError(f"resampling: rate_hz must be a positive number, not {self.rate_hz:g}")
 
     def __call__(self, recording: Recording) -> Recording:
         """Resample every channel.
@@ -77,38 +72,28 @@ class Resample:
         what = f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
         check_limit("samples", expected, what)
         check_limit("memory", 8 * expected * len(recording.channels), f"{what} in each of {len(recording.channels)} channels")
-        up, down = self.ratio(recording)
+        exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
+        ratio = exact.limit_denominator(1000)
+        if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
+            what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
+            raise DataError(f"recording '{recording.id}': {what}")
+        up, down = ratio.numerator, ratio.denominator
         if up == down:
             return recording
-        n_out = -(-len(recording) * up // down)
         if self.method == "decimate":
             if up != 1:
                 what = f"plain decimation from {recording.rate_hz:g} to {self.rate_hz:g} Hz is not a whole ratio"
                 raise ConfigurationError(f"recording '{recording.id}': {what}; use method=polyphase")
             channels = {name: samples[::down] for name, samples in recording.channels.items()}
         else:
-            if recording.gappy:
-                what = f"channel '{sorted(recording.gappy)[0]}' has gaps and cannot be filtered"
-                raise DataError(f"recording '{recording.id}': {what}; use method=decimate or leave the channel out")
-            reach = self.zero_crossings * max(up, down)
-            ratio = f"resampling by {up}/{down}, from {recording.rate_hz:g} to {self.rate_hz:g} Hz"
-            check_limit("filter_samples", 2 * reach + 1, f"recording '{recording.id}': {ratio}, needs a filter of {2 * reach + 1} samples")
-            taps = self._taps(up, down)
-            channels = {name: _resampled(samples, up, down, taps)[:n_out] for name, samples in recording.channels.items()}
+            length = 2 * self.zero_crossings * max(up, down) + 1
+            check_limit(
+                "filter_samples", length, f"recording '{recording.id}': resampling by {up}/{down} needs a filter of {length} samples"
+            )
+            names, taps = _without_gaps(recording, tuple(recording.channels)), self._taps(up, down)
+            n_out = -(-len(recording) * up // down)
+            channels = {name: _resampled(recording[name], up, down, taps)[:n_out] for name in names}
         return replace(recording, rate_hz=self.rate_hz, channels=channels)
-
-    def ratio(self, recording: Recording) -> tuple[int, int]:
-        """Interpolation and decimation factors (up, down).
-
-        Raises:
-            DataError: the ratio is not one of small whole numbers.
-        """
-        exact = Fraction(self.rate_hz) / Fraction(recording.rate_hz)
-        ratio = exact.limit_denominator(1000)
-        if ratio == 0 or abs(ratio / exact - 1) > Fraction(1, 10**9):
-            what = f"{self.rate_hz:g} Hz from {recording.rate_hz:g} Hz is not a ratio of whole numbers up to 1000"
-            raise DataError(f"recording '{recording.id}': {what}")
-        return ratio.numerator, ratio.denominator
 
     def _taps(self, up: int, down: int) -> FloatArray:
         slower = max(up, down)
@@ -133,26 +118,18 @@ class LowPass:
     ``causal`` runs a second-order Butterworth filter forward, as a car would; ``zero_phase`` runs it both ways, offline. A ``fir`` is
     symmetric (a sinc under a Hamming window), so that it has no phase, and cannot be causal.
 
-    Args:
-        cutoff_hz: -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz].
-        channels: which channels; all measured ones if empty, never references.
-        direction: ``causal`` or ``zero_phase``.
-        design: ``butterworth`` or ``fir``.
-        reach: of a ``fir`` into past and future; the longer, the sharper its cut-off [s].
-
     Source: of the ``fir``, Oppenheim & Schafer, Discrete-Time Signal Processing, 2010, section 7.5.
     """
 
-    cutoff_hz: float
-    channels: tuple[str, ...] = ()
-    direction: Literal["causal", "zero_phase"] = "zero_phase"
-    design: Literal["butterworth", "fir"] = "butterworth"
-    reach: float = 0.3
+    cutoff_hz: float  # -3 dB frequency of one pass; -6 dB of a ``fir`` [Hz]
+    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
+    direction: Literal["causal", "zero_phase"] = "zero_phase"  # ``causal`` or ``zero_phase``
+    design: Literal["butterworth", "fir"] = "butterworth"  # ``butterworth`` or ``fir``
+    reach: PositiveFloat = 0.3  # of a ``fir`` into past and future; the longer, the sharper its cut-off [s]
 
     def __post_init__(self) -> None:
         if self.design == "fir" and self.direction == "causal":
             raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
-        require_positive("low-pass", reach=self.reach)
 
     def __call__(self, recording: Recording) -> Recording:
         """Filter the channels.
@@ -191,21 +168,13 @@ class LowPass:
 class RemoveOutliers:
     """Replace isolated spikes by the median of their neighbourhood (Hampel filter); offline.
 
-    Args:
-        half_window: samples on either side that count as neighbours.
-        threshold: how many scaled median absolute deviations make an outlier.
-        channels: which channels; all measured ones if empty, never references.
-
     Source:
         Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
     """
 
-    half_window: int = 5
-    threshold: float = 6.0
-    channels: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_positive("outlier removal", half_window=self.half_window, threshold=self.threshold)
+    half_window: PositiveInt = 5  # samples on either side that count as neighbours
+    threshold: PositiveFloat = 6.0  # how many scaled median absolute deviations make an outlier
+    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
 
     def __call__(self, recording: Recording) -> Recording:
         """Clean the channels.
@@ -242,25 +211,16 @@ class MountingCorrection:
     The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw`` about the vertical axis:
     a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l). With a lever arm it is offline: dω/dt is taken by central differences.
 
-    Args:
-        lever_x: forward offset of the sensor from the centre of gravity [m].
-        lever_y: leftward offset [m].
-        yaw: rotation of the sensor's axes against the vehicle's, counter-clockwise [rad].
-
     Source:
         Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section 3.2.
     """
 
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    yaw: float = 0.0
+    lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
+    lever_y: float = 0.0  # leftward offset [m]
+    yaw: float = 0.0  # rotation of the sensor's axes against the vehicle's, counter-clockwise [rad]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct ax and ay.
-
-        Raises:
-            DataError: ax, ay or yaw_rate is missing or has gaps.
-        """
+        """Correct ax and ay. Raises `DataError`: ax, ay or yaw_rate is missing or has gaps."""
         ax, ay, yaw_rate = (recording[name] for name in _without_gaps(recording, ("ax", "ay", "yaw_rate")))
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         rotated_x, rotated_y = cosine * ax - sine * ay, sine * ax + cosine * ay
@@ -275,16 +235,12 @@ class MountingCorrection:
 class ReferenceLever:
     """Move reference velocities from where their sensor sits to the centre of gravity: v_cg = v_sensor - ω × l.
 
-    Args:
-        lever_x: forward offset of the sensor from the centre of gravity [m].
-        lever_y: leftward offset [m].
-
     Source:
         Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C moves an optical sensor on the bumper so.
     """
 
-    lever_x: float = 0.0
-    lever_y: float = 0.0
+    lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
+    lever_y: float = 0.0  # leftward offset [m]
 
     def __call__(self, recording: Recording) -> Recording:
         """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate.
@@ -311,16 +267,12 @@ class DelayCorrection:
     frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
     interpolation, 16 samples, and by the delay at one of them.
 
-    Args:
-        delay: by how much the channels are late, negative if they are early [s].
-        channels: which channels; all measured ones if empty, never references.
-
     Source:
         Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing Magazine 13 (1), 1996.
     """
 
-    delay: float
-    channels: tuple[str, ...] = ()
+    delay: float  # by how much the channels are late, negative if they are early [s]
+    channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
     reach: ClassVar[int] = 16
     kaiser_beta: ClassVar[float] = 7.0
 
@@ -353,26 +305,12 @@ class DelayCorrection:
 
 @dataclass(frozen=True)
 class OffsetCorrection:
-    """Take constant offsets off channels.
+    """Take constant offsets off channels."""
 
-    Args:
-        offsets: channel -> offset of its sensor, in the channel's unit.
-    """
-
-    offsets: dict[str, float] = field(hash=False)
-
-    def __post_init__(self) -> None:
-        if not self.offsets:
-            raise ConfigurationError("offsets are a mapping from channels to values, such as {ax: 0.1}, and name none")
-        for name in self.offsets:
-            require_channel(name, "offset")
+    offsets: Annotated[dict[ChannelName, float], Field(min_length=1)] = field(hash=False)  # by channel, in its unit
 
     def __call__(self, recording: Recording) -> Recording:
-        """Subtract the offsets.
-
-        Raises:
-            DataError: a channel is missing.
-        """
+        """Subtract the offsets. Raises `DataError`: a channel is missing."""
         return recording.with_channels({name: recording[name] - value for name, value in self.offsets.items()})
 
 
@@ -400,15 +338,10 @@ OF_REFERENCES = frozenset({"reference_lever", "velocity_from_sideslip", "sidesli
 
 @dataclass(frozen=True)
 class Preparation:
-    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a model.
+    """How recordings are brought to an estimator's rate: ``downsample`` of a configuration or of a model."""
 
-    Args:
-        method: of `Resample`.
-        transforms: applied before, at the native rate, each by its ``name`` and its arguments.
-    """
-
-    method: Literal["polyphase", "decimate"] = "polyphase"
-    transforms: tuple[dict[str, Any], ...] = ()
+    method: Literal["polyphase", "decimate"] = "polyphase"  # of `Resample`
+    transforms: tuple[dict[str, Any], ...] = ()  # applied before, at the native rate, each by its ``name`` and its arguments
 
     def __post_init__(self) -> None:
         for entry in self.transforms:
@@ -420,11 +353,7 @@ class Preparation:
 
 
 def transform_from_config(config: Mapping[str, Any]) -> Transform:
-    """Build a transform from plain values: its ``name`` and its arguments.
-
-    Raises:
-        ConfigurationError: an unknown name or argument.
-    """
+    """Build a transform from plain values: its ``name`` and its arguments. Raises `ConfigurationError`: an unknown name or argument."""
     if not isinstance(config, Mapping):
         raise ConfigurationError(f"a transform is a mapping with a name, such as {{name: low_pass, cutoff_hz: 5}}, not {config!r}")
     arguments = {str(key): value for key, value in config.items() if key != "name"}
@@ -453,5 +382,6 @@ def _without_gaps(recording: Recording, names: tuple[str, ...]) -> tuple[str, ..
     chosen = names or tuple(name for name in recording.channels if not CHANNELS[name].is_reference)
     for name in chosen:
         if name in recording.gappy:
-            raise DataError(f"recording '{recording.id}': channel '{name}' has gaps and cannot be filtered; leave it out")
+            what = f"channel '{name}' has gaps and cannot be filtered"
+            raise DataError(f"recording '{recording.id}': {what}; leave it out, or resample with method=decimate")
     return chosen

@@ -19,18 +19,12 @@ class WindowSet:
     """All windows of N samples of some recordings, each with the target one step after it.
 
     Window i is ``series[starts[i] : starts[i] + n_window]``; it never crosses from one recording into the next.
-
-    Args:
-        series: channels as columns, recordings one after another, shape (T, C).
-        targets: target of each window, shape (W,).
-        starts: first row of each window, shape (W,).
-        n_window: samples N in a window.
     """
 
-    series: FloatArray
-    targets: FloatArray
-    starts: NDArray[np.int64]
-    n_window: int
+    series: FloatArray  # channels as columns, recordings one after another, shape (T, C)
+    targets: FloatArray  # target of each window, shape (W,)
+    starts: NDArray[np.int64]  # first row of each window, shape (W,)
+    n_window: int  # samples N in a window
 
     def __len__(self) -> int:
         return len(self.starts)

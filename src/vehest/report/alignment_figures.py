@@ -128,11 +128,11 @@ def _density(time: FloatArray, samples: FloatArray) -> tuple[FloatArray, FloatAr
 
 def _draw_residual(axes: Any, residual: Residual, *, last: bool) -> None:
     lines = [
-        ("before", residual.time_before, residual.before, residual.rms_before, _BEFORE),
-        ("after", residual.time_after, residual.after, residual.rms_after, _AFTER),
+        ("before", residual.time_before, residual.before, residual.rms["before"], _BEFORE),
+        ("after", residual.time_after, residual.after, residual.rms["after"], _AFTER),
     ]
     if residual.rest is not None:
-        lines.append(("rest", residual.time_after, residual.rest, residual.rms_rest, _REST))
+        lines.append(("rest", residual.time_after, residual.rest, residual.rms["rest"], _REST))
     for name, time, values, size, colour in lines:
         label = f"{LABELS[name]}: {significant(size)} {residual.unit} rms"
         axes.plot(*decimated(time, values, POINTS), color=colour, linewidth=0.7, label=label)

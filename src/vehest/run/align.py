@@ -47,7 +47,8 @@ def align_recording(source: str, overrides: Sequence[str], recording_id: str | N
 
 def in_words(alignment: Alignment, out: Path | None) -> Lines:
     """An alignment for a terminal; ``out`` is where it was written."""
-    first = f"{alignment.recording_id}: {alignment.kind}, {alignment.duration:.6g} s at {alignment.rate_hz:g} Hz; nothing is applied"
+    drive = alignment.recording
+    first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; nothing is applied"
     lines: Lines = [first, _parameters(alignment)]
     if alignment.residuals:
         lines += ["", _residuals(alignment)]
@@ -63,17 +64,18 @@ def override_of(alignment: Alignment) -> str:
 
 def as_plain(alignment: Alignment) -> dict[str, Any]:
     """All figures as plain values, SI units throughout."""
-    correlation = alignment.correlation
+    drive, correlation = alignment.recording, alignment.correlation
     return {
-        "recording": alignment.recording_id,
-        "kind": alignment.kind,
-        "rate_hz": alignment.rate_hz,
-        "duration": alignment.duration,
+        "recording": drive.id,
+        "kind": drive.kind,
+        "rate_hz": drive.rate_hz,
+        "duration": drive.duration,
         "estimated": alignment.settings.estimate,
         "cutoff_hz": alignment.settings.cutoff_hz,
         "parameters": [_plain_parameter(parameter) for parameter in alignment.parameters],
         "residuals": [
-            {key: getattr(one, key) for key in ("channel", "unit", "rms_before", "rms_after")} | {"rms_without_tilt": one.rms_rest}
+            {"channel": one.channel, "unit": one.unit}
+            | {"rms_before": one.rms["before"], "rms_after": one.rms["after"], "rms_without_tilt": one.rms["rest"]}
             for one in alignment.residuals
         ],
         "correlation": None if correlation is None else {"of": correlation.signal, "peak": correlation.peak, "value": correlation.highest},
@@ -99,7 +101,7 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
     others = sorted(path.name for path in folder.iterdir() if path.name not in FILES) if folder.is_dir() else []
     if others:
         raise ConfigurationError(f"folder '{folder}' holds other files ('{others[0]}'); name a new one")
-    recording = {"recording": alignment.recording_id, "kind": alignment.kind}
+    recording = {"recording": alignment.recording.id, "kind": alignment.recording.kind}
     table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
     texts = (_report(alignment), table.to_csv(index=False, lineterminator="\n"), _transforms(alignment))
     figures = figure_files(alignment_figure(alignment))
@@ -138,7 +140,7 @@ def _parameters(alignment: Alignment) -> TerminalTable:
 def _residuals(alignment: Alignment) -> TerminalTable:
     rows = []
     for own in alignment.residuals:
-        sizes = (f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in (own.rms_before, own.rms_after, own.rms_rest))
+        sizes = (f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values())
         rows.append([own.channel, *sizes, own.unit])
     return TerminalTable("", ("residual rms", "before", "after", "and without tilt", "unit"), rows)
 
@@ -148,7 +150,7 @@ def _report(alignment: Alignment) -> str:
 
     shown = in_words(alignment, None)[:-1]  # without the override, which stands below
     parts = [
-        f"# Alignment of {as_text(alignment.recording_id)}",
+        f"# Alignment of {as_text(alignment.recording.id)}",
         f"Estimated: {', '.join(alignment.settings.estimate)}. Both sides are low-passed at {alignment.settings.cutoff_hz:g} Hz.",
         *(as_text(one) if isinstance(one, str) else _markdown(one) for one in shown),
         "Transforms that would correct it, in this order, for `downsample`:",

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.by_name import BY_NAME_ALONE, named_channels
-from vehest.alignment.proposals.columns import Candidate, candidates, correlation, largest, si_factor, slow_of
-from vehest.alignment.proposals.fitting import CLEAR, Agreement, fitting_channels, longitudinal, may_be_ax
-from vehest.alignment.proposals.names import STRONG
+from vehest.alignment.proposals.columns import UNITS, Candidate, candidates, correlation, largest, si_factor, slow_of
+from vehest.alignment.proposals.fitting import CLEAR, REFERENCES, Agreement, fitting_channels, longitudinal, may_be_ax
+from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered, is_reference
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.turning import CLOSE, RARE, Search, Turning, find_turning, reference_speed, repeated, turning_by_names
+from vehest.alignment.proposals.turning import CLOSE, FAR, RARE, Search, Turning, find_turning, reference_speed, repeated, turning_by_names
 from vehest.alignment.proposals.wheels import Wheels, find_wheels, speed_of_wheels, turning_left, wheel_proposals
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
@@ -28,7 +27,18 @@ RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 40
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
-REFERENCES = {"vy_ref", "sideslip_ref"}
+USUAL = {  # 99th percentile of the motion's channels, SI
+    "vx": (1.0, 90.0),
+    "yaw_rate": (0.03, 3.0),
+    "ay": (0.5, 25.0),
+    "ax": (0.3, 25.0),
+    "handwheel": (0.2, 14.0),
+    "steer": (0.01, 0.7),
+    "vy_ref": (0.02, 8.0),
+    "sideslip_ref": (0.002, 0.8),
+}
+BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
+"""Channels that no relation is known of."""
 
 
 def propose(
@@ -55,7 +65,7 @@ def propose(
     proposals = _assigned(found, search, wheels)
     notes = [*proposals.notes]
     known = search.known if search else None
-    if not REFERENCES & set(proposals.by_channel):
+    if not set(REFERENCES) & set(proposals.by_channel):
         proposals = replace(proposals, pose=find_pose(found, known))
         named = [f"'{one.name}'" for one in named_pose(found)]
         if len(named) == 3 and not proposals.pose:
@@ -71,12 +81,7 @@ def propose(
 
 
 def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposals:
-    """Without channels by name alone whose values no vehicle can have; those of the motion are asked there.
-
-    Args:
-        proposals: for a log.
-        columns: of that log, or of another one of the same car: name -> values, (T,).
-    """
+    """Without channels by name alone whose values no vehicle can have, in columns (T,) of any log of the car; others are asked there."""
     kept, notes = [], list(proposals.notes)
     for one in proposals.channels:
         beyond = one.beyond(columns[one.column])
@@ -161,35 +166,72 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         made, radius = wheel_proposals(wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made)
         found |= {one.channel: one for one in made}
         free = [one for one in free if one not in wheels.values()]
-    found |= {one.channel: one for one in named_channels(free, found, moves=search is not None)}
+    found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
     gappy = {column.name for column in columns if column.gappy}
     channels = tuple(replace(one, gappy=one.column in gappy) for one in found.values())
     return Proposals(channels, wheel_radius=radius, notes=notes)
 
 
+def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, moves: bool) -> list[Proposal]:
+    """Channels that only names suggest, of columns that are left beside the channels that are held; ``moves``: the motion is known.
+
+    Channels of the motion are asked: had they agreed with the others, they would not be left. `BY_NAME_ALONE` are taken where
+    the header gives their unit, or where only one is known.
+    """
+    found: dict[str, Proposal] = {}
+    has_wheels = any(name.startswith("wheel_speed") for name in held)
+    for channel in USUAL:
+        least = STRONG if moves else WEAK
+        named = [one for one in columns if one.hints.get(channel, 0.0) >= least and one.measures(channel)]
+        needless = (channel == "steer" and "handwheel" in {*held, *found}) or (channel == "vx" and has_wheels and moves)
+        if not named or channel in held or needless:
+            continue
+        best = max(named, key=lambda one: (one.hints[channel], not is_filtered(one.name), not is_reference(one.name)))
+        if best.name not in {one.column for one in found.values()}:
+            found[channel] = _by_name(best, channel)
+    for column in columns:
+        for channel in BY_NAME_ALONE:
+            is_sure = (column.unit or channel == "motor_current") and column.measures(channel)
+            if is_sure and channel in column.hints and channel not in {*held, *found}:
+                evidence = "its name and unit" if column.unit else "its name"
+                found[channel] = Proposal(column.name, channel, column.unit or CHANNELS[channel].unit, 1, (evidence,))
+    return list(found.values())
+
+
+def _by_name(column: Candidate, channel: str) -> Proposal:
+    """With the header's unit, or the first in which the column is of a usual size, or at least of a possible one."""
+    if column.unit:
+        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), "sign", others=UNITS[channel])
+    size, (low, high) = largest(column.values), USUAL[channel]
+    sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
+    fitting = [unit for unit, own in sizes.items() if low <= own <= high]
+    fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]
+    evidence = f"its name, and {size:.3g} for its 99th percentile"
+    asked = "unit and sign: nothing to hold it against"
+    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), asked, others=UNITS[channel])
+
+
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
     """Speed, yaw rate and lateral acceleration, without a speed that was made of wheels."""
+    is_close = abs(math.log(turning.scale)) < FAR
     if "ay" in turning.columns:
         evidence = f"ay and vx·yaw_rate agree {turning.correlation:.2f}, ay {turning.scale:.3g} times as large in these units"
         asked = "" if turning.decided else "other units explain the scale as well"
-        if not turning.is_close:
+        if not is_close:
             asked = f"ay is {turning.scale:.2g} times as large as vx·yaw_rate: one of the three is in another unit"
     else:
         evidence = "its name and unit" if turning.decided else "its name and size"
         asked = "" if turning.decided else "unit: no lateral acceleration ties speed and yaw rate together"
     for channel, column in turning.columns.items():
         if not column.is_made:
-            doubt = "" if column.unit and "ay" in turning.columns and turning.is_close else asked
+            doubt = "" if column.unit and "ay" in turning.columns and is_close else asked
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
             yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:
-    """The three of turning asked where no name or unit speaks for two of them, and nothing else agrees with them.
-
-    yaw_rate ≈ steer·vx / wheelbase looks like ay ≈ vx·yaw_rate in other units.
-    """
+    """The three of turning asked where no name, unit or other column speaks for them: yaw_rate ≈ steer·vx / wheelbase looks alike."""
     named = any(one.unit or channel in one.hints for channel, one in turning.columns.items() if channel != "vx")
     confirmed = any(channel in found and not found[channel].asked for channel in ("ax", *REFERENCES))
     if named or confirmed or "ay" not in turning.columns:
@@ -216,10 +258,7 @@ def _left_and_right(
 
 
 def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, compass: str, west_positive: bool) -> Iterator[tuple[str, float]]:
-    """Of wheels, of a column that counts the heading clockwise, and of the course over latitude and longitude.
-
-    Each is a text with a place for the sign of the yaw rate, and a correlation that has the sign by which it counts to the left.
-    """
+    """Texts with a place for the sign of the yaw rate, and correlations with the sign by which it counts to the left."""
     yield "right wheels are faster where yaw_rate, sign {}, counts up", turning_left(wheels, known)
     for column in columns:
         if column.name == compass:

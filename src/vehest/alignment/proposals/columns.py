@@ -24,7 +24,6 @@ MOST_STRAY = 0.002
 LONG = 1000  # samples
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
-POSITIONS = {"latitude", "longitude", "position_x", "position_y"}
 UNITS = {  # where the header is silent, the likeliest first
     "vx": ("m/s", "km/h", "mph", "knots"),
     "yaw_rate": ("rad/s", "deg/s"),
@@ -76,19 +75,14 @@ def si_factor(unit: str, channel: str) -> float:
 
 
 def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -> list[Candidate]:
-    """Columns that change, are mostly there, and are neither clocks nor distances.
-
-    Args:
-        columns: name, unit as vehest spells it (empty where unknown), values on an even clock, (T,) each.
-        rate_hz: of that clock.
-    """
+    """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
     found = []
     for name, unit, values in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)
         if 1.0 - known.mean() > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
         only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
-        if only_grows and not POSITIONS & set(hints(name)):
+        if only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(hints(name)):
             continue
         gappy = not known.all()
         known[known] = ~_stray(values[known])

@@ -28,7 +28,7 @@ SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 HARDLY = "the motion hardly decides it"
 SAME_ANGLE = 0.9  # correlation of a sideslip angle with atan2(vy, vx)
-LATERAL = ("vy_ref", "sideslip_ref")
+REFERENCES = ("vy_ref", "sideslip_ref")
 LARGEST = {"steer": 0.8, "handwheel": 16.0}  # rad
 STRAIGHT_AHEAD = 0.1  # rad that a road wheel may show there, of an angle
 LENGTHS = {"steer": (1.2, 7.0), "handwheel": (12.0, 130.0)}  # m, wheelbase, and that times the ratio, of cars
@@ -83,14 +83,14 @@ def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ..
         search.free.remove(offer.column)
     left = [[offer for offer in row if offer and offer.column in search.free] for row in offers]
     proposals = {offer.proposal.channel: _with_rivals(offer, left[row]) for row, offer in chosen.items()}
-    held = set(LATERAL) & set(proposals)
+    held = set(REFERENCES) & set(proposals)
     others = [offer for offer in left[2] if held and offer.proposal.channel not in held]
     second = max(others, key=lambda one: one.score, default=None)
     if second is None or second.score < SECOND:
         return proposals, ()
     search.free.remove(second.column)
     columns_of = {offer.proposal.channel: offer.column for offer in (chosen[2], second)}
-    velocity, angle = (columns_of[channel] for channel in LATERAL)
+    velocity, angle = (columns_of[channel] for channel in REFERENCES)
     proposals[second.proposal.channel] = second.proposal
     forward = slow_of(search.known.vx, search.known.rate_hz)
     moving = forward > 0.2 * forward.max()
@@ -174,14 +174,14 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     is_named_otherwise = STRONG in column.hints.values()
     found = [
         agreement(known, column, channel, unit, f"d({channel})/dt")
-        for channel in LATERAL
+        for channel in REFERENCES
         if column.measures(channel) and (column.hints.get(channel) == STRONG or not is_named_otherwise)
         for unit in column.units(channel)
     ]
     found = sorted((one for one in found if _is_plausible(known, column, one)), key=lambda one: 0.3 * one.mismatch - 2.0 * one.strength)
     if not found:
         return None
-    hints = {channel: column.hints.get(channel, 0.0) for channel in LATERAL}
+    hints = {channel: column.hints.get(channel, 0.0) for channel in REFERENCES}
     best = max(found, key=lambda one: 4.0 * one.strength - 0.6 * min(one.mismatch, 5.0) + hints[one.channel])
     hint = hints[best.channel]
     rivals = [one for one in found if one.channel != best.channel and one.strength > best.strength - 0.05 and not hint]
@@ -189,7 +189,7 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     asked = f"could be {rivals[0].channel} in {rivals[0].unit} as well" if rivals else "" if is_clear else HARDLY
     if not best.strength and not column.unit:
         asked = f"sign and unit: {HARDLY}"
-    evidence = (best.in_words or "its name alone", *_name_evidence(column, *LATERAL))
+    evidence = (best.in_words or "its name alone", *_name_evidence(column, *REFERENCES))
     others = tuple(dict.fromkeys(f"{one.channel} {one.unit}" for one in found if one is not best)) if asked else ()
     proposal = Proposal(column.name, best.channel, best.unit, best.sign, evidence, asked, others=others)
     return Offer(_score(best.strength, LEAST, hint), column, proposal)
@@ -217,18 +217,9 @@ def longitudinal(known: Motion, column: Candidate, units: Sequence[str] = ()) ->
 
 
 def agreement(known: Motion, column: Candidate, channel: str, unit: str, left: str, *, offset: float = 0.0) -> Agreement:
-    """Agreement of a column with a motion.
-
-    Args:
-        known: the motion.
-        column: to be compared.
-        channel: that it may be.
-        unit: of the column.
-        left: side of the relation that it is compared by.
-        offset: taken off the column first, in its unit.
-    """
+    """Agreement with a motion of a column, less an offset in its unit, as a channel, by the relation with that left side."""
     samples = (column.values - offset) * si_factor(unit, channel)
-    velocity = channel if channel in ("vy_ref", "sideslip_ref") else ""
+    velocity = channel if channel in REFERENCES else ""
     with np.errstate(all="ignore"):
         relations = relations_of(replace(known, channels={**known.channels, channel: samples}, velocity=velocity))
     for one in relations:

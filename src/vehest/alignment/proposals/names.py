@@ -1,7 +1,4 @@
-"""Roles that a column's name suggests: English and German, in full and as loggers shorten them. A name is a hint and decides little alone.
-
-They are names of channels, and ``heading``, ``latitude``, ``longitude``, ``position_x``, ``position_y`` and ``other``.
-"""
+"""Roles that a name suggests: channels, ``heading``, ``latitude``, ``longitude``, ``position_x`` and ``_y``, ``other``."""
 
 from __future__ import annotations
 
@@ -17,14 +14,11 @@ _STRONG = {  # over the name without blanks
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
     "yaw_rate": r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
-    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|"
-    r"linearaccelerationy|yacc|glat|^gy$|quera|accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|"
-    r"ayvehicle",
-    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|"
-    r"along$|^along|algt|linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|"
-    r"longg$|lonacc|acclon|gforcelon|axvehicle",
-    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|"
-    r"volant",
+    "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|"
+    r"accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
+    "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
+    r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle",
+    "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",

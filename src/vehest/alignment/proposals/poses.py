@@ -29,12 +29,7 @@ def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
 
 
 def find_pose(columns: Sequence[Candidate], known: Motion | None) -> tuple[tuple[str, str, str], ...]:
-    """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty where there is none.
-
-    Args:
-        columns: of the log.
-        known: the motion; without one nothing shows that positions are the car's.
-    """
+    """Part, column and unit of a pose whose derivatives are the known speed and yaw rate; empty where there is none, or no motion."""
     pose = named_pose(columns)
     if known is None or len(pose) < len(PARTS) or pose[0].unit not in ("", *LENGTHS) or not pose[2].measures("sideslip_ref"):
         return ()

@@ -48,11 +48,6 @@ class Turning:
     score: float = 0.0  # of all evidence
 
     @property
-    def is_close(self) -> bool:
-        """Whether the units explain the scale, or nearly."""
-        return abs(math.log(self.scale)) < FAR
-
-    @property
     def signs(self) -> dict[str, int]:
         """Channel -> sign by which the car drives ahead and ay is +vx·yaw_rate."""
         ahead = -1 if float(np.median(self.columns["vx"].slow)) < 0.0 else 1

@@ -25,8 +25,7 @@ AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
 APART = 0.25
 
-Wheels = Mapping[str, Candidate]
-"""Corner -> the column that is named as its speed."""
+Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 
 
 def find_wheels(columns: Sequence[Candidate]) -> Wheels:
@@ -47,10 +46,7 @@ def turning_left(wheels: Wheels, known: Motion) -> float:
 
 
 def speed_of_wheels(columns: Sequence[Candidate], wheels: Wheels, rate_hz: float) -> list[Candidate]:
-    """The mean of the wheels in m/s, where there are some and no column may be a speed.
-
-    Unit and radius are those that make ay = vx·yaw_rate with the likeliest columns of these.
-    """
+    """The mean of the wheels in m/s, where no column may be a speed, by the unit and radius that make ay = vx·yaw_rate."""
     if not wheels or any("vx" in column.hints for column in columns):
         return []
     mean = _mean(wheels)
@@ -73,14 +69,7 @@ def speed_of_wheels(columns: Sequence[Candidate], wheels: Wheels, rate_hz: float
 
 
 def wheel_proposals(wheels: Wheels, known: Motion | None, *, has_speed: bool, is_made: bool) -> tuple[list[Proposal], float | None]:
-    """A channel each, and the rolling radius by which they make the speed; None where it is not needed.
-
-    Args:
-        wheels: one at least.
-        known: the motion.
-        has_speed: whether the speed has a column.
-        is_made: whether the motion's speed was made of the wheels.
-    """
+    """A channel each, and the rolling radius by which they make the speed, if it has no column; of it, the motion's may be made."""
     mean, units = _mean(wheels), _units(wheels)
     evidence, radius = ["its name"], NOMINAL_RADIUS
     if known is None:
