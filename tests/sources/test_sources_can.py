@@ -93,11 +93,11 @@ def test_one_bus_of_several_is_taken(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, r"has no signal 'Speed.VehSpeed' \(near it: Speed.VehSpd\)"),
+        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, r"no signal 'Speed.VehSpeed' \(near it: Speed.VehSpd,"),
         ({"channels": {"vx": {"column": "Counter", "unit": "m/s"}}}, "stands in several messages; write one of IMU.Counter, Speed.Counter"),
         ({"channels": {"steer": {"column": "SteerAng", "unit": "deg"}}}, "'SteerAng' for channel 'steer' never occurs"),
         ({"channels": {"vx": {"column": "VehSpd", "unit": "m/s"}}}, "'km/h' by the file and in 'm/s' by conf/dataset"),
-        ({"channels": {"vx": {"column": "VehSpd", "unit": "km/h", "invalid": ["SNA"]}}}, "invalid must list raw values"),
+        ({"channels": {"vx": {"column": "VehSpd", "unit": "km/h", "invalid": ["SNA"]}}}, "invalid must be raw values"),
         ({"dbc": None}, "dbc must name the DBC file"),
         ({"dbc": "/nowhere/car.dbc"}, "there is no file '/nowhere/car.dbc'"),
         ({"rate_hz": 50}, "faster than the raster"),

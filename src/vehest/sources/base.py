@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import vehest.sources as package
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
@@ -274,29 +274,6 @@ def existing_folder(path: Any, dataset: str) -> Path:
     if not folder.is_dir():
         raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
     return folder
-
-
-def matching_files(dataset: Mapping[str, Any], default: str) -> list[Path]:
-    """Files in a data set's ``path`` that match its ``files``, in alphabetical order; their stems are recordings' names.
-
-    Args:
-        dataset: its configuration.
-        default: pattern if it names none.
-
-    Raises:
-        MissingError: there is no folder, or no file matches.
-        DataError: two files have the same stem.
-    """
-    name = str(dataset.get("name", "unnamed"))
-    folder, pattern = existing_folder(dataset.get("path"), name), str(dataset.get("files", default))
-    files = sorted(file for file in folder.glob(pattern) if file.is_file())
-    if not files:
-        raise MissingError(f"data set '{name}': no file in '{folder}' matches '{pattern}'")
-    stems = [file.stem for file in files]
-    doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if doubled:
-        raise DataError(f"data set '{name}': two files are called '{doubled[0]}', a recording's name must be unique")
-    return files
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:

@@ -118,6 +118,19 @@ def unevenness(stamps: FloatArray) -> str:
     return ""
 
 
+def require_no_gap(times: FloatArray, limit: float, where: str) -> None:
+    """Refuse increasing times [s], shape (T,), that are further apart than the limit [s].
+
+    Raises:
+        DataError: they are; ``where`` names file and signal.
+    """
+    steps = np.diff(times)
+    at = int(np.argmax(steps))
+    if steps[at] > limit:
+        what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > limit).sum()} above {limit:.6g} s"
+        raise DataError(f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time")
+
+
 @dataclass(frozen=True)
 class Clock:
     """A uniform clock, and how to bring samples onto it.
