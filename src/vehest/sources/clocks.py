@@ -118,6 +118,18 @@ def unevenness(stamps: FloatArray) -> str:
     return ""
 
 
+def require_finite(values: FloatArray, times: FloatArray, where: str) -> None:
+    """Refuse samples, shape (T,), that are no finite numbers.
+
+    Raises:
+        DataError: they are; ``where`` names file and signal.
+    """
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are invalid or no finite numbers"
+        raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
+
+
 def require_no_gap(times: FloatArray, limit: float, where: str) -> None:
     """Refuse increasing times [s], shape (T,), that are further apart than the limit [s].
 
@@ -186,8 +198,8 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     start, elapsed, intervals = float(stamps[0]), float(stamps[-1] - stamps[0]), len(stamps) - 1
     if policy == "uniform":
         nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
-        sampled = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
-        return Clock(float(sampled.times[0]), plain_rate(float(sampled.rate_hz or 0.0), min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
+        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+        return Clock(float(times[0]), plain_rate(rate, min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
     if policy == "interpolate":
         rate = plain_rate(1.0 / mean_step(np.diff(stamps)), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
@@ -198,30 +210,9 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     return Clock(start, plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4)), len(stamps))
 
 
-@dataclass(frozen=True)
-class SampleTimes:
-    """Times of samples and how their stamps scatter about them.
-
-    Args:
-        times: strictly increasing [s], shape (T,).
-        rate_hz: the rate found [Hz]; None where the stamps themselves are the times.
-        jitter: root mean square of stamp minus time [s]; of the intervals where the stamps themselves are the times.
-    """
-
-    times: FloatArray
-    rate_hz: float | None
-    jitter: float
-
-
-def stamped_times(stamps: FloatArray, where: str) -> SampleTimes:
-    """The stamps [s], shape (T,), themselves as times; raises `DataError` as `require_clock` does."""
-    require_clock(stamps, where, "repair or cut the range out, or take clock: uniform if samples come in batches")
-    return SampleTimes(stamps, None, float(np.diff(stamps).std()))
-
-
 def uniform_times(
     stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = "cut the range out or set clock: stamps"
-) -> SampleTimes:
+) -> tuple[FloatArray, float, float]:
     """Times of a sensor that samples evenly, from time stamps with software delay.
 
     A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled
@@ -233,6 +224,9 @@ def uniform_times(
         where: file and topic, for messages.
         tolerated: wandering of the stamps about the line that does not matter [s].
         fix: what to do where samples are missing, for messages.
+
+    Returns:
+        times [s], shape (T,), the rate found [Hz], and the root mean square of stamps minus times [s].
 
     Raises:
         DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
@@ -259,7 +253,7 @@ def uniform_times(
             f"{where}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of {found:.6g} Hz about "
             f"{stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
         )
-    return SampleTimes(times, found, float(np.sqrt(np.mean(np.square(late)))))
+    return times, found, float(np.sqrt(np.mean(np.square(late))))
 
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:

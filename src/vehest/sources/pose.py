@@ -4,17 +4,52 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy import signal
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 
 UpAxis = Literal["y", "z"]
-POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
+PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
+POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
 """Channels that poses give."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How reference channels are made of poses; see `planar_motion`.
+
+    Args:
+        window: samples of the Savitzky-Golay filter.
+        order: of its polynomial.
+        lever_x: from the rigid body's origin forward to the reference point [m].
+        lever_y: to the left [m].
+        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
+    """
+
+    window: int = 9
+    order: int = 2
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    channels: tuple[PoseChannel, ...] = POSE_CHANNELS
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.order < self.window or self.window % 2 == 0:
+            raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
+
+    def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, mounting_yaw: float, where: str) -> PlanarMotion:
+        """Motion of the reference point; arguments as `planar_motion` has them.
+
+        Raises:
+            DataError: there are fewer poses than the window holds.
+        """
+        if len(yaw) < self.window:
+            raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
+        lever = (self.lever_x, self.lever_y)
+        return planar_motion(positions, yaw, interval, window=self.window, order=self.order, mounting_yaw=mounting_yaw, lever=lever)
 
 
 @dataclass(frozen=True)
@@ -105,18 +140,3 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
         plane = np.stack([positions[:, 0], -positions[:, 2]], axis=1)
         y, z = -z, y
     return plane, np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def require_filter(window: Any, order: Any, where: str) -> tuple[int, int]:
-    """Window and order of a Savitzky-Golay filter as a data set declares them; raises `ConfigurationError` where they are none."""
-    if not isinstance(window, int) or not isinstance(order, int) or not 1 <= order < window or window % 2 == 0:
-        raise ConfigurationError(f"{where}: window must be an odd number of samples above an order of 1 or more, not {window} and {order}")
-    return window, order
-
-
-def require_pose_channels(names: Any, where: str) -> tuple[str, ...]:
-    """Channels of poses as a data set declares them; raises `ConfigurationError` for another one."""
-    unknown = [name for name in names if name not in POSE_CHANNELS] if isinstance(names, list | tuple) else [names]
-    if unknown:
-        raise ConfigurationError(f"{where}: channels must be a list of {', '.join(POSE_CHANNELS)}, not '{unknown[0]}'")
-    return tuple(names)

@@ -20,7 +20,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
-from vehest.sources.clocks import SLACK, Clock, at_ticks, common_ticks, on_nearest, require_no_gap, uniform_clock
+from vehest.sources.clocks import SLACK, Clock, at_ticks, common_ticks, on_nearest, require_finite, require_no_gap, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.unit_spellings import require_unit
@@ -165,12 +165,7 @@ class SignalSource(FileSource):
         first = max(int(np.searchsorted(signal.stamps, ticks[0] + near, side="right")) - 1, 0)
         last = int(np.searchsorted(signal.stamps, ticks[-1] - near, side="left"))
         times, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            raise DataError(
-                f"{where} holds {len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or are "
-                f"no finite numbers; cut the range out of the measurement, or declare the channel gappy"
-            )
+        require_finite(values, times, where)
         declared = self.channels[name]
         require_no_gap(times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where)
         if np.array_equal(times, stamps):

@@ -7,14 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from vehest.constants import FloatArray
-from vehest.data.channels import channel
-from vehest.data.errors import VehestError
-from vehest.data.units import factor_to_si
-from vehest.sources.columns import Column
-from vehest.sources.pose import POSE_CHANNELS, UpAxis, require_filter, require_pose_channels
-
-Positive = Annotated[float, Field(gt=0.0)]
+from vehest.sources.columns import Positive
+from vehest.sources.pose import PoseOptions, UpAxis
 
 
 @dataclass(frozen=True)
@@ -70,41 +64,22 @@ class BagChannel:
     factor: float = 1.0
     offset: float = 0.0
 
-    def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
-        """Values in SI units and ISO 8855 signs."""
-        column = Column(self.field, self.unit, self.sign, self.factor)
-        return column.to_si(values - self.offset if self.offset else values, si_unit)
-
 
 @dataclass(frozen=True)
-class Pose:
-    """How the reference is made of poses; see `vehest.sources.pose.planar_motion`.
+class Pose(PoseOptions):
+    """Where poses stand.
 
     Args:
         topic: the topic's name in the data set.
         field: path of a geometry_msgs/Pose in the message.
         up: upward axis of the world and of the rigid body.
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
         yaw: from the rigid body's x axis to the car's forward axis [rad].
-        lever_x: from the rigid body's origin forward to the reference point [m].
-        lever_y: from the rigid body's origin left to the reference point [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
     """
 
     topic: str
     field: str = "pose"
     up: UpAxis = "z"
-    window: int = 9
-    order: int = 2
     yaw: float = 0.0
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    channels: tuple[str, ...] = POSE_CHANNELS
-
-    def __post_init__(self) -> None:
-        require_filter(self.window, self.order, "pose")
-        require_pose_channels(self.channels, "pose")
 
 
 @dataclass(frozen=True)
@@ -132,13 +107,6 @@ class RosbagOptions:
         for topic in [*(declared.topic for declared in channels.values()), *([self.pose.topic] if self.pose else [])]:
             if topic not in topics:
                 raise ValueError(f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}")
-        for name, declared in channels.items():
-            try:
-                factor_to_si(declared.unit, channel(name).unit)
-            except VehestError as error:
-                raise ValueError(f"channel '{name}': {error}") from None
-            if declared.factor == 0:
-                raise ValueError(f"channel '{name}': factor must be a number other than 0")
         if self.pose and topics[self.pose.topic].average:
             raise ValueError(f"orientations cannot be averaged; leave average out of topic '{self.pose.topic}'")
         if doubled := sorted(set(channels) & set(self.pose.channels if self.pose else ())):
