@@ -427,7 +427,7 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
         # what only the message types can tell
         (
             {"channels": {"vx": CHANNELS["vx"] | {"field": "motor.speed"}}},
-            "'car_msgs/msg/Motor' has no field 'speed' (it has rpm, currents",
+            "has no field 'motor.speed': 'speed' is none of: rpm, currents",
         ),
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),

@@ -126,7 +126,7 @@ def require_finite(values: FloatArray, times: FloatArray, where: str) -> None:
     """
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
-        what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are invalid or no finite numbers"
+        what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
         raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
 
 
