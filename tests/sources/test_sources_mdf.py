@@ -229,7 +229,7 @@ def test_spellings_are_known_where_they_mean_one_thing(text: str, plain: str | N
     [
         (lambda t: np.concatenate([t[:50], t[49:]]), "time repeats 1 times, first at sample 50 (0.49 s)"),
         (lambda t: np.concatenate([t[:50], t[40:]]), "time goes backwards 1 times, first at sample 50 (0.4 s)"),
-        (lambda t: np.where(np.arange(len(t)) == 5, np.nan, t), "time stamp of sample 5 is not a number"),
+        (lambda t: np.where(np.arange(len(t)) == 5, np.nan, t), "time stamp of sample 5 is nan s"),
         (lambda t: t[:1], "fewer than two time stamps"),
     ],
 )

@@ -89,9 +89,7 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
         return f"fewer than two time stamps; {fix}"
     odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
     if len(odd):
-        time = float(stamps[odd[0]])
-        what = f"{time:.6g} s, which is no time of a drive" if math.isfinite(time) else "not a number"
-        return f"time stamp of sample {odd[0]} is {what}; {fix}"
+        return f"time stamp of sample {odd[0]} is {stamps[odd[0]]:.6g} s, which is no time of a drive; {fix}"
     steps = np.diff(stamps)
     for what, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
         if bad.any():
@@ -103,11 +101,10 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
 def unevenness(stamps: FloatArray) -> str:
     """Gaps, jitter or drift of increasing time stamps [s], in words; empty where they are even."""
     steps = np.diff(stamps)
-    step = float(np.median(steps))
-    gaps = np.flatnonzero(steps > GAP * step)
-    if len(gaps):
-        longest = gaps[np.argmax(steps[gaps])]
-        return f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s (interval {step:.6g} s)"
+    step, longest = float(np.median(steps)), int(np.argmax(steps))
+    if steps[longest] > GAP * step:
+        gaps = f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
+        return f"{gaps} (interval {step:.6g} s)"
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
         return f"intervals deviate by up to {100 * jitter:.2g} % from the median of {step:.6g} s"
@@ -159,10 +156,6 @@ class Clock:
     n_samples: int
     stamps: FloatArray | None = None
 
-    def times_of_rows(self) -> FloatArray:
-        """Times of the file's rows [s]."""
-        return self.ticks() if self.stamps is None else self.stamps
-
     def ticks(self) -> FloatArray:
         """Times of the uniform clock [s]."""
         return self.start_time + np.arange(self.n_samples) / self.rate_hz
@@ -195,19 +188,20 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
             hold more samples than the limits allow.
     """
     require_clock(stamps, where, may_repeat=policy == "uniform")
-    start, elapsed, intervals = float(stamps[0]), float(stamps[-1] - stamps[0]), len(stamps) - 1
-    if policy == "uniform":
-        nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
-        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
-        return Clock(float(times[0]), plain_rate(rate, min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
+    start, elapsed, steps = float(stamps[0]), float(stamps[-1] - stamps[0]), np.diff(stamps)
     if policy == "interpolate":
-        rate = plain_rate(1.0 / mean_step(np.diff(stamps)), INTERPOLATED_TOLERANCE)
+        rate = plain_rate(1.0 / mean_step(steps), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
         check_limit("samples", n_samples, f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples")
         return Clock(start, rate, n_samples, stamps)
-    if uneven := unevenness(stamps):
+    rate, deviation = len(steps) / elapsed, MOST_DRIFT
+    if policy == "uniform":
+        nominal, deviation = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE), MOST_STRETCH
+        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+        start = float(times[0])
+    elif uneven := unevenness(stamps):
         raise DataError(f"{where}: {uneven}; {fix}")
-    return Clock(start, plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4)), len(stamps))
+    return Clock(start, plain_rate(rate, min(deviation / len(steps), 1e-4)), len(stamps))
 
 
 def uniform_times(

@@ -101,7 +101,7 @@ def read_dbc(file: Path) -> list[Any]:
     try:
         messages = [message for message in load_string(text, "dbc", strict=False).messages if message.name != UNASSIGNED]
     except Exception as error:  # of cantools and its parser, of any kind
-        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error)[:160])})") from None
+        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error))})") from None
     if not messages:
         raise DataError(f"'{file}' declares no message; is it a DBC file?")
     return messages
@@ -171,7 +171,7 @@ def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
         try:
             coders.append(Coder(message.frame_id, message.name, message.length, parts, is_extended_frame=message.is_extended_frame))
         except Exception as error:  # of cantools
-            raise DataError(f"{where} cannot be decoded ({printable(first_line(error)[:160])})") from None
+            raise DataError(f"{where} cannot be decoded ({printable(first_line(error))})") from None
     return Message(message, {name: signals[name].unit or "" for name in wanted}, coders)
 
 
