@@ -27,7 +27,7 @@ from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.clocks import uniform_times
 from vehest.sources.limited import Reading
-from vehest.sources.pose import ground_plane, planar_motion
+from vehest.sources.pose import PoseOptions, ground_plane
 from vehest.sources.rosbag import POSE_FIELDS
 from vehest.sources.rosbag.topics import read_bag
 
@@ -179,7 +179,7 @@ def _drive(bag: Reading) -> Drive:
     servo_times = _seconds(bag, "/vesc/servo_position_command", "received")
     poses = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.{part}"][body_kept] for part in POSE_FIELDS], axis=1)
     plane, yaw = ground_plane(poses[:, :3], poses[:, 3:], "z", "pose")
-    motion = planar_motion(plane, yaw, float(np.diff(body_times).mean()), window=9, order=2)
+    motion = PoseOptions().motion(plane, yaw, float(np.diff(body_times).mean()))
     begin, end = max(imu_times[0], vesc_times[0], body_times[0]), min(imu_times[-1], vesc_times[-1], body_times[-1], servo_times[-1])
     grid = np.arange(np.ceil(begin * RATE), np.floor(end * RATE) + 1) / RATE
     return Drive(

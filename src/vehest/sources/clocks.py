@@ -6,6 +6,7 @@ stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -265,15 +266,32 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
     return slope, offset - slope * middle + origin
 
 
-def common_ticks(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
+def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
+    """Time that all spans [s] have in common; their keys name them in messages.
+
+    Raises:
+        DataError: there is none.
+    """
+    late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
+    begin, end = spans[late][0], spans[early][1]
+    if begin >= end:
+        what = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
+        raise DataError(f"{where}: {what}: nothing is common to all; leave one out, declare it gappy or take stamps of one clock")
+    return begin, end
+
+
+def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
     """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], shape (T,).
 
     Raises:
-        DataError: they are more than the limits allow.
+        DataError: they are fewer than two or more than the limits allow.
     """
     n_samples = (end - begin) * rate_hz
     check_limit("samples", n_samples, f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
-    return np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+    ticks = np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+    if len(ticks) < 2:
+        raise DataError(f"{where} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
+    return ticks
 
 
 def at_ticks(samples: FloatArray, stamps: FloatArray, ticks: FloatArray, *, hold: bool = False, slack: float = 0.0) -> FloatArray:

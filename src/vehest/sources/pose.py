@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -16,40 +17,6 @@ UpAxis = Literal["y", "z"]
 PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
 POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
 """Channels that poses give."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PoseOptions:
-    """How reference channels are made of poses; see `planar_motion`.
-
-    Args:
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
-        lever_x: from the rigid body's origin forward to the reference point [m].
-        lever_y: to the left [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
-    """
-
-    window: int = 9
-    order: int = 2
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    channels: tuple[PoseChannel, ...] = POSE_CHANNELS
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.order < self.window or self.window % 2 == 0:
-            raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
-
-    def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, mounting_yaw: float, where: str) -> PlanarMotion:
-        """Motion of the reference point; arguments as `planar_motion` has them.
-
-        Raises:
-            DataError: there are fewer poses than the window holds.
-        """
-        if len(yaw) < self.window:
-            raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
-        lever = (self.lever_x, self.lever_y)
-        return planar_motion(positions, yaw, interval, window=self.window, order=self.order, mounting_yaw=mounting_yaw, lever=lever)
 
 
 @dataclass(frozen=True)
@@ -76,39 +43,55 @@ class PlanarMotion:
         return {name: made[name] for name in names}
 
 
-def planar_motion(
-    positions: FloatArray,
-    yaw: FloatArray,
-    interval: float,
-    *,
-    window: int,
-    order: int,
-    mounting_yaw: float = 0.0,
-    lever: tuple[float, float] = (0.0, 0.0),
-) -> PlanarMotion:
-    """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How reference channels are made of poses.
 
     Args:
-        positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
-        yaw: of the rigid body, unwrapped [rad], shape (T,).
-        interval: between two samples [s].
-        window: samples of the filter, odd.
+        window: samples of the Savitzky-Golay filter.
         order: of its polynomial.
-        mounting_yaw: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-        lever: from the rigid body's origin to the reference point, forward and left in the car's axes [m].
-
-    Source:
-        Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Analytical Chemistry 36 (8), 1964.
+        lever_x: from the rigid body's origin forward to the reference point, in the car's axes [m].
+        lever_y: to the left [m].
+        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
     """
-    velocity_x, velocity_y = (signal.savgol_filter(positions[:, axis], window, order, deriv=1, delta=interval) for axis in (0, 1))
-    yaw_rate = signal.savgol_filter(yaw, window, order, deriv=1, delta=interval)
-    heading = signal.savgol_filter(yaw, window, order) + mounting_yaw
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return PlanarMotion(
-        vx=cosine * velocity_x + sine * velocity_y - yaw_rate * lever[1],
-        vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * lever[0],
-        yaw_rate=yaw_rate,
-    )
+
+    window: int = 9
+    order: int = 2
+    lever_x: float = 0.0
+    lever_y: float = 0.0
+    channels: tuple[PoseChannel, ...] = POSE_CHANNELS
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.order < self.window or self.window % 2 == 0:
+            raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
+
+    def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, turned: float = 0.0, where: str = "poses") -> PlanarMotion:
+        """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+
+        Args:
+            positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
+            yaw: of the rigid body, unwrapped [rad], shape (T,).
+            interval: between two samples [s].
+            turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+            where: file and topic, for messages.
+
+        Raises:
+            DataError: there are fewer poses than the window holds.
+
+        Source:
+            Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
+        """
+        if len(yaw) < self.window:
+            raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
+        derivative = partial(signal.savgol_filter, window_length=self.window, polyorder=self.order, deriv=1, delta=interval)
+        velocity_x, velocity_y, yaw_rate = derivative(positions[:, 0]), derivative(positions[:, 1]), derivative(yaw)
+        heading = signal.savgol_filter(yaw, self.window, self.order) + turned
+        cosine, sine = np.cos(heading), np.sin(heading)
+        return PlanarMotion(
+            vx=cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
+            vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,
+            yaw_rate=yaw_rate,
+        )
 
 
 def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:

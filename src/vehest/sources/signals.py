@@ -20,7 +20,17 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
-from vehest.sources.clocks import SLACK, Clock, at_ticks, common_ticks, on_nearest, require_finite, require_no_gap, uniform_clock
+from vehest.sources.clocks import (
+    SLACK,
+    Clock,
+    at_ticks,
+    common_span,
+    on_nearest,
+    require_finite,
+    require_no_gap,
+    ticks_within,
+    uniform_clock,
+)
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.unit_spellings import require_unit
@@ -133,21 +143,18 @@ class SignalSource(FileSource):
     def _clock(self, signals: Mapping[str, Signal], file: Path) -> tuple[FloatArray, FloatArray, float]:
         """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""
         spanning = {name: signal for name, signal in signals.items() if name not in self.gappy} or signals
-        spans = {name: _valid_span(signal, self._signal_name(name, signal, file)) for name, signal in spanning.items()}
-        late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
-        begin, end, rate_hz = spans[late][0], spans[early][1], self.options.rate_hz
-        if rate_hz is not None:
-            stamps = common_ticks(begin, end, rate_hz, f"'{file}'")
-        else:
-            raster = signals[str(self.options.raster)]
-            stamps = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
-        if len(stamps) < 2:
-            raise DataError(
-                f"'{file}': channel '{late}' ({signals[late].origin}) begins at {begin:.6g} s, channel '{early}' ("
-                f"{signals[early].origin}) ends at {end:.6g} s: nothing is common to all; leave one out or declare it gappy"
-            )
-        if rate_hz is not None:
-            return stamps, stamps, rate_hz
+        spans = {}
+        for name, signal in spanning.items():
+            valid = signal.stamps[~np.isnan(signal.values)]
+            if not len(valid):
+                raise DataError(f"{self._signal_name(name, signal, file)} holds no valid sample; leave the channel out")
+            spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
+        begin, end = common_span(spans, f"'{file}'")
+        if self.options.rate_hz is not None:
+            ticks = ticks_within(begin, end, self.options.rate_hz, f"'{file}'")
+            return ticks, ticks, self.options.rate_hz
+        raster = signals[str(self.options.raster)]
+        stamps = raster.stamps[(raster.stamps >= begin) & (raster.stamps <= end)]
         where = f"'{file}': {raster.origin}, whose clock is taken, does not come evenly"
         clock = uniform_clock(stamps, where, fix="give rate_hz instead of raster")
         return stamps, clock.ticks(), clock.rate_hz
@@ -174,11 +181,3 @@ class SignalSource(FileSource):
 
     def _signal_name(self, name: str, signal: Signal, file: Path) -> str:
         return f"'{file}': signal '{self.channels[name].column}' of {signal.origin}, for channel '{name}',"
-
-
-def _valid_span(signal: Signal, where: str) -> tuple[float, float]:
-    """Times of the first and last valid sample [s]."""
-    valid = np.flatnonzero(~np.isnan(signal.values))
-    if len(valid) == 0:
-        raise DataError(f"{where} holds no valid sample; leave the channel out")
-    return float(signal.stamps[valid[0]]), float(signal.stamps[valid[-1]])

@@ -17,7 +17,16 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.clocks import Clock, at_ticks, common_ticks, require_clock, require_finite, require_no_gap, uniform_times
+from vehest.sources.clocks import (
+    Clock,
+    at_ticks,
+    common_span,
+    require_clock,
+    require_finite,
+    require_no_gap,
+    ticks_within,
+    uniform_times,
+)
 from vehest.sources.columns import columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.limited import Reading
@@ -86,7 +95,8 @@ class RosbagSource(FileSource):
         most_bytes, layouts = int(1e9 * self.options.unpacked_limit), self.options.messages or {}
         reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)
         series = {name: self._series(topic, self.fields[name], reading, file) for name, topic in self.topics.items()}
-        grid = self._grid(series.values(), file)
+        spans = {f"topic '{one.topic.topic}'": (float(one.times[0]), float(one.times[-1])) for one in series.values()}
+        grid = ticks_within(*common_span(spans, f"'{file}'"), self.options.rate_hz, f"'{file}'")
         channels = {}
         for name, one in self.channels.items():
             held, values = series[one.topic], series[one.topic].fields[one.field]
@@ -151,18 +161,6 @@ class RosbagSource(FileSource):
             late = (received - stamped) * 1e-9
             about["latency_ms"] = [round(1e3 * float(one), 3) for one in (np.median(late), late.max())]
         return Series(topic, times - topic.delay, rate_hz, values, about)
-
-    def _grid(self, series: Iterable[Series], path: Path) -> FloatArray:
-        """Ticks that all topics reach [s]."""
-        late, early = max(series, key=lambda one: one.times[0]), min(series, key=lambda one: one.times[-1])
-        begin, end = float(late.times[0]), float(early.times[-1])
-        grid = common_ticks(begin, end, self.options.rate_hz, f"'{path}'")
-        if len(grid) < 2:
-            raise DataError(
-                f"'{path}': topic '{late.topic.topic}' begins at {begin:.6g} s, when '{early.topic.topic}' has ended at {end:.6g} s; "
-                f"do their stamps come from different clocks? then set stamps: received"
-            )
-        return grid
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
         """Reference channels from the poses."""

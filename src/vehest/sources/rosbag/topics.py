@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError, MissingError, VehestError
-from vehest.data.files import writing_error
+from vehest.data.files import regular_file, writing_error
 from vehest.data.text_files import first_line, read_text
 from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked
 from vehest.sources.limited import Reading, read_limited, require_package
@@ -46,20 +46,16 @@ def bag_files(path: Path) -> list[Path]:
     """The files that a bag is made of: the archive or file itself, or what its folder holds.
 
     Raises:
-        MissingError: one is not there, is empty, or may not be read.
+        MissingError: there is none, or the folder may not be read.
     """
+    if not path.is_dir():
+        return [regular_file(path)]
     try:
-        inside = sorted(path.iterdir()) if path.is_dir() else [path]
+        files = sorted(file for file in path.iterdir() if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED))
     except OSError as error:
         raise MissingError(f"cannot read '{path}' ({error.strerror}); check its permissions") from None
-    files = [file for file in inside if file == path or file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED)]
     if not files:
         raise MissingError(f"'{path}' holds no bag: neither {METADATA} nor a file ending in {' or '.join(STORAGES)}")
-    for file in files:
-        if not file.is_file():
-            raise MissingError(f"there is no file '{file}'")
-        if file.stat().st_size == 0:
-            raise MissingError(f"file '{file}' is empty")
     return files
 
 
