@@ -130,8 +130,8 @@ class Source(ABC):
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.where}: {error}") from None
         if isinstance(self.reference_point, Point) and any(isinstance(transform, ScaleToWheelbase) for transform in self.transforms):
-            what = "a reference point is in metres of the unscaled car; move the reference by the transform reference_lever, before"
-            raise ConfigurationError(f"{self.where}: {what} scale_to_wheelbase")
+            what = "reference_point does not go with scale_to_wheelbase; put the transform reference_lever before it instead"
+            raise ConfigurationError(f"{self.where}: {what}")
         if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
             raise ConfigurationError(f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out")
         self.options = self._validated(self.options_type)
@@ -140,11 +140,6 @@ class Source(ABC):
         names = {field.name for field in fields(cast(Any, kind))}
         own = {key: value for key, value in self.dataset.items() if key in names}
         return validated(kind, own, self.where, error=ConfigurationError, group="dataset")
-
-    @property
-    def kind(self) -> Kind:
-        """``real`` or ``simulated``."""
-        return kind_of(self.dataset)
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
@@ -261,11 +256,11 @@ def existing_folder(path: Any, dataset: str) -> Path:
     Raises:
         MissingError: no root was given, or the folder is not there.
     """
-    if str(path or "None").split("/")[0] in {"None", "null"}:
-        raise MissingError(f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA")
     folder = Path(str(path)).expanduser()
-    if not folder.is_dir():
-        raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
+    has_root = bool(path) and folder.parts[:1] not in {("None",), ("null",)}
+    if not (has_root and folder.is_dir()):
+        what = f"there is no folder '{folder}'" if has_root else "no data root is set"
+        raise MissingError(f"data set '{dataset}': {what}; give root=FOLDER or set VEHEST_DATA")
     return folder
 
 

@@ -143,19 +143,12 @@ def require_no_gap(times: FloatArray, limit: float, where: str) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """A uniform clock, and how to bring samples onto it.
+    """A uniform clock, and how to bring samples onto it."""
 
-    Args:
-        start_time: time of the first sample [s].
-        rate_hz: sampling rate [Hz].
-        n_samples: samples on the uniform clock.
-        stamps: the file's own time stamps, where samples must be interpolated [s].
-    """
-
-    start_time: float
+    start_time: float  # s
     rate_hz: float
     n_samples: int
-    stamps: FloatArray | None = None
+    stamps: FloatArray | None = None  # the file's own time stamps, where samples must be interpolated [s]
 
     def ticks(self) -> FloatArray:
         """Times of the uniform clock [s]."""

@@ -9,7 +9,7 @@ from typing import Any
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.base import Source, existing_folder
+from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
 from vehest.sources.tables import listed
 
@@ -89,7 +89,7 @@ class FileSource(Source):
                 rate_hz=clock.rate_hz,
                 start_time=clock.start_time,
                 channels=channels,
-                kind=self.kind,
+                kind=kind_of(self.dataset),
                 gappy=self.gappy,
                 provenance={"dataset": self.name, "source": self.dataset["source"], **provenance},
             )

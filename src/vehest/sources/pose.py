@@ -21,17 +21,11 @@ POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Motion of a car in the plane, in ISO 8855 axes.
+    """Motion of a car's reference point in the plane, in ISO 8855 axes, shape (T,) each."""
 
-    Args:
-        vx: forward velocity of the reference point [m/s], shape (T,).
-        vy: leftward velocity of the reference point [m/s], shape (T,).
-        yaw_rate: yaw rate [rad/s], shape (T,).
-    """
-
-    vx: FloatArray
-    vy: FloatArray
-    yaw_rate: FloatArray
+    vx: FloatArray  # m/s
+    vy: FloatArray  # m/s
+    yaw_rate: FloatArray  # rad/s
 
     def at(self, times: FloatArray, grid: FloatArray) -> PlanarMotion:
         """The same on another clock, along straight lines."""
@@ -45,20 +39,12 @@ class PlanarMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseOptions:
-    """How reference channels are made of poses.
+    """How reference channels are made of poses."""
 
-    Args:
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
-        lever_x: from the rigid body's origin forward to the reference point, in the car's axes [m].
-        lever_y: to the left [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
-    """
-
-    window: int = 9
-    order: int = 2
-    lever_x: float = 0.0
-    lever_y: float = 0.0
+    window: int = 9  # samples of the Savitzky-Golay filter
+    order: int = 2  # of its polynomial
+    lever_x: float = 0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
+    lever_y: float = 0.0  # to the left [m]
     channels: tuple[PoseChannel, ...] = POSE_CHANNELS
 
     def __post_init__(self) -> None:

@@ -18,18 +18,11 @@ from vehest.sources.columns import Column
 
 @dataclass(frozen=True)
 class SampleAndHold:
-    """Channels whose values stand in every row, though they are new in few.
-
-    Args:
-        channels: their names.
-        updated: column that changes with every new sample, such as a time stamp of the sensors' own; None: a sample is new in the rows
-            in which any of the channels changes.
-        delay: how much later than it was taken a sample first stands in a row [s], of all channels or of some.
-    """
+    """Channels whose values stand in every row, though they are new in few: where ``updated`` changes, or else any of their columns."""
 
     channels: Annotated[tuple[str, ...], "a list of channels"]
-    updated: str | int | None = None
-    delay: float | dict[str, float] = 0.0
+    updated: str | int | None = None  # column that changes with every new sample, such as a time stamp of the sensors' own
+    delay: float | dict[str, float] = 0.0  # how much later than it was taken a sample first stands in a row [s], of all channels or some
 
     @property
     def delays(self) -> dict[str, float]:

@@ -41,32 +41,20 @@ FASTER = 1.05  # than the raster: the rest would fold into it
 
 @dataclass(frozen=True)
 class SignalChannel(Column):
-    """Declaration of a signal that becomes a channel.
+    """Declaration of a signal that becomes a channel."""
 
-    Args:
-        interpolation: ``linear``, or ``hold`` for values that hold until the next one.
-        max_gap: longest time between two samples that is interpolated [s]; None for three median intervals.
-    """
-
-    interpolation: Literal["linear", "hold"] = "linear"
-    max_gap: Positive | None = None
+    interpolation: Literal["linear", "hold"] = "linear"  # hold: for values that hold until the next one
+    max_gap: Positive | None = None  # longest time between two samples that is interpolated [s]; None for three median intervals
 
 
 @dataclass(frozen=True)
 class Signal:
-    """One signal.
+    """One signal."""
 
-    Args:
-        origin: its channel group or message, for messages: ``group 3 (Gateway)``.
-        stamps: times of the samples [s], strictly increasing, shape (T,).
-        values: physical values in the file's unit, NaN where the file marks them as invalid, shape (T,).
-        unit: as the file writes it.
-    """
-
-    origin: str
-    stamps: FloatArray
-    values: FloatArray
-    unit: str
+    origin: str  # its channel group or message, for messages: group 3 (Gateway)
+    stamps: FloatArray  # times of the samples [s], strictly increasing, shape (T,)
+    values: FloatArray  # physical values in the file's unit, NaN where the file marks them as invalid, shape (T,)
+    unit: str  # as the file writes it
 
     @property
     def rate_hz(self) -> float:
@@ -88,15 +76,11 @@ class SignalOptions:
 
 
 class SignalSource(FileSource):
-    """Files of signals, a recording each.
-
-    Attributes:
-        channel_type: declaration of a channel.
-    """
+    """Files of signals, a recording each."""
 
     options_type = SignalOptions
     options: SignalOptions
-    channel_type: ClassVar[type[SignalChannel]] = SignalChannel
+    channel_type: ClassVar[type[SignalChannel]] = SignalChannel  # declaration of a channel
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)

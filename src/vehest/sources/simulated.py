@@ -34,25 +34,12 @@ class Payload:
 
 @dataclass(frozen=True)
 class Drive:
-    """One of ``drives`` as a data set declares it, or ``count`` of them; for None the data set's own value holds.
-
-    Args:
-        id: name of the recording.
-        manoeuvre: its name and parameters.
-        count: of drives ``ID_001``, ``ID_002`` and so on.
-        seed: of everything that is drawn; without it one that follows from the data set's and the drive's name.
-        vehicle: name of one of the data set's vehicles.
-        surface: name or configuration.
-        stability_control: whether it is switched on.
-        sensors: a preset's name, or what differs from one.
-        payload: None: empty.
-        tyres: lag of cold tyres and wear over the drive; None: neither.
-    """
+    """One of ``drives`` as a data set declares it, or ``count`` of them; for None the data set's own value holds."""
 
     id: str | int
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
-    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None
-    seed: Whole | None = None
+    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None  # called ID_001, ID_002 and so on
+    seed: Whole | None = None  # None: one that follows from the data set's and the drive's name
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None
     stability_control: bool | None = None

@@ -40,17 +40,11 @@ class CanChannel(SignalChannel):
 
 @dataclass(frozen=True)
 class Wanted:
-    """The signal that becomes a channel.
+    """The signal that becomes a channel."""
 
-    Args:
-        message: that carries it.
-        signal: its name.
-        invalid: values that mean that nothing was measured, in the unit of the DBC.
-    """
-
-    message: Message
+    message: Message  # that carries it
     signal: str
-    invalid: frozenset[float] = frozenset()
+    invalid: frozenset[float] = frozenset()  # values that mean that nothing was measured, in the unit of the DBC
 
 
 class CanSource(SignalSource):

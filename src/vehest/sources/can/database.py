@@ -25,17 +25,11 @@ _TOO_LONG = re.compile(r"\b(?:BO_\s+\d+\s+\w+|SG_\s+\w+(?:\s+[mM]\w*)?)\s*:\s*(?
 
 @dataclass(frozen=True)
 class Message:
-    """A message of which signals are wanted.
+    """A message of which signals are wanted."""
 
-    Args:
-        described: the message of cantools.
-        units: wanted signal -> its unit as the DBC writes it.
-        coders: messages of cantools with fewer signals: one of all that every frame carries, one for each that is multiplexed.
-    """
-
-    described: Any
-    units: Mapping[str, str]
-    coders: Sequence[Any]
+    described: Any  # by cantools
+    units: Mapping[str, str]  # wanted signal -> its unit as the DBC writes it
+    coders: Sequence[Any]  # of cantools: one for all signals that every frame carries, one for each that is multiplexed
 
     @property
     def name(self) -> str:
@@ -68,19 +62,12 @@ class Message:
 
 @dataclass(frozen=True)
 class Database:
-    """Messages that hold wanted signals.
-
-    Args:
-        file: the DBC.
-        messages: (identifier, whether it is extended) -> message.
-        places: wanted name -> its message and signal.
-        taken: identifiers of all messages in the file.
-    """
+    """Messages of a DBC that hold wanted signals."""
 
     file: Path
-    messages: Mapping[tuple[int, bool], Message]
-    places: Mapping[str, tuple[Message, str]]
-    taken: frozenset[tuple[int, bool]]
+    messages: Mapping[tuple[int, bool], Message]  # by identifier and whether it is extended
+    places: Mapping[str, tuple[Message, str]]  # wanted name -> its message and signal
+    taken: frozenset[tuple[int, bool]]  # identifiers of all messages in the file
 
 
 def read_dbc(file: Path) -> list[Any]:

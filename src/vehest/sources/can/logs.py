@@ -16,17 +16,11 @@ SUFFIXES = (".asc", ".blf", ".log")
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a log in their order, without error frames and remote frames; iterated over as messages of python-can.
-
-    Args:
-        file: the log.
-        arrays: as `vehest.sources.readers.can_logs.read_frames` returns them.
-        buses: names or numbers of the buses.
-    """
+    """Frames of a log in their order, without error frames and remote frames; iterated over as messages of python-can."""
 
     file: Path
-    arrays: Arrays
-    buses: list[Any]
+    arrays: Arrays  # as `vehest.sources.readers.can_logs.read_frames` returns them
+    buses: list[Any]  # names or numbers
 
     def __iter__(self) -> Iterator[Any]:
         from can import Message

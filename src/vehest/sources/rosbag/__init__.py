@@ -40,21 +40,13 @@ MOST_WANDERING = 0.4  # of the grid's interval
 
 @dataclass(frozen=True)
 class Series:
-    """A topic's samples with their times.
-
-    Args:
-        topic: its declaration.
-        times: of the samples, the declared delay taken off [s], shape (T,).
-        rate_hz: of an even clock [Hz]; None where the stamps are the times.
-        fields: path -> values, shape (T,).
-        about: what was made of the stamps, for the provenance.
-    """
+    """A topic's samples with their times."""
 
     topic: Topic
-    times: FloatArray
-    rate_hz: float | None
-    fields: Mapping[str, FloatArray]
-    about: Mapping[str, Any]
+    times: FloatArray  # the declared delay taken off [s], shape (T,)
+    rate_hz: float | None  # of an even clock [Hz]; None where the stamps are the times
+    fields: Mapping[str, FloatArray]  # path -> values, shape (T,)
+    about: Mapping[str, Any]  # what was made of the stamps, for the provenance
 
 
 class RosbagSource(FileSource):

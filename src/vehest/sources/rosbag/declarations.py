@@ -13,29 +13,17 @@ from vehest.sources.pose import PoseOptions, UpAxis
 
 @dataclass(frozen=True)
 class Topic:
-    """How a topic's samples come by their times.
+    """How a topic's samples come by their times."""
 
-    Args:
-        topic: its name in the bag.
-        type: its message type.
-        stamps: ``header``, what the message says, or ``received``, what the bag says.
-        clock: ``stamps`` takes the stamps as times, ``uniform`` the even clock behind them.
-        rate_hz: nominal rate [Hz], for ``uniform``.
-        max_gap: longest time between two stamps that is interpolated [s].
-        delay: how much later than the sample its time says [s].
-        interpolation: ``linear``, or ``hold`` for commands that stand until the next one.
-        average: width of a centred moving average before interpolation [s]; 0 for none.
-    """
-
-    topic: str
-    type: str
-    stamps: Literal["header", "received"] = "header"
-    clock: Literal["stamps", "uniform"] = "stamps"
-    rate_hz: Positive | None = None
-    max_gap: Positive = 0.05
-    delay: float = 0.0
-    interpolation: Literal["linear", "hold"] = "linear"
-    average: Annotated[float, Field(ge=0.0)] = 0.0
+    topic: str  # its name in the bag
+    type: str  # of its messages
+    stamps: Literal["header", "received"] = "header"  # of the message or of the bag
+    clock: Literal["stamps", "uniform"] = "stamps"  # the stamps themselves, or the even clock behind them
+    rate_hz: Positive | None = None  # nominal rate of a uniform clock [Hz]
+    max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
+    delay: float = 0.0  # how much later than the sample its time says [s]
+    interpolation: Literal["linear", "hold"] = "linear"  # hold: for commands that stand until the next one
+    average: Annotated[float, Field(ge=0.0)] = 0.0  # width of a centred moving average before interpolation [s]; 0 for none
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:
@@ -46,19 +34,10 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagChannel:
-    """Where a channel comes from: sign · factor · (field - offset).
+    """Where a channel comes from: sign · factor · (field - offset), in ``unit``."""
 
-    Args:
-        topic: the topic's name in the data set.
-        field: path of the field in the message.
-        unit: of the result.
-        sign: 1 or -1.
-        factor: other than 0.
-        offset: the field's value where the channel is zero.
-    """
-
-    topic: str
-    field: str
+    topic: str  # its name in the data set
+    field: str  # path in the message
     unit: str
     sign: Literal[1, -1] = 1
     factor: float = 1.0
@@ -67,19 +46,12 @@ class BagChannel:
 
 @dataclass(frozen=True)
 class Pose(PoseOptions):
-    """Where poses stand.
+    """Where poses stand."""
 
-    Args:
-        topic: the topic's name in the data set.
-        field: path of a geometry_msgs/Pose in the message.
-        up: upward axis of the world and of the rigid body.
-        yaw: from the rigid body's x axis to the car's forward axis [rad].
-    """
-
-    topic: str
-    field: str = "pose"
-    up: UpAxis = "z"
-    yaw: float = 0.0
+    topic: str  # its name in the data set
+    field: str = "pose"  # path of a geometry_msgs/Pose in the message
+    up: UpAxis = "z"  # upward axis of the world and of the rigid body
+    yaw: float = 0.0  # from the rigid body's x axis to the car's forward axis [rad]
 
 
 @dataclass(frozen=True)
