@@ -281,9 +281,9 @@ def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) 
     topics = drive()
     del topics["/motor"]
     servo = topics["/servo"]
-    assert "has no topic '/motor' (it has /body, /imu, /servo)" in refusal(write_bag(tmp_path / "absent", topics).parent)
+    assert "holds no messages of topic '/motor' (of /body, /imu, /servo)" in refusal(write_bag(tmp_path / "absent", topics).parent)
     topics = drive() | {"/servo": Topic(servo.type, servo.times[:0], {})}
-    assert "topic '/servo' holds no messages" in refusal(write_bag(tmp_path / "empty", topics).parent)
+    assert "holds no messages of topic '/servo'" in refusal(write_bag(tmp_path / "empty", topics).parent)
 
 
 def test_a_layout_that_the_bag_contradicts_is_refused(tmp_path: Path) -> None:
@@ -299,7 +299,10 @@ def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
     kept = (motor.times < 1.0) | (motor.times > 1.095)
     topics["/motor"] = Topic(motor.type, motor.times[kept], {name: samples[kept] for name, samples in motor.fields.items()})
     bags = write_bag(tmp_path, topics).parent
-    assert "topic '/motor' has a gap of 0.11 s after 0.99 s, the longest of 1 above 0.05 s; cut the range out" in refusal(bags)
+    assert (
+        "topic '/motor': field 'motor.rpm' has a gap of 0.11 s after 0.99 s, the longest of 1 above 0.05 s; cut the range out"
+        in refusal(bags)
+    )
     assert len(read(bags, topics=topic_options("motor", max_gap=0.12))) == 295
 
 

@@ -116,28 +116,19 @@ def unevenness(stamps: FloatArray) -> str:
     return ""
 
 
-def require_finite(values: FloatArray, times: FloatArray, where: str) -> None:
-    """Refuse samples, shape (T,), that are no finite numbers.
+def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
+    """Refuse samples, shape (T,), that are no finite numbers or whose increasing times [s] lie further apart than ``longest`` [s].
 
     Raises:
-        DataError: they are; ``where`` names file and signal.
+        DataError: there are such; ``where`` names file and signal.
     """
-    bad = np.flatnonzero(~np.isfinite(values))
+    bad, steps = np.flatnonzero(~np.isfinite(values)), np.diff(times)
     if len(bad):
         what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
         raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
-
-
-def require_no_gap(times: FloatArray, limit: float, where: str) -> None:
-    """Refuse increasing times [s], shape (T,), that are further apart than the limit [s].
-
-    Raises:
-        DataError: they are; ``where`` names file and signal.
-    """
-    steps = np.diff(times)
     at = int(np.argmax(steps))
-    if steps[at] > limit:
-        what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > limit).sum()} above {limit:.6g} s"
+    if steps[at] > longest:
+        what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > longest).sum()} above {longest:.6g} s"
         raise DataError(f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time")
 
 

@@ -20,17 +20,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
-from vehest.sources.clocks import (
-    SLACK,
-    Clock,
-    at_ticks,
-    common_span,
-    on_nearest,
-    require_finite,
-    require_no_gap,
-    ticks_within,
-    uniform_clock,
-)
+from vehest.sources.clocks import SLACK, Clock, at_ticks, common_span, on_nearest, require_samples, ticks_within, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.unit_spellings import require_unit
@@ -156,9 +146,8 @@ class SignalSource(FileSource):
         first = max(int(np.searchsorted(signal.stamps, ticks[0] + near, side="right")) - 1, 0)
         last = int(np.searchsorted(signal.stamps, ticks[-1] - near, side="left"))
         times, values = signal.stamps[first : last + 1], signal.values[first : last + 1]
-        require_finite(values, times, where)
         declared = self.channels[name]
-        require_no_gap(times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where)
+        require_samples(values, times, (declared.max_gap or GAP / signal.rate_hz) * (1.0 + SLACK), where)
         if np.array_equal(times, stamps):
             return values
         return at_ticks(values, times, ticks, hold=declared.interpolation == "hold", slack=near)

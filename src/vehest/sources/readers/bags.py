@@ -50,7 +50,10 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
     """
     types = _types(layouts)
     with _opened(bag) as reader:
-        arrays = _read(bag, reader, types, topics)
+        try:
+            arrays = _read(bag, reader, types, topics)
+        except KeyError as error:  # of rosbags' types
+            raise ConfigurationError(f"message type {error} is neither a standard one nor declared; give its layout in messages") from None
         if not 0 <= reader.start_time < LATEST:
             raise DataError(f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again")
         return arrays, {"start": reader.start_time}
@@ -116,11 +119,6 @@ def _types(layouts: Mapping[str, str]) -> Any:
             declared.update(get_types_from_msg(text, name))
         except Exception as error:  # of rosbags' parser, of any kind
             raise ConfigurationError(f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}") from None
-    for name, (_, fields) in declared.items():
-        for field, kind in fields:
-            inner = kind[1][0] if kind[0] in ARRAYS else kind
-            if inner[0] == Nodetype.NAME and inner[1] not in declared and inner[1] not in types.fielddefs:
-                raise ConfigurationError(f"the layout of message type '{name}': type '{inner[1]}' of field '{field}' is not declared")
     try:
         types.register(declared)
     except TypesysError as error:
@@ -165,8 +163,6 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
     takers: dict[str, list[tuple[Callable[[Any], None], Callable[[Any], Any]]]] = {}
     counts, keys, wanted = {}, {}, []
     for name, kind, paths in topics:
-        if kind not in types.fielddefs:
-            raise ConfigurationError(f"message type '{kind}' is neither a standard one nor declared; give its layout in messages")
         getters = {f"{name}.{path}": _getter(types, name, kind, path) for path in paths}
         if dict(types.fielddefs[kind][1]).get("header") == (Nodetype.NAME, "std_msgs/msg/Header"):
             getters[f"{name}@stamped"] = lambda message: message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
@@ -197,19 +193,16 @@ def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arr
 def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
     """What the bag holds of a topic; its type and layout are those that are declared."""
     held = [connection for connection in reader.connections if connection.topic == name]
-    if not held:
-        names = sorted({connection.topic for connection in reader.connections})
-        topics = printable(", ".join(names[:30])) + (", …" if len(names) > 30 else "")
-        raise DataError(f"'{bag}' has no topic '{name}' (it has {topics or 'none'}); correct topics in the data set's configuration")
+    if not any(connection.msgcount for connection in held):
+        topics = printable(", ".join(sorted({connection.topic for connection in reader.connections if connection.msgcount})[:30]))
+        raise DataError(f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics in the configuration")
     for connection in held:
         if connection.msgtype != kind:
             raise DataError(f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared")
         for found, (_, fields) in _definitions(connection).items():
-            declared = types.fielddefs.get(found)
-            if declared is not None and _lower(declared[1]) != _lower(fields):
+            declared = types.fielddefs.get(found, ((), fields))[1]
+            if [(field.lower(), node) for field, node in fields] != [(field.lower(), node) for field, node in declared]:
                 raise DataError(f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages")
-    if not any(connection.msgcount for connection in held):
-        raise DataError(f"'{bag}': topic '{name}' holds no messages")
     return held
 
 
@@ -223,7 +216,3 @@ def _definitions(connection: Connection) -> Mapping[str, Any]:
     rule = "=" * 80 + "\n"
     sections = [part.split("\n", 1)[1] for part in text.split(rule)[1:]] if text.startswith(f"{rule}IDL: ") else [text]
     return {name: kind for section in sections for name, kind in get_types_from_idl(section).items()}
-
-
-def _lower(fields: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    return [(name.lower(), kind) for name, kind in fields]

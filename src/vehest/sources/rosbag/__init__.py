@@ -17,16 +17,7 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.clocks import (
-    Clock,
-    at_ticks,
-    common_span,
-    require_clock,
-    require_finite,
-    require_no_gap,
-    ticks_within,
-    uniform_times,
-)
+from vehest.sources.clocks import Clock, at_ticks, common_span, require_clock, require_samples, ticks_within, uniform_times
 from vehest.sources.columns import columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.limited import Reading
@@ -131,8 +122,7 @@ class RosbagSource(FileSource):
         times = stamps = stamps[kept]
         values = {field: reading.arrays[f"{name}.{field}"][kept] for field in fields}
         for field, samples in values.items():
-            require_finite(samples, stamps, f"{where}: field '{field}'")
-        require_no_gap(stamps, topic.max_gap, where)
+            require_samples(samples, stamps, topic.max_gap, f"{where}: field '{field}'")
         rate_hz = None
         if topic.clock == "uniform":
             times, rate_hz, jitter = uniform_times(stamps, topic.rate_hz or 0.0, where, MOST_WANDERING / self.options.rate_hz)
