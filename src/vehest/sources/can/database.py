@@ -20,7 +20,7 @@ from vehest.sources.limited import require_package
 
 COMPARED = 10_000  # names that a misspelt one is compared with
 UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
-_TOO_LONG = re.compile(r"\b(?:BO_\s+\d+\s+\w+|SG_\s+\w+(?:\s+[mM]\w*)?)\s*:\s*(?:\d+\s*\|\s*)?\d{6,}")
+_TOO_LONG = re.compile(r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})")
 
 
 @dataclass(frozen=True)
