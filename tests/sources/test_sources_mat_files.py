@@ -43,7 +43,7 @@ def test_numbers_of_every_type_come_back_as_doubles(tmp_path: Path, dtype: str, 
         "one": {"value": np.ones((1, 1), dtype), "time": np.zeros((1, 1))},
     }
     savemat(tmp_path / "a.mat", {"s": channels}, do_compression=compressed)
-    arrays, summary = read_channels(tmp_path / "a.mat", ["column", "s.one"], "value", "time")
+    arrays, summary = read_channels(tmp_path / "a.mat", ["column", "s.one"], "time")
     assert summary["names"] == {"column": "s.column", "s.one": "s.one"}
     np.testing.assert_array_equal(arrays["column.value"], long.astype(float))
     np.testing.assert_array_equal(arrays["s.one.value"], [1.0])

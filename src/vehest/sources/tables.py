@@ -69,22 +69,30 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
     else:
+        text = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace").decode(read_head(file))
+        lines = [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
+        if not lines:
+            raise DataError(f"'{file}' holds nothing but empty lines")
         try:
-            lines = first_lines(file, layout)
             names = next(csv.reader(lines[:1], delimiter=layout.delimiter))
-        except StopIteration:
-            raise DataError(f"'{file}' holds nothing but empty lines") from None
-        except (*DAMAGE, csv.Error) as error:
+        except csv.Error as error:
             raise _unreadable(file, error) from None
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
     return names
 
 
-def first_lines(file: Path, layout: TextLayout) -> list[str]:
-    """Lines from the one of names on that are not empty, as far as a megabyte goes."""
-    with table_stream(file) as stream:
-        text = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace").decode(stream.read(BLOCK))
-    return [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
+def read_head(file: Path, size: int = BLOCK) -> bytes:
+    """First bytes of a table, unpacked.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read.
+    """
+    try:
+        with table_stream(file) as stream:
+            return bytes(stream.read(size))
+    except DAMAGE as error:
+        raise _unreadable(file, error) from None
 
 
 def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None) -> dict[str, FloatArray]:

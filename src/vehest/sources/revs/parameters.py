@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import csv
-import math
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from vehest.data.errors import DataError
-from vehest.data.files import regular_file
-
-LARGEST_TABLE = 1 << 20  # bytes
+from vehest.data.errors import DataError, printable
+from vehest.sources.revs.csv_layout import decoded, number
+from vehest.sources.tables import read_head
 
 
 def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
@@ -22,56 +21,35 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
     Raises:
         DataError: it is no such table.
     """
-    rows = _rows(file)
-    if len(rows) < 3:
-        raise DataError(f"'{file}' has {len(rows)} lines; a table of vehicle parameters has one of names, one of units and values below")
-    width = max(column + 1 for row in rows for column, cell in enumerate(row) if cell)
-    names, units, *values = [[*row, *[""] * width][:width] for row in rows]
-    for column, name in enumerate(names):
-        if not name or names.index(name) != column:
-            raise DataError(f"'{file}': line 1 should name every column once, column {column + 1} is called '{name}'")
-    if any(_number(unit) is not None for unit in units):
-        raise DataError(f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?")
-    columns = zip(names, units, *values, strict=True)
-    return {name: {"value": _values(file, name, cells), "unit": unit} for name, unit, *cells in columns}
-
-
-def _values(file: Path, name: str, cells: list[str]) -> Any:
-    """A column's value, or its values."""
-    while cells and not cells[-1]:
-        cells = cells[:-1]
-    numbers = [_number(cell) for cell in cells]
-    wrong = next((row for row, number in enumerate(numbers) if number is None), None)
-    if wrong is not None and not (len(cells) == 1 and cells[0]):
-        what = f"holds the text '{cells[wrong][:40]}'" if cells[wrong] else "is blank"
-        raise DataError(f"'{file}': parameter '{name}' {what} in line {wrong + 3}, between its values; numbers are needed")
-    found = numbers if wrong is None else cells
-    return found[0] if len(found) == 1 else (found or None)
-
-
-def _rows(file: Path) -> list[list[str]]:
-    try:
-        if regular_file(file).stat().st_size > LARGEST_TABLE:
-            raise DataError(f"'{file}' is no table of vehicle parameters, it has more than {LARGEST_TABLE} bytes; is it a recording?")
-        content = file.read_bytes()
-    except OSError as error:
-        raise DataError(f"'{file}' cannot be read ({error.strerror or error}); check the disk and its permissions") from None
+    content = read_head(file)
     if b"\0" in content:
         raise DataError(f"'{file}' is no table of vehicle parameters; is it compressed or of another format?")
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    try:
-        rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), strict=True)]
+        cells = [[cell.strip() for cell in row] for row in csv.reader(decoded(content).splitlines(), strict=True)]
     except csv.Error as error:
         raise DataError(f"'{file}' cannot be read as a table ({error}); the copy is damaged") from None
-    return [row for row in rows if any(row)]
+    rows = [row for row in cells if any(row)]
+    if len(rows) < 3:
+        raise DataError(f"'{file}' has {len(rows)} lines; a table of vehicle parameters has one of names, one of units and values below")
+    found: dict[str, dict[str, Any]] = {}
+    for name, unit, *values in filter(any, zip_longest(*rows, fillvalue="")):
+        if not name or name in found:
+            raise DataError(f"'{file}': line 1 should name every column once, column {len(found) + 1} is called '{printable(name[:40])}'")
+        if number(unit) is not None:
+            raise DataError(f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?")
+        found[name] = {"value": _value(values, f"'{file}': parameter '{printable(name[:40])}'"), "unit": unit}
+    return found
 
 
-def _number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None
+def _value(cells: list[str], where: str) -> Any:
+    """A column's value, or its values."""
+    while cells and not cells[-1]:
+        cells.pop()
+    if len(cells) == 1:
+        return cells[0] if number(cells[0]) is None else number(cells[0])
+    numbers = [number(cell) for cell in cells]
+    if None in numbers:
+        raise DataError(
+            f"{where} holds '{printable(cells[numbers.index(None)][:40])}' in line {numbers.index(None) + 3}; numbers are needed"
+        )
+    return numbers or None
