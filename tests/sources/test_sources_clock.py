@@ -134,7 +134,7 @@ def test_columns_named_like_channels_need_no_map() -> None:
         ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
         ({"vx": {"column": "a"}}, "channel 'vx': unit is missing"),
-        ({"vx": "a"}, "must say column, unit"),
+        ({"vx": "a"}, "must be a group of options, not 'a'; options: column, unit"),
         ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "unknown key 'scale'; there are: column, unit, sign, factor"),
         ({"vx": {"column": "a", "unit": "m/s", "sign": 2}}, "sign '2' is not one of: 1, -1"),
     ],
@@ -151,12 +151,12 @@ def test_a_time_column_has_a_unit_of_time() -> None:
     assert time_column_from_config({"column": "t", "unit": "ms"}, "mine") == Column("t", "ms")
     with pytest.raises(ConfigurationError, match="data set 'mine': time: unit 'km/h' cannot be converted to 's'"):
         time_column_from_config({"column": "t", "unit": "km/h"}, "mine")
-    with pytest.raises(ConfigurationError, match="data set 'mine': time must say column"):
+    with pytest.raises(ConfigurationError, match="data set 'mine': time: it must be a group of options"):
         time_column_from_config("t", "mine")
-    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here") == Column("3", "s", -1), "YAML reads it as a number"
+    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column("3", "s", -1), "YAML reads it as a number"
     for name in (3.5, True, None, ["3"]):
         with pytest.raises(ConfigurationError, match=f"here: column must be text, not {re.escape(repr(name))}"):
-            column_from_config({"column": name, "unit": "s"}, "here")
+            column_from_config({"column": name, "unit": "s"}, "here", "s")
 
 
 EVEN = np.arange(1000) / 100.0

@@ -93,7 +93,7 @@ def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
     ("changes", "said"),
     [
         ({"layout": "xlsx"}, "layout 'xlsx' is not one of: csv, mat, text"),
-        ({"time": None}, "time must say column"),
+        ({"time": None}, "time: it must be a group of options"),
         ({"time": {"column": "t", "unit": "m/s"}}, "cannot be converted to 's'"),
         ({"channels": {"vx": {"column": "vx", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
         ({"rate": 3}, "has no option 'rate'"),

@@ -158,9 +158,9 @@ def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_
         ({"time": {"column": "t", "unit": "km/h"}}, "time: unit 'km/h' cannot be converted to 's'"),
         ({"channels": {"vx": {"column": "a", "unit": "furlong"}}}, "unit 'furlong' is not known"),
         ({"gappy": ["ay"], "channels": {"vx": {"column": "a", "unit": "m/s"}}}, "gappy names 'ay'"),
-        ({"delimiter": ";;"}, "delimiter must be one character"),
-        ({"encoding": "latin-x"}, "encoding 'latin-x' is not known"),
-        ({"skip_rows": -1}, "skip_rows must be a whole number"),
+        ({"delimiter": ";;"}, "dataset.delimiter: string should have at most 1 character"),
+        ({"encoding": "latin-x"}, "dataset.encoding: 'latin-x' is not known"),
+        ({"skip_rows": -1}, "dataset.skip_rows: input should be greater than or equal to 0"),
         ({"files": "/data/*.csv"}, "files must be a pattern inside path"),
     ],
 )
