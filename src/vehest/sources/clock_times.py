@@ -34,6 +34,11 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     if dates:
         days = _days(dates)
         return None if days is None else times + DAY * days
+    return past_midnight(times)
+
+
+def past_midnight(times: FloatArray) -> FloatArray:
+    """Times since midnight that go on past the next [s], (N,), of times of day."""
     return np.asarray(times + DAY * np.concatenate([[0.0], np.cumsum(np.diff(times) < -0.5 * DAY)]), dtype=np.float64)
 
 

@@ -69,13 +69,11 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
     else:
-        text = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace").decode(read_head(file))
-        lines = [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
-        if not lines:
-            raise DataError(f"'{file}' holds nothing but empty lines")
+        decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
         try:
-            names = next(csv.reader(lines[:1], delimiter=layout.delimiter))
-        except csv.Error as error:
+            lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))[layout.skip_rows :]
+            names = next(csv.reader(filter(None, lines), delimiter=layout.delimiter), [])
+        except (ValueError, csv.Error) as error:
             raise _unreadable(file, error) from None
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
     return names
@@ -95,26 +93,6 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
         raise _unreadable(file, error) from None
 
 
-def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None) -> dict[str, FloatArray]:
-    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
-
-    Args:
-        file: a table.
-        wanted: names of columns.
-        layout: of a table of text.
-        clock: the wanted column that holds times as a clock shows them; it is returned in seconds.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
-    """
-    require_columns(file, column_names(file, layout), wanted)
-    if is_parquet(file):
-        with parquet_file(file) as table:
-            return read_numbers(file, table, wanted)
-    return parse_columns(file, partial(table_stream, file), wanted, layout, clock)
-
-
 def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> None:
     """See that a table has every wanted column once.
 
@@ -129,18 +107,27 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
             raise DataError(f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset")
 
 
-def parse_columns(
-    file: Path, opened: Callable[[], pa.NativeFile], wanted: Sequence[str], layout: TextLayout, clock: str | None = None
+def read_columns(
+    file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None, text: bytes | None = None
 ) -> dict[str, FloatArray]:
-    """Columns of numbers of a table of text, as `read_columns` does.
+    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
 
     Args:
-        file: for messages.
-        opened: opens the table's text.
-        wanted: names of columns that are there once each.
-        layout: of the table.
-        clock: the wanted column that holds times as a clock shows them.
+        file: a table.
+        wanted: names of columns.
+        layout: of a table of text.
+        clock: the wanted column that holds times as a clock shows them; it is returned in seconds.
+        text: of the table where it is not the file's own.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
     """
+    require_columns(file, column_names(file, layout), wanted)
+    if is_parquet(file):
+        with parquet_file(file) as parquet:
+            return read_numbers(file, parquet, wanted)
+    opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     convert = pc.ConvertOptions(
         column_types={name: pa.string() if name == clock else pa.float64() for name in wanted},
         include_columns=list(wanted),
@@ -158,7 +145,7 @@ def parse_columns(
         raise DataError(f"'{file}' has {'a header and ' if layout.names is None else ''}no rows")
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
-    del table
+    del table  # so that a column is dropped as soon as it is converted
     return {name: _seconds(file, name, columns.pop(name)) if name == clock else columns.pop(name).to_numpy() for name in wanted}
 
 
