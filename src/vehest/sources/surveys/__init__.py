@@ -16,7 +16,7 @@ from vehest.sources.surveys.tables import survey_table
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
-MDF, VBO, BAGS = (".mf4", ".mdf", ".dat"), (".vbo",), (".db3", ".mcap", ".zip", ".bag")
+MDF, BAGS = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip")
 
 
 def survey(path: Path) -> Log:
@@ -28,27 +28,7 @@ def survey(path: Path) -> Log:
     """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
-    ending = path.suffix.lower()
-    if path.is_dir() or ending in BAGS:
-        from vehest.sources.surveys.bags import survey_bag
-
-        if ending == ".bag":
-            raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
-        log = survey_bag(path)
-    elif path.stat().st_size == 0:
-        raise MissingError(f"file '{path}' is empty")
-    elif ending in MDF and _begins_as_mdf(path):
-        from vehest.sources.surveys.mdf import survey_mdf
-
-        log = survey_mdf(path)
-    elif ending in VBO:
-        from vehest.sources.surveys.vbo import survey_vbo
-
-        log = survey_vbo(path)
-    elif is_stored_recording(path):
-        raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
-    else:
-        log = survey_table(path)
+    log = _survey(path)
     for run in log.runs:
         if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
             raise DataError(f"'{path}': {fault}")
@@ -58,6 +38,29 @@ def survey(path: Path) -> Log:
     if not log.columns:
         raise DataError(f"'{path}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     return log
+
+
+def _survey(path: Path) -> Log:
+    ending = path.suffix.lower()
+    if ending == ".bag":
+        raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
+    if path.is_dir() or ending in BAGS:
+        from vehest.sources.surveys.bags import survey_bag
+
+        return survey_bag(path)
+    if path.stat().st_size == 0:
+        raise MissingError(f"file '{path}' is empty")
+    if ending in MDF and _begins_as_mdf(path):
+        from vehest.sources.surveys.mdf import survey_mdf
+
+        return survey_mdf(path)
+    if ending == ".vbo":
+        from vehest.sources.surveys.vbo import survey_vbo
+
+        return survey_vbo(path)
+    if is_stored_recording(path):
+        raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
+    return survey_table(path)
 
 
 def _begins_as_mdf(path: Path) -> bool:

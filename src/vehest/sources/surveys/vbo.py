@@ -18,8 +18,7 @@ def survey_vbo(file: Path) -> Log:
         DataError: it is no such file, is damaged, or is more than the limits allow.
     """
     log = read_log(file)
-    columns = [
-        RawColumn(name, log.units.get(name, DEGREES.get(name, "")), samples, {"column": name}) for name, samples in log.columns.items()
-    ]
+    units = {**DEGREES, **log.units}
+    columns = tuple(RawColumn(name, units.get(name, ""), samples, {"column": name}) for name, samples in log.columns.items())
     clock = Stamps("time", "s", "clock time of the format")
-    return Log(file, "vbo", tuple(columns), {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),))
+    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),))
