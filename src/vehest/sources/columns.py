@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from vehest.constants import FloatArray
-from vehest.data.channels import CHANNELS, channel
+from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
@@ -85,13 +85,3 @@ def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] 
     except DataError as error:
         raise ConfigurationError(f"{where}: {error}") from None
     return column
-
-
-def time_column_from_config(entry: Any, dataset: str) -> Column:
-    """The declaration of the time column; raises `ConfigurationError` as `column_from_config` does."""
-    return column_from_config(entry, f"data set '{dataset}': time", "s")
-
-
-def identity_columns(names: list[str]) -> dict[str, Column]:
-    """Columns that already carry a channel's name and unit."""
-    return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}

@@ -23,9 +23,8 @@ from vehest.sources.columns import (
     Column,
     ColumnName,
     Positive,
+    column_from_config,
     columns_from_config,
-    identity_columns,
-    time_column_from_config,
 )
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
@@ -78,7 +77,7 @@ class TabularSource(FileSource):
         super().__init__(dataset)
         options, where = self.options, self.where
         self.columns = None if options.channels is None else columns_from_config(options.channels, self.name)
-        self.time = None if options.time is None else time_column_from_config(options.time, self.name)
+        self.time = None if options.time is None else column_from_config(options.time, f"{where}: time", "s")
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
         if options.time_restarts and (options.runs is not None or self.time is None):
@@ -126,12 +125,12 @@ class TabularSource(FileSource):
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)
-        names = column_names(file, self.layout)
-        columns = identity_columns(names) if self.columns is None else self.columns
+        names, columns = column_names(file, self.layout), self.columns
+        if columns is None:
+            columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
         if not columns:
-            raise DataError(
-                f"'{file}' has no column that is named like a channel (it has {listed(names)}); declare the columns in conf/dataset"
-            )
+            what = f"has no column that is named like a channel (it has {listed(names)})"
+            raise DataError(f"'{file}' {what}; declare the columns in conf/dataset")
         wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
         extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
         values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
@@ -178,12 +177,10 @@ class TabularSource(FileSource):
         """Tables of the data set, without those that it excludes."""
         found = super()._files()
         stems, patterns = {file.stem for file in found}, self.options.exclude or ()
-        for pattern in patterns:
-            if not any(fnmatchcase(stem, pattern) for stem in stems):
-                raise MissingError(f"{self.where}: exclude names '{pattern}', which no file is called")
-        for stem in self.dropped:
-            if stem not in stems:
-                raise MissingError(f"{self.where}: drop_rows names '{stem}', which no file is called")
+        for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
+            for name in named:
+                if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):
+                    raise MissingError(f"{self.where}: {option} names '{name}', which no file is called")
         kept = [file for file in found if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)]
         if not kept:
             raise MissingError(f"{self.where}: exclude leaves none of its files")

@@ -19,9 +19,9 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import existing_folder, require_files
 from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, columns_from_config, time_column_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
-from vehest.sources.revs.csv_layout import read_csv_columns, read_csv_head
+from vehest.sources.revs.csv_layout import read_csv
 from vehest.sources.revs.mat_layout import read_mat_columns
 from vehest.sources.revs.parameters import read_vehicle_parameters
 from vehest.sources.tables import TextLayout, read_columns
@@ -61,7 +61,7 @@ class RevsSource(FileSource):
         self.columns = columns_from_config({**(options.channels or {}), **(extra or {})}, self.name)
         if not self.columns:
             raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
-        self.time = time_column_from_config(options.time, self.name)
+        self.time = column_from_config(options.time, f"{self.where}: time", "s")
         self.gappy = self._gappy_among(self.columns)
         if options.rate_hz is not None and options.layout != "mat":
             raise ConfigurationError(f"{self.where}: rate_hz is an option of layout mat; 'vehest downsample' brings others to another rate")
@@ -120,13 +120,12 @@ class RevsSource(FileSource):
 
     def _read_csv(self, file: Path) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         columns = list(dict.fromkeys([self.time.column, *self.column_names]))
-        head = read_csv_head(file, columns, self.options.preamble_lines)
+        values, units, about = read_csv(file, columns, self.gappy_columns, self.options.preamble_lines)
         if self.options.units_row == "check":
             for name, column in self.columns.items():
                 where = f"'{file}': column '{column.column}'"
-                require_unit(head.units[column.column], column, channel(name).unit, where, "set units_row: ignore")
-        values, dropped = read_csv_columns(file, head, columns, self.gappy_columns)
-        return values, {"file": file.name, "preamble": head.preamble, "rows_dropped_at_the_head": dropped}
+                require_unit(units[column.column], column, channel(name).unit, where, "set units_row: ignore")
+        return values, about
 
     def _read_text(self, folder: Path) -> dict[str, FloatArray]:
         """Columns of text files with a number a line."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,20 +18,6 @@ from vehest.sources.limited import read_limited
 
 READER = "vehest.sources.readers.mat_files:read_channels"
 SLACK = 1e-2  # of an interval: as far as stamps may jitter
-
-
-@dataclass(frozen=True)
-class _Signal:
-    """A column with its own times [s]; the last value holds for an interval."""
-
-    name: str
-    values: FloatArray
-    stamps: FloatArray
-    rate_hz: float
-
-    @property
-    def end(self) -> float:
-        return float(self.stamps[-1]) + 1.0 / self.rate_hz
 
 
 def read_mat_columns(
@@ -63,37 +48,28 @@ def read_mat_columns(
         DataError: the file or a column cannot be used as it is.
     """
     reading = read_limited(READER, regular_file(file), columns=columns, time=time.column)
-    signals = {}
+    values: dict[str, FloatArray] = {}
+    stamps: dict[str, FloatArray] = {}
+    rates: dict[str, float] = {}
     for column, name in reading.summary["names"].items():
-        values, stamps = reading.arrays[f"{column}.value"], time.to_si(reading.arrays[f"{column}.time"], "s")
-        signals[column] = _signal(f"'{file}': '{name}'", name, values, stamps, policy, column in gappy)
-    slowest = min(signals.values(), key=lambda signal: signal.rate_hz)
-    latest_start = max(signals.values(), key=lambda signal: float(signal.stamps[0]))
-    earliest_end = min(signals.values(), key=lambda signal: signal.end)
-    rate, origin = rate_hz or slowest.rate_hz, slowest.stamps[0]
-    span = (earliest_end.end - origin) * rate
-    check_limit("samples", span, f"'{file}' would become {span:.0f} samples at {rate:.6g} Hz")
-    first = max(math.ceil((latest_start.stamps[0] - origin) * rate - SLACK), 0)
-    n_samples = math.ceil(span - SLACK) - first
+        samples, times, where = reading.arrays[f"{column}.value"], time.to_si(reading.arrays[f"{column}.time"], "s"), f"'{file}': '{name}'"
+        rates[column] = uniform_clock(times, where, policy).rate_hz
+        blank = np.isnan(samples) & (column not in gappy)
+        first = int(np.argmin(blank))
+        if blank[first:].any():
+            missing = times[first:][blank[first:]][0]
+            what = f"holds NaN at {missing:.12g} s; cut the range out, or declare its channel in 'gappy' if that means 'not measured'"
+            raise DataError(f"{where} {what}")
+        values[column], stamps[column] = samples[first:], times[first:]
+    slowest = min(rates, key=lambda column: rates[column])
+    rate, origin = rate_hz or rates[slowest], float(stamps[slowest][0])
+    start = max(float(own[0]) for own in stamps.values())
+    end = min(float(own[-1]) + 1.0 / rates[column] for column, own in stamps.items())  # the last value holds for an interval
+    check_limit("samples", (end - origin) * rate, f"'{file}' would become {(end - origin) * rate:.0f} samples at {rate:.6g} Hz")
+    first = max(math.ceil((start - origin) * rate - SLACK), 0)
+    n_samples = math.ceil((end - origin) * rate - SLACK) - first
     if n_samples < 2:
-        raise DataError(
-            f"'{file}': '{earliest_end.name}' ends at {earliest_end.end:.12g} s, '{latest_start.name}' begins at "
-            f"{latest_start.stamps[0]:.12g} s; there is no time in which all columns are measured"
-        )
+        raise DataError(f"'{file}': one column ends at {end:.12g} s, one begins at {start:.12g} s; nothing is common to all")
     ticks = origin + (first + np.arange(n_samples)) / rate
-    held = {column: at_ticks(own.values, own.stamps, ticks, hold=True, slack=SLACK / own.rate_hz) for column, own in signals.items()}
-    return Clock(float(ticks[0]), rate, n_samples), held, {column: own.rate_hz for column, own in signals.items()}
-
-
-def _signal(where: str, name: str, values: FloatArray, stamps: FloatArray, policy: ClockPolicy, gappy: bool) -> _Signal:
-    """A column from its first value on; a gappy one from its first sample on."""
-    rate_hz = uniform_clock(stamps, where, policy).rate_hz
-    if gappy:
-        return _Signal(name, values, stamps, rate_hz)
-    blank = np.isnan(values)
-    first = int(np.argmin(blank))
-    if blank[first:].any():
-        missing = first + int(np.argmax(blank[first:]))
-        what = f"holds NaN at {stamps[missing]:.12g} s; cut the range out, or declare its channel in 'gappy' if that means 'not measured'"
-        raise DataError(f"{where} {what}")
-    return _Signal(name, values[first:], stamps[first:], rate_hz)
+    held = {name: at_ticks(values[name], stamps[name], ticks, hold=True, slack=SLACK / rates[name]) for name in columns}
+    return Clock(float(ticks[0]), rate, n_samples), held, rates
