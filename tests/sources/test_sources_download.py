@@ -197,7 +197,7 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
 
 def test_a_server_without_a_trusted_connection_is_one_line_and_not_tried_again(server: Server, tmp_path: Path) -> None:
     refused = refusal(Download("mine", tmp_path, server.url.replace("http:", "https:"), ("a.csv",)), MissingError)
-    assert "/a.csv: no trusted connection, " in refused
+    assert "SSLError" in refused
     assert server.asked == []
 
 

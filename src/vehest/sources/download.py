@@ -135,10 +135,8 @@ class Download:
         except OSError as error:
             if error.errno is not None:
                 raise writing_error(path, error) from error
-            reason = str(error).rsplit(": ", 1)[-1].split("', ")[0].rstrip("'\")")  # the innermost of the errors that requests reports
-            trust = "no trusted connection, " if "SSLError" in str(error) else ""
             part = "; the same command goes on after what has arrived" if downloader.part.exists() else ""
-            raise MissingError(f"cannot fetch {address}: {trust}{reason[:160]}{part}") from None
+            raise MissingError(f"cannot fetch {address}: {str(error)[-200:]}{part}") from None  # the cause comes last
         except ValueError as error:  # of pooch, which has removed the file
             raise DataError(f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})") from None
         return Outcome(name, "fetched", found, path.stat().st_size, downloader.resumed_at)

@@ -140,7 +140,7 @@ def read_columns(
         try:
             table = parse_table(opened, layout, convert, threads=False)  # its errors state the row
         except DAMAGE as error:
-            raise _wrong_cell(file, layout, str(error)) or _unreadable(file, error) from None
+            raise _unreadable(file, error, layout) from None
     if not table.num_rows:
         raise DataError(f"'{file}' has {'a header and ' if layout.names is None else ''}no rows")
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
@@ -196,16 +196,12 @@ def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
     return seconds
 
 
-def _wrong_cell(file: Path, layout: TextLayout, message: str) -> DataError | None:
-    """The error for text in a column of numbers; None where pyarrow's message is of something else."""
-    found = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", message, re.DOTALL)
-    if found is None:
-        return None
-    name, above = column_names(file, layout)[int(found[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
-    text = printable(found[3] if len(found[3]) <= 40 else f"{found[3][:40]}…")
-    return DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {int(found[2]) - above}; numbers are needed")
-
-
-def _unreadable(file: Path, error: Exception) -> DataError:
+def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) -> DataError:
+    """The error of pyarrow in one line; with a layout, a cell of text by its column's name."""
+    cell = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", str(error), re.DOTALL)
+    if cell is not None and layout is not None:
+        name, above = column_names(file, layout)[int(cell[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
+        where = f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row {int(cell[2]) - above}"
+        return DataError(f"'{file}': {where}; numbers are needed")
     problem = f"a line is longer than {BLOCK} bytes" if "straddl" in str(error) else printable(first_line(error))
     return DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?")

@@ -60,16 +60,14 @@ class Log:
         units: name -> unit as the file writes it; only of columns that have one.
         seconds: clock time since midnight, going on past it [s], (T,).
         offsets: point (``CoG``, ``FL``, …) -> lateral and longitudinal distance from the antenna at which slip is given [m].
-        created: first line of the file.
-        n_dropped: rows at the end that were cut off or came late.
+        provenance: first line of the file, offsets, and rows at the end that were cut off or came late.
     """
 
     columns: Mapping[str, FloatArray]
     units: Mapping[str, str]
     seconds: FloatArray
     offsets: Mapping[str, tuple[float, float]]
-    created: str
-    n_dropped: int
+    provenance: Mapping[str, Any]
 
 
 class VboSource(FileSource):
@@ -104,13 +102,7 @@ class VboSource(FileSource):
             unit, where = channel(name).unit, f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
             channels[name] = clock.align(column.to_si(log.columns[column.column], unit), gappy=name in self.gappy)
-        provenance = {
-            "file": file.name,
-            "created": log.created,
-            "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in log.offsets.items()},
-            "rows_dropped_at_the_end": log.n_dropped,
-        }
-        return self._recording(file.stem, f"'{file}'", clock, channels, provenance)
+        return self._recording(file.stem, f"'{file}'", clock, channels, {"file": file.name, **log.provenance})
 
 
 def read_log(file: Path) -> Log:
@@ -146,8 +138,12 @@ def read_log(file: Path) -> Log:
     own = dict(zip(names[len(names) - len(units) :], units, strict=True)) if len(units) <= len(names) else {}
     found = OFFSETS.findall(sections.get("comments", ""))
     offsets = {point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found}
-    created = printable(" ".join(first.partition("\n")[0].split()))[:80]
-    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, offsets, created, cut_off + late)
+    provenance = {
+        "created": printable(" ".join(first.partition("\n")[0].split()))[:80],
+        "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in offsets.items()},
+        "rows_dropped_at_the_end": cut_off + late,
+    }
+    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, offsets, provenance)
 
 
 def require_slip_offsets(log: Log, where: str) -> None:
