@@ -71,17 +71,15 @@ def survey_table(file: Path) -> Log:
     """
     if is_parquet(file):
         with parquet_file(file) as table:
-            schema = table.schema_arrow
-            names = [name for name in schema.names if _is_numeric(schema.field(name).type)]
+            names = [field.name for field in table.schema_arrow if _is_numeric(field.type)]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             return _log(file, read_numbers(file, table, names), {}, {}, {}, [])
     shape = shape_of(file)
     check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
     values, clocks, marks, skipped = _columns(file, shape)
-    layout, plain = asdict(shape.layout), asdict(TextLayout())
-    options = {name: option for name, option in layout.items() if name in ("delimiter", "decimal") or option != plain[name]}
-    options |= {"missing": sorted(marks)} if marks else {}
-    return _log(file, values, clocks, shape.units, options, skipped)
+    always, plain = ("delimiter", "decimal"), asdict(TextLayout())
+    options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
+    return _log(file, values, clocks, shape.units, options | ({"missing": sorted(marks)} if marks else {}), skipped)
 
 
 def _log(
@@ -92,16 +90,7 @@ def _log(
     options: dict[str, Any],
     skipped: list[str],
 ) -> Log:
-    """The log of a table.
-
-    Args:
-        file: the table.
-        values: name -> numbers, (N,).
-        clocks: name -> times that are written as a clock's [s], (N,).
-        units: name -> unit below it.
-        options: of the source.
-        skipped: columns that were not read, and why.
-    """
+    """The log of columns of numbers and of clock times [s], (N,), units below the names, options of the source and what was not read."""
     if not values:
         raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     n_rows = len(next(iter(values.values())))
@@ -142,7 +131,7 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """How a table of text is laid out, from its beginning.
+    """Layout of a table of text, by its beginning.
 
     Raises:
         DataError: it is no table of text, has one column only, or no line of names.
@@ -150,7 +139,8 @@ def shape_of(file: Path) -> Shape:
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]
-    best = max((_shape(lines, delimiter, encoding) for delimiter in DELIMITERS), key=lambda shape: shape.score)
+    marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",") if decimal != delimiter]
+    best = max((_shape(lines, *pair, encoding) for pair in marks), key=lambda shape: shape.score)
     if not best.score:
         raise DataError(f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?")
     if not best.names:
@@ -160,24 +150,21 @@ def shape_of(file: Path) -> Shape:
     return best
 
 
-def _shape(lines: Sequence[str], delimiter: str, encoding: str) -> Shape:
-    nothing = Shape(TextLayout(delimiter, encoding=encoding))
-    rows = [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
-    filled = [k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
-    lengths = [len(rows[k]) for k in filled[len(filled) // 2 :]]
+def _shape(lines: Sequence[str], delimiter: str, decimal: str, encoding: str) -> Shape:
+    """The table that a delimiter and a decimal mark make of lines: names and units stand right above the first two rows of numbers."""
+    split = [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
+    rows = {k: row for k, row in enumerate(split) if any(cell.strip() for cell in row)}
+    lengths = [len(row) for row in rows.values()][len(rows) // 2 :]
     n_columns = max(set(lengths), key=lengths.count, default=0)
-    if n_columns < 2:
-        return nothing
-    shares = {mark: {k: _share(rows[k], mark) for k in filled} for mark in (".", ",") if mark != delimiter}
-    decimal = max(shares, key=lambda mark: sum(shares[mark].values()))
-    data = [k for k, share in shares[decimal].items() if share >= LEAST_NUMBERS and len(rows[k]) == n_columns]
-    if not data:
-        return nothing
+    shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns}
+    data = [k for k, share in shares.items() if share >= LEAST_NUMBERS]
+    if n_columns < 2 or not data:
+        return Shape(TextLayout())
     first = next((k for k, after in pairwise([*data, len(lines)]) if after - k == 1 or k == data[-1]), data[0])
-    score = sum(shares[decimal][k] for k in data) / len(filled) + 0.01 * min(n_columns, 20)
-    above = [k for k in filled if k < first and len(rows[k]) == n_columns]
+    score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
+    above = [k for k in shares if k < first]
     if not above:
-        return Shape(nothing.layout, score=score, first=first)
+        return Shape(TextLayout(), score=score, first=first)
     below = int(len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(rows[above[-1]]))
     names = tuple(rows[above[-1] - below])
     units = {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)} if below else {}
