@@ -217,7 +217,7 @@ def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("mass\nkg\n", "has 2 lines"),
+        ("mass\nkg\n", "is no table of vehicle parameters"),
         ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 is called ''"),
         ("mass\nkg\n1\nabc\n", "parameter 'mass' holds 'abc' in line 4"),
         ("a,b\nkg,m\n1,1\n,2\n3,3\n", "parameter 'a' holds '' in line 4; numbers are needed"),

@@ -21,9 +21,8 @@ from vehest.sources.base import existing_folder, require_files
 from vehest.sources.clocks import ClockPolicy, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
-from vehest.sources.revs.csv_layout import read_csv
+from vehest.sources.revs.csv_layout import read_csv, read_vehicle_parameters
 from vehest.sources.revs.mat_layout import read_mat_columns
-from vehest.sources.revs.parameters import read_vehicle_parameters
 from vehest.sources.tables import TextLayout, read_columns
 from vehest.sources.unit_spellings import require_unit
 

@@ -1,5 +1,7 @@
 """The official CSV files of Revs: lines about the drive, names, units, then a row a millisecond with blank heads of slow columns.
 
+Tables of vehicle parameters have a line of names, one of units, then values, a column a parameter.
+
 Only the lines above the rows hold anything but ASCII. They alone are decoded here: transcoding the rows takes as long as reading them.
 """
 
@@ -8,13 +10,14 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Collection, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, printable
 from vehest.sources.tables import TextLayout, listed, read_columns, read_head, require_columns
 
 LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but broken
@@ -38,7 +41,7 @@ def read_csv(
         DataError: it has other lines, lacks a column, a cell cannot be read, or a column begins after half of the rows.
     """
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
-    lines = [decoded(line).strip() for line in (*head, b"", b"")]
+    lines = [_decoded(line).strip() for line in (*head, b"", b"")]
     names, units = (
         [cell.strip() for cell in next(csv.reader(line.splitlines()), [])] for line in lines[preamble_lines : preamble_lines + 2]
     )
@@ -46,7 +49,7 @@ def read_csv(
         problem = f"line {preamble_lines + 1} should name the columns and has no '{time}' (it has {listed(names)})"
         raise DataError(f"'{file}': {problem}; correct preamble_lines, or is it no official Revs file?")
     require_columns(file, names, columns)
-    if len(units) != len(names) or any(number(unit) is not None for unit in units):
+    if len(units) != len(names) or any(_number(unit) is not None for unit in units):
         raise DataError(f"'{file}': line {preamble_lines + 2} should hold units of the {len(names)} columns; was it removed?")
     values = read_columns(file, columns, TextLayout(skip_rows=preamble_lines + 2, names=tuple(names)))
     starts = {name: int(np.argmin(np.isnan(values[name]))) for name in columns[1:] if name not in gappy}
@@ -60,7 +63,46 @@ def read_csv(
     return {name: samples[first:] for name, samples in values.items()}, dict(zip(names, units, strict=True)), about
 
 
-def decoded(content: bytes) -> str:
+def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
+    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``.
+
+    A parameter with several values (a curve, such as road-wheel angles over the angle of the steering wheel) has a list of them.
+    Cells below a column's last value are blank; text is kept as text.
+
+    Raises:
+        DataError: it is no such table.
+    """
+    text = _decoded(read_head(file))
+    try:
+        rows = [row for line in csv.reader(text.splitlines(), strict=True) if any(row := [cell.strip() for cell in line])]
+    except csv.Error as error:
+        raise DataError(f"'{file}' cannot be read as a table ({error}); the copy is damaged") from None
+    if len(rows) < 3 or "\0" in text:
+        raise DataError(f"'{file}' is no table of vehicle parameters: a line of names, one of units, and values below")
+    found: dict[str, dict[str, Any]] = {}
+    for name, unit, *values in filter(any, zip_longest(*rows, fillvalue="")):
+        if not name or name in found:
+            raise DataError(f"'{file}': line 1 should name every column once, column {len(found) + 1} is called '{printable(name[:40])}'")
+        if _number(unit) is not None:
+            raise DataError(f"'{file}': line 2 should hold units and holds numbers; was the line of units removed?")
+        found[name] = {"value": _value(values, f"'{file}': parameter '{printable(name[:40])}'"), "unit": unit}
+    return found
+
+
+def _value(cells: list[str], where: str) -> Any:
+    """A column's value, or its values."""
+    while cells and not cells[-1]:
+        cells.pop()
+    if len(cells) == 1:
+        return cells[0] if _number(cells[0]) is None else _number(cells[0])
+    numbers = [_number(cell) for cell in cells]
+    for line, (cell, found) in enumerate(zip(cells, numbers, strict=True), start=3):
+        if found is None:
+            raise DataError(f"{where} holds '{printable(cell[:40])}' in line {line}; numbers are needed")
+    return numbers or None
+
+
+def _decoded(content: bytes) -> str:
     """Text in UTF-8 or else Latin-1."""
     try:
         return content.decode("utf-8-sig")
@@ -68,7 +110,7 @@ def decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def number(text: str) -> float | None:
+def _number(text: str) -> float | None:
     """A finite number; None of other text."""
     try:
         value = float(text)

@@ -11,12 +11,16 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
 from vehest.sources.clocks import clock_fault, span_fault
+from vehest.sources.surveys.bags import survey_bag
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
+from vehest.sources.surveys.mdf import survey_mdf
 from vehest.sources.surveys.tables import survey_table
+from vehest.sources.vbo import read_log
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
 MDF, BAGS = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip")
+DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 
 
 def survey(path: Path) -> Log:
@@ -45,22 +49,24 @@ def _survey(path: Path) -> Log:
     if ending == ".bag":
         raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
     if path.is_dir() or ending in BAGS:
-        from vehest.sources.surveys.bags import survey_bag
-
         return survey_bag(path)
     if path.stat().st_size == 0:
         raise MissingError(f"file '{path}' is empty")
     if ending in MDF and _begins_as_mdf(path):
-        from vehest.sources.surveys.mdf import survey_mdf
-
         return survey_mdf(path)
     if ending == ".vbo":
-        from vehest.sources.surveys.vbo import survey_vbo
-
-        return survey_vbo(path)
+        return _survey_vbo(path)
     if is_stored_recording(path):
         raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
     return survey_table(path)
+
+
+def _survey_vbo(file: Path) -> Log:
+    log = read_log(file)
+    units = {**DEGREES, **log.units}
+    columns = tuple(RawColumn(name, units.get(name, ""), samples, {"column": name}) for name, samples in log.columns.items())
+    clock = Stamps("time", "s", "clock time of the format")
+    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),))
 
 
 def _begins_as_mdf(path: Path) -> bool:
