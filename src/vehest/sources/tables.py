@@ -40,6 +40,7 @@ class TextLayout:
         rows_below_names: lines between the names and the rows.
         missing: cells without a sample, beside empty ones, NaN, NA and null.
         names: of the columns where the file has no line of them.
+        clock: column of times as a clock shows them, which become seconds.
     """
 
     delimiter: str = ","
@@ -49,6 +50,7 @@ class TextLayout:
     rows_below_names: int = 0
     missing: tuple[str, ...] = ()
     names: tuple[str, ...] | None = None
+    clock: str | None = None
 
 
 def is_parquet(file: Path) -> bool:
@@ -107,16 +109,13 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
             raise DataError(f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset")
 
 
-def read_columns(
-    file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None, text: bytes | None = None
-) -> dict[str, FloatArray]:
+def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None) -> dict[str, FloatArray]:
     """Columns of numbers, shape (T,) each, NaN where a sample is missing.
 
     Args:
         file: a table.
         wanted: names of columns.
         layout: of a table of text.
-        clock: the wanted column that holds times as a clock shows them; it is returned in seconds.
         text: of the table where it is not the file's own.
 
     Raises:
@@ -129,7 +128,7 @@ def read_columns(
             return read_numbers(file, parquet, wanted)
     opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     convert = pc.ConvertOptions(
-        column_types={name: pa.string() if name == clock else pa.float64() for name in wanted},
+        column_types={name: pa.string() if name == layout.clock else pa.float64() for name in wanted},
         include_columns=list(wanted),
         decimal_point=layout.decimal,
         null_values=[*pc.ConvertOptions().null_values, *layout.missing],
@@ -146,7 +145,7 @@ def read_columns(
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
     del table  # so that a column is dropped as soon as it is converted
-    return {name: _seconds(file, name, columns.pop(name)) if name == clock else columns.pop(name).to_numpy() for name in wanted}
+    return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else columns.pop(name).to_numpy() for name in wanted}
 
 
 def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:

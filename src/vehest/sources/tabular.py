@@ -71,7 +71,6 @@ class TabularSource(FileSource):
     """Tables, a recording each, or one for each uninterrupted run that a column of them counts."""
 
     options_type = TabularOptions
-    written_clock: str | None = None  # column of times that are written as a clock's
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
@@ -139,7 +138,7 @@ class TabularSource(FileSource):
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out."""
-        values = read_columns(file, wanted, self.layout, self.written_clock)
+        values = read_columns(file, wanted, self.layout)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values

@@ -36,11 +36,12 @@ class TextLogSource(TabularSource):
     options_type = TextLogOptions
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
-        time = dataset.get("time")
+        time, clock = dataset.get("time"), None
         if isinstance(time, Mapping) and time.get("unit") == CLOCK:
-            dataset, self.written_clock = {**dataset, "time": {**time, "unit": "s"}}, str(time.get("column"))
+            dataset, clock = {**dataset, "time": {**time, "unit": "s"}}, str(time.get("column"))
         super().__init__(dataset)
-        self.layout = replace(self.layout, rows_below_names=self.options.rows_below_names, missing=self.options.missing or ())
+        below, missing = self.options.rows_below_names, self.options.missing or ()
+        self.layout = replace(self.layout, rows_below_names=below, missing=missing, clock=clock)
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out, and without gaps that are short enough."""

@@ -18,7 +18,6 @@ from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import regular_file
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
@@ -120,13 +119,12 @@ def read_log(file: Path) -> Log:
     first, *parts = re.split(r"^\[([^\]\n]+)\]\s*?$", lines, flags=re.MULTILINE)
     sections = {title.strip().lower(): text for title, text in zip(parts[::2], parts[1::2], strict=True)}
     names = sections.get("column names", "").split()
-    check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-    require_columns(file, names, ["time", *names])
-
     text = re.sub(rb" ?\r?\n ?", b"\n", re.sub(rb"[ \t]+", b" ", rows.strip()))
     last = text.rfind(b"\n") + 1
     cut_off = last > 0 and text.count(b" ", last) < len(names) - 1
-    columns = read_columns(file, names, TextLayout(delimiter=" ", names=tuple(names)), text=text[:last] if cut_off else text)
+    columns = read_columns(
+        file, list(dict.fromkeys(["time", *names])), TextLayout(delimiter=" ", names=tuple(names)), text=text[:last] if cut_off else text
+    )
     seconds = _seconds(columns.pop("time"), file)
     late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
     if late:

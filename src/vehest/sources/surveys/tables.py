@@ -53,14 +53,12 @@ class Shape:
         names: of the columns; empty where no line above the numbers has them.
         units: name -> unit in the row below the names, if there is one.
         score: share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row.
-        first: line of the first numbers.
     """
 
     layout: TextLayout
     names: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     score: float = 0.0
-    first: int = 0
 
 
 def survey_table(file: Path) -> Log:
@@ -75,7 +73,6 @@ def survey_table(file: Path) -> Log:
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
             return _log(file, read_numbers(file, table, names), {}, {}, {}, [])
     shape = shape_of(file)
-    check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
     values, clocks, marks, skipped = _columns(file, shape)
     always, plain = ("delimiter", "decimal"), asdict(TextLayout())
     options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
@@ -144,8 +141,8 @@ def shape_of(file: Path) -> Shape:
     if not best.score:
         raise DataError(f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?")
     if not best.names:
-        row = lines[best.first][:60]
-        raise DataError(f"'{file}' has no line of names above its first numbers ({printable(row)}); write one there")
+        raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
+    check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
     require_columns(file, best.names, filter(None, best.names))
     return best
 
@@ -164,12 +161,12 @@ def _shape(lines: Sequence[str], delimiter: str, decimal: str, encoding: str) ->
     score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
     above = [k for k in shares if k < first]
     if not above:
-        return Shape(TextLayout(), score=score, first=first)
+        return Shape(TextLayout(), score=score)
     below = int(len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(rows[above[-1]]))
     names = tuple(rows[above[-1] - below])
     units = {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)} if below else {}
     layout = TextLayout(delimiter, decimal, encoding, skip_rows=above[-1] - below, rows_below_names=below)
-    return Shape(layout, names, units, score, first)
+    return Shape(layout, names, units, score)
 
 
 def _share(row: Sequence[str], decimal: str) -> float:
