@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from vehest.data.errors import DataError, VehestError
+from vehest.data.errors import DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.archive import unpacked
 
@@ -35,11 +35,10 @@ def packed(folder: Path, content: dict[str, bytes], name: str = "bag.zip") -> Pa
     return file
 
 
-def refusal(file: Path, kind: type[VehestError] = DataError, **limits: int) -> str:
+def refusal(file: Path, **limits: int) -> str:
     before = sorted(file.parent.rglob("*"))
-    with pytest.raises(kind) as error, unpacked(file, **limits):
+    with pytest.raises(DataError) as error, unpacked(file, **limits):
         pytest.fail("it was unpacked")
-    assert type(error.value) is kind
     message = str(error.value)
     assert str(file) in message
     assert message.isprintable()  # no line breaks, no control characters of an entry's name
@@ -55,15 +54,7 @@ def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> Non
     assert not folder.exists()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../evil",
-        "/etc/evil",
-        "C:\\evil",
-        "a/\x1b[2J",
-    ],
-)
+@pytest.mark.parametrize("name", ["../evil", "/etc/evil", "C:\\evil", "a/\x1b[2J"])
 def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> None:
     message = refusal(packed(tmp_path, {"bag/metadata.yaml": b"", name: b"evil"}))
     assert "is no file inside the folder" in message
@@ -95,15 +86,6 @@ def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None
         raw[at : at + 4] = (10).to_bytes(4, "little")
     file.write_bytes(raw)
     assert "not a sound zip archive" in refusal(file)
-
-
-def test_an_encrypted_archive_is_refused(tmp_path: Path) -> None:
-    file = packed(tmp_path, {"data.db3": b"secret"})
-    raw = bytearray(file.read_bytes())
-    for at in (raw.index(b"PK\x03\x04") + 6, raw.index(b"PK\x01\x02") + 8):
-        raw[at] |= 1
-    file.write_bytes(raw)
-    assert "is encrypted" in refusal(file)
 
 
 def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path: Path) -> None:
