@@ -114,7 +114,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 
 
 def download(server: Server, folder: Path, *names: str, known: dict[str, str] | None = None) -> Download:
-    return Download("mine", folder, server.url, names or ("a.csv",), known or {})
+    return Download(folder, server.url, names or ("a.csv",), known or {})
 
 
 def fetch(what: Download) -> list[Outcome]:
@@ -188,7 +188,7 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
 
 
 def test_a_server_without_a_trusted_connection_is_one_line_and_not_tried_again(server: Server, tmp_path: Path) -> None:
-    refused = refusal(Download("mine", tmp_path, server.url.replace("http:", "https:"), ("a.csv",)), MissingError)
+    refused = refusal(Download(tmp_path, server.url.replace("http:", "https:"), ("a.csv",)), MissingError)
     assert "SSLError" in refused
     assert server.asked == []
 
@@ -260,7 +260,7 @@ ENTRY = {"url": "https://example.org/folder", "files": ["a.csv"]}
 def test_an_entry_says_address_files_and_checksums() -> None:
     entry = {"url": "https://example.org/folder/", "files": ["a.csv", "b 1.csv"], "sha256": {"a.csv": "AB" * 32}}
     what = download_of(open_source({**TABULAR, "download": entry}))
-    assert (what.dataset, what.folder, what.files, what.sha256) == ("mine", Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
+    assert (what.folder, what.files, what.sha256) == (Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
     assert what.address("b 1.csv") == "https://example.org/folder/b%201.csv"
 
 

@@ -51,40 +51,23 @@ class DownloadOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result for one file.
-
-    Args:
-        name: of the file.
-        what: ``fetched``; ``matched`` its recorded checksum; or was there and its checksum ``recorded`` on first sight.
-        sha256: of its bytes.
-        size: bytes.
-        resumed_at: bytes that an earlier attempt had left, 0 for a file in one go.
-    """
+    """Result for one file."""
 
     name: str
-    what: Literal["fetched", "matched", "recorded"]
+    what: Literal["fetched", "matched", "recorded"]  # matched its known checksum; was there and its checksum is recorded on first sight
     sha256: str
-    size: int
-    resumed_at: int = 0
+    size: int  # bytes
+    resumed_at: int = 0  # bytes that an earlier attempt had left
 
 
 @dataclass(frozen=True)
 class Download:
-    """Files of a data set, their address and their folder.
+    """Files of a data set, the folder where they belong, and the address of the folder that they come from."""
 
-    Args:
-        dataset: name of the data set.
-        folder: where the files belong.
-        url: address of the folder that they come from.
-        files: their names.
-        sha256: checksums known beforehand, by name.
-    """
-
-    dataset: str
     folder: Path
     url: str
     files: tuple[str, ...]
-    sha256: Mapping[str, str] = field(default_factory=dict)
+    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums known beforehand, by name
 
     def address(self, name: str) -> str:
         """Address of a file."""
@@ -173,7 +156,7 @@ def download_of(source: Source) -> Download:
         raise ConfigurationError(f"{where}: download.files must list the names of files, each once, not {list(files)}")
     path = str(source.dataset.get("path") or "None")
     folder = existing_folder(None, source.name) if path.split("/")[0] in {"None", "null"} else Path(path).expanduser()
-    return Download(source.name, folder, options.url, files, {name: digest.lower() for name, digest in (options.sha256 or {}).items()})
+    return Download(folder, options.url, files, {name: digest.lower() for name, digest in (options.sha256 or {}).items()})
 
 
 def _read_checksums(folder: Path) -> dict[str, str]:

@@ -64,9 +64,15 @@ class TablePose:
         x, y, yaw = (clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"])))
         if len(x) < self.window:
             raise DataError(f"{where}: {len(x)} poses are fewer than the {self.window} of the filter's window")
-        shape = {"window": self.window, "order": self.order}
-        lever = (self.lever_x, self.lever_y)
-        motion = planar_motion(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, mounting_yaw=self.yaw_offset, lever=lever, **shape)
+        motion = planar_motion(
+            np.stack([x, y], axis=1),
+            yaw,
+            1.0 / clock.rate_hz,
+            window=self.window,
+            order=self.order,
+            mounting_yaw=self.yaw_offset,
+            lever=(self.lever_x, self.lever_y),
+        )
         return motion.channels(self.channels)
 
 

@@ -30,27 +30,16 @@ PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 @dataclass(frozen=True)
 class TextLayout:
-    """Layout of a table of text.
-
-    Args:
-        delimiter: between cells.
-        decimal: mark of numbers.
-        encoding: of the text.
-        skip_rows: lines above the names; above the rows where ``names`` are given.
-        rows_below_names: lines between the names and the rows.
-        missing: cells without a sample, beside empty ones, NaN, NA and null.
-        names: of the columns where the file has no line of them.
-        clock: column of times as a clock shows them, which become seconds.
-    """
+    """Layout of a table of text."""
 
     delimiter: str = ","
     decimal: str = "."
     encoding: str = "utf8"
-    skip_rows: int = 0
-    rows_below_names: int = 0
-    missing: tuple[str, ...] = ()
-    names: tuple[str, ...] | None = None
-    clock: str | None = None
+    skip_rows: int = 0  # lines above the names; above the rows where names are given
+    rows_below_names: int = 0  # lines between the names and the rows
+    missing: tuple[str, ...] = ()  # cells without a sample, beside empty ones, NaN, NA and null
+    names: tuple[str, ...] | None = None  # of the columns where the file has no line of them
+    clock: str | None = None  # column of times as a clock shows them, which become seconds
 
 
 def is_parquet(file: Path) -> bool:

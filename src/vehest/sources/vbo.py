@@ -52,21 +52,13 @@ class VboOptions:
 
 @dataclass(frozen=True)
 class Log:
-    """Rows and sections of a file.
+    """Rows and sections of a file."""
 
-    Args:
-        columns: name -> values in the file's unit, (T,).
-        units: name -> unit as the file writes it; only of columns that have one.
-        seconds: clock time since midnight, going on past it [s], (T,).
-        offsets: point (``CoG``, ``FL``, …) -> lateral and longitudinal distance from the antenna at which slip is given [m].
-        provenance: first line of the file, offsets, and rows at the end that were cut off or came late.
-    """
-
-    columns: Mapping[str, FloatArray]
-    units: Mapping[str, str]
-    seconds: FloatArray
-    offsets: Mapping[str, tuple[float, float]]
-    provenance: Mapping[str, Any]
+    columns: Mapping[str, FloatArray]  # name -> values in the file's unit, (T,)
+    units: Mapping[str, str]  # name -> unit as the file writes it; only of columns that have one
+    seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
+    offsets: Mapping[str, tuple[float, float]]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
+    provenance: Mapping[str, Any]  # first line, offsets, and rows at the end that were cut off or came late
 
 
 class VboSource(FileSource):

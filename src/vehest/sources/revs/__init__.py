@@ -87,7 +87,7 @@ class RevsSource(FileSource):
     def inputs(self) -> dict[str, str | Path]:
         """Every file that is read."""
         folder = self._folder()
-        files = {file.relative_to(folder).as_posix(): file for name in self.ids() for file in self._files_of(name)}
+        files = {file.relative_to(folder).as_posix(): file for name in self.ids() for file in self._files_of(name).values()}
         parameters = self._parameters_file()
         return dict(files) if parameters is None else {**files, parameters.name: parameters}
 
@@ -101,13 +101,12 @@ class RevsSource(FileSource):
 
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
-        self._files_of(recording_id)
-        path, options = self._path(recording_id), self.options
+        files, path, options = self._files_of(recording_id), self._path(recording_id), self.options
         if options.layout == "mat":
             clock, values, rates = read_mat_columns(path, self.column_names, self.time, options.rate_hz, options.clock, self.gappy_columns)
             origin: dict[str, Any] = {"file": path.name, "native_rates_hz": rates}
         else:
-            own, origin = self._read_csv(path) if options.layout == "csv" else (self._read_text(path), {})
+            own, origin = self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
             clock = uniform_clock(self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock)
             values = {name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names}
         channels = {name: column.to_si(values[column.column], channel(name).unit) for name, column in self.columns.items()}
@@ -126,9 +125,8 @@ class RevsSource(FileSource):
                 require_unit(units[column.column], column, channel(name).unit, where, "set units_row: ignore")
         return values, about
 
-    def _read_text(self, folder: Path) -> dict[str, FloatArray]:
+    def _read_text(self, files: Mapping[str, Path]) -> dict[str, FloatArray]:
         """Columns of text files with a number a line."""
-        files = {name: _text_file(folder, name) for name in (self.time.column, *self.column_names)}
         values = {name: read_columns(file, ["number"], TextLayout(names=("number",)))["number"] for name, file in files.items()}
         n_stamps = len(values[self.time.column])
         for name, samples in values.items():
@@ -142,14 +140,14 @@ class RevsSource(FileSource):
     def _path(self, recording_id: str) -> Path:
         return self._folder() / f"{recording_id}{SUFFIXES[self.options.layout]}"
 
-    def _files_of(self, recording_id: str) -> list[Path]:
+    def _files_of(self, recording_id: str) -> dict[str, Path]:
+        """The file of a recording; of the text layout column -> its file."""
         path = self._path(recording_id)
+        files = {path.name: path}
         if self.options.layout == "text":
             existing_folder(path, self.name)
-            files = [_text_file(path, column) for column in sorted({self.time.column, *self.column_names})]
-        else:
-            files = [path]
-        require_files(files, self.name)
+            files = {column: path / f"{column}.txt" for column in sorted({self.time.column, *self.column_names})}
+        require_files(list(files.values()), self.name)
         return files
 
     def _parameters_file(self) -> Path | None:
@@ -157,10 +155,6 @@ class RevsSource(FileSource):
         name = self.options.vehicle_parameters
         file = self._folder() / str(name)
         return file if name and file.is_file() else None
-
-
-def _text_file(folder: Path, column: str) -> Path:
-    return folder / f"{column}.txt"
 
 
 SOURCE = RevsSource

@@ -32,19 +32,12 @@ MOST_RESTARTS = 0.01  # of the rows
 
 @dataclass(frozen=True)
 class Found:
-    """The clock of a table.
+    """The clock of a table."""
 
-    Args:
-        stamps: its column; None where none looks like a clock.
-        seconds: times of the rows [s], (N,).
-        runs: rows of each run, the longest first.
-        counted_by: column that counts the runs; empty where none does.
-    """
-
-    stamps: Stamps | None
-    seconds: FloatArray | None
-    runs: tuple[slice, ...]
-    counted_by: str = ""
+    stamps: Stamps | None  # its column; None where none looks like a clock
+    seconds: FloatArray | None  # times of the rows [s], (N,)
+    runs: tuple[slice, ...]  # rows of each run, the longest first
+    counted_by: str = ""  # column that counts the runs; empty where none does
 
 
 def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:

@@ -46,19 +46,12 @@ ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad
 
 @dataclass(frozen=True)
 class Shape:
-    """A table of text as one delimiter explains it.
-
-    Args:
-        layout: how to read it.
-        names: of the columns; empty where no line above the numbers has them.
-        units: name -> unit in the row below the names, if there is one.
-        score: share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row.
-    """
+    """A table of text as one delimiter and decimal mark explain it."""
 
     layout: TextLayout
-    names: tuple[str, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    score: float = 0.0
+    names: tuple[str, ...] = ()  # of the columns; empty where no line above the numbers has them
+    units: Mapping[str, str] = field(default_factory=dict)  # name -> unit in the row below the names, if there is one
+    score: float = 0.0  # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row
 
 
 def survey_table(file: Path) -> Log:
