@@ -45,12 +45,7 @@ class Column:
 
 
 def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column) -> dict[str, Column]:
-    """The map of channels that a data set declares.
-
-    Args:
-        entries: channel -> its declaration.
-        dataset: for messages.
-        kind: of which the declarations are.
+    """Channel -> its declaration of ``kind``, as a data set declares them.
 
     Raises:
         ConfigurationError: an unknown channel, unit or key.
@@ -66,13 +61,7 @@ def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Col
 
 
 def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
-    """One column's declaration.
-
-    Args:
-        entry: mapping of column, unit and, if need be, sign and factor.
-        where: for messages.
-        si_unit: to which the unit must be convertible.
-        kind: of which the declaration is.
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
 
     Raises:
         ConfigurationError: a key is missing or unknown, or the unit is of another quantity.

@@ -73,11 +73,6 @@ def restarted_runs(stamps: FloatArray) -> dict[int | None, slice]:
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
-    """Rows of uninterrupted runs in their order.
-
-    Args:
-        begins: whether a run begins with the next row, (N - 1,).
-        n_rows: N.
-    """
+    """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N - 1,)."""
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()
     return [slice(first, last) for first, last in pairwise(edges)]

@@ -93,12 +93,7 @@ class TabularSource(FileSource):
         self._known_runs: dict[Path, dict[int | None, slice]] = {}
 
     def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file.
-
-        Raises:
-            MissingError: no file is there, or one is empty.
-            DataError: the column of runs cannot be read.
-        """
+        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file."""
         return list(self._found())
 
     def read_raw(self, recording_id: str) -> Recording:

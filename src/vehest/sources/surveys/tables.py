@@ -69,7 +69,8 @@ def survey_table(file: Path) -> Log:
     values, clocks, marks, skipped = _columns(file, shape)
     always, plain = ("delimiter", "decimal"), asdict(TextLayout())
     options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
-    return _log(file, values, clocks, shape.units, options | ({"missing": sorted(marks)} if marks else {}), skipped)
+    options |= {"missing": sorted(marks)} if marks else {}
+    return _log(file, values, clocks, shape.units, options, skipped)
 
 
 def _log(
@@ -220,7 +221,7 @@ def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str,
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
             values[name] = numbers[0]
             marks |= numbers[1]
-        elif (seconds := seconds_of_text(column.cast(pa.string()))) is not None:
+        elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
             clocks[name] = seconds
         else:
             skipped.append(f"column '{printable(name)}' holds text")
@@ -231,16 +232,13 @@ def _table(file: Path, shape: Shape) -> pa.Table:
     """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as they stand."""
     inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
     text = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
-    opened = partial(table_stream, file)
-    try:
-        return parse_table(opened, shape.layout, inferred)
-    except DAMAGE:
+    problem = None
+    for convert in (inferred, text):
         try:
-            return parse_table(opened, shape.layout, text)
+            return parse_table(partial(table_stream, file), shape.layout, convert)
         except DAMAGE as error:
-            blanks = "its columns are aligned by blanks; write one delimiter between cells"
-            remedy = blanks if shape.layout.delimiter == " " else "remove that row, or what lies behind it if the file is truncated"
-            raise DataError(f"'{file}' cannot be read as a table ({printable(first_line(error))}); {remedy}") from None
+            problem = printable(first_line(error))
+    raise DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or are its columns aligned by blanks?")
 
 
 def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str]] | None:
