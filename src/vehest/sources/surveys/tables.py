@@ -130,8 +130,9 @@ def shape_of(file: Path) -> Shape:
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]
+    tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
     marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",") if decimal != delimiter]
-    best = max((_shape(lines, *pair, encoding) for pair in marks), key=lambda shape: shape.score)
+    best = max((_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score)
     if not best.score:
         raise DataError(f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?")
     if not best.names:
@@ -141,17 +142,21 @@ def shape_of(file: Path) -> Shape:
     return best
 
 
-def _shape(lines: Sequence[str], delimiter: str, decimal: str, encoding: str) -> Shape:
-    """The table that a delimiter and a decimal mark make of lines: names and units stand right above the first two rows of numbers."""
+def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
+    """Number of each line that holds something -> its cells."""
     split = [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
-    rows = {k: row for k, row in enumerate(split) if any(cell.strip() for cell in row)}
+    return {k: row for k, row in enumerate(split) if any(cell.strip() for cell in row)}
+
+
+def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding: str) -> Shape:
+    """The table that a decimal mark makes of rows: names and units stand right above the first two rows of numbers."""
     lengths = [len(row) for row in rows.values()][len(rows) // 2 :]
     n_columns = max(set(lengths), key=lengths.count, default=0)
-    shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns}
+    shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns > 1}
     data = [k for k, share in shares.items() if share >= LEAST_NUMBERS]
-    if n_columns < 2 or not data:
+    if not data:
         return Shape(TextLayout())
-    first = next((k for k, after in pairwise([*data, len(lines)]) if after - k == 1 or k == data[-1]), data[0])
+    first = next((k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0])
     score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
     above = [k for k in shares if k < first]
     if not above:
