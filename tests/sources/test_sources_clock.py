@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.sources.base import open_source
 from vehest.sources.clocks import unevenness, uniform_clock, uniform_times
-from vehest.sources.columns import Column, column_from_config, columns_from_config, identity_columns, time_column_from_config
+from vehest.sources.columns import Column, column_from_config, columns_from_config
 from vehest.sources.surveys import survey
 
 RATES = [1e-3, 10.0, 12.5, 20.0, 29.97, 51.2, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0]
@@ -90,17 +91,14 @@ def test_units_and_signs_are_applied() -> None:
     np.testing.assert_array_equal(Column("a", "m/s").to_si(values, "m/s"), values)
 
 
-def test_columns_named_like_channels_need_no_map() -> None:
-    assert identity_columns(["time", "ay", "steer", "spam"]) == {"ay": Column("ay", "m/s²"), "steer": Column("steer", "rad")}
-
-
 @pytest.mark.parametrize(
     ("entries", "what"),
     [
         ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
         ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
-        ({"vx": "a"}, "must say column, unit"),
+        ({"vx": {"column": "a"}}, "channel 'vx': unit is missing"),
+        ({"vx": "a"}, "must be a group of options, not 'a'; options: column, unit"),
         ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "unknown key 'scale'; there are: column, unit, sign, factor"),
     ],
 )
@@ -113,10 +111,15 @@ def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: dict[str, obj
 
 
 def test_a_time_column_has_a_unit_of_time() -> None:
-    assert time_column_from_config({"column": "t", "unit": "ms"}, "mine") == Column("t", "ms")
-    with pytest.raises(ConfigurationError, match="data set 'mine': time: unit 'km/h' cannot be converted to 's'"):
-        time_column_from_config({"column": "t", "unit": "km/h"}, "mine")
-    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here") == Column("3", "s", -1), "YAML reads it as a number"
+    assert column_from_config({"column": "t", "unit": "ms"}, "here", "s") == Column("t", "ms")
+    with pytest.raises(ConfigurationError, match="here: unit 'km/h' cannot be converted to 's'"):
+        column_from_config({"column": "t", "unit": "km/h"}, "here", "s")
+    with pytest.raises(ConfigurationError, match="here: it must be a group of options"):
+        column_from_config("t", "here", "s")
+    assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column("3", "s", -1), "YAML reads it as a number"
+    for name in (3.5, True, None, ["3"]):
+        with pytest.raises(ConfigurationError, match=f"here: column must be text, not {re.escape(repr(name))}"):
+            column_from_config({"column": name, "unit": "s"}, "here", "s")
 
 
 EVEN = np.arange(1000) / 100.0

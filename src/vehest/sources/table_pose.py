@@ -29,15 +29,15 @@ class TablePose(PoseOptions):
         yaw_offset: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
     """
 
-    x: dict[str, Any]
-    y: dict[str, Any]
-    yaw: dict[str, Any]
+    x: Column
+    y: Column
+    yaw: Column
     yaw_offset: float = 0.0
 
     @property
     def columns(self) -> dict[str, Column]:
-        """Columns of ``x``, ``y`` [m] and ``yaw`` [rad]."""
-        return {name: column_from_config(getattr(self, name), f"pose: {name}", unit) for name, unit in UNITS.items()}
+        """Columns of ``x``, ``y`` and ``yaw``."""
+        return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
     def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
         """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window.
@@ -45,16 +45,14 @@ class TablePose(PoseOptions):
         Raises:
             DataError: a pose is missing, or there are fewer than the filter's window.
         """
-        found = {}
-        for name, column in self.columns.items():
-            samples = column.to_si(values[column.column], UNITS[name])
+        poses = {name: column.to_si(values[column.column], UNITS[name]) for name, column in self.columns.items()}
+        for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                what = f"pose column '{column.column}' holds {len(odd)} values that are no numbers, the first in row {odd[0] + 1}"
-                raise DataError(f"{where}: {what} of the run; leave them out by drop_rows")
-            found[name] = clock.align(np.unwrap(samples) if name == "yaw" else samples)
-        positions = np.stack([found["x"], found["y"]], axis=1)
-        motion = self.motion(positions, found["yaw"], 1.0 / clock.rate_hz, self.yaw_offset, where)
+                what = f"pose column '{self.columns[name].column}' holds no number in {len(odd)} rows of the run, first in row {odd[0] + 1}"
+                raise DataError(f"{where}: {what}; leave them out by drop_rows")
+        x, y, yaw = (clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"])))
+        motion = self.motion(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where)
         return motion.channels(self.channels)
 
 
@@ -66,5 +64,5 @@ def table_pose_from_config(entry: Any, where: str) -> TablePose:
     """
     pose = validated(TablePose, entry, where, error=ConfigurationError)
     for name, unit in UNITS.items():
-        column_from_config(getattr(pose, name), f"{where}: {name}", unit)
+        column_from_config(entry[name], f"{where}: {name}", unit)
     return pose
