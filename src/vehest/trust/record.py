@@ -39,11 +39,6 @@ class Trust:
     health: HealthModel | None = None  # residuals and thresholds of the health flag
 
 
-@dataclass(frozen=True)
-class _File(Trust):
-    format: int = 0
-
-
 def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
     return trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
@@ -70,9 +65,8 @@ def read_trust(folder: Path) -> Trust:
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:
         raise DataError(f"'{path}' does not say how far a model can be trusted; calibrate it again")
-    check_format(content["format"], FORMAT, f"'{path}'")
-    found = validated(_File, content, f"'{path}'")
-    return Trust(found.about, found.bands, found.guard, found.health)
+    check_format(content.pop("format"), FORMAT, f"'{path}'")
+    return validated(Trust, content, f"'{path}'")
 
 
 def _plain(value: Any) -> Any:
