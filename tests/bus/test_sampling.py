@@ -16,9 +16,7 @@ def arrivals(n: int = 2000, phase: float = 0.003, jitter: float = 0.0, period: f
     return phase + period * np.arange(n) + rng.uniform(0.0, jitter, n) if jitter else phase + period * np.arange(n)
 
 
-def run(
-    timing: Timing, frames: list[tuple[float, dict[str, float]]], until: float
-) -> list[tuple[float, dict[str, float], list[str]]]:
+def run(timing: Timing, frames: list[tuple[float, dict[str, float]]], until: float) -> list[tuple[float, dict[str, float], list[str]]]:
     sampler, found = Sampler(timing), []
     for stamp, values in sorted(frames, key=lambda frame: frame[0]):
         while sampler.next_time < stamp:

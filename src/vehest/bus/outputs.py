@@ -12,7 +12,7 @@ from typing import Any
 from vehest.bus.messages import dbc_text
 from vehest.data.errors import ConfigurationError
 from vehest.data.files import writing_error
-from vehest.trust.verdict import reason_in_words
+from vehest.trust.health import reason_in_words
 
 FIRST, LAST = ("vy", "sideslip"), ("band_vy", "band_sideslip", "health", "health_reason")
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
-from vehest.trust.verdict import reason_in_words
+from vehest.trust.health import reason_in_words
 
 HEALTH = ("valid", "degraded", "invalid")
 STYLES = {"valid": "green", "degraded": "yellow", "invalid": "bold red"}

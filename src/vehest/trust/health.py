@@ -68,8 +68,11 @@ NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Number of a channel in a reason's code."""
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
-_REASONS: dict[int, tuple[str, float]] = {
-    kernel.FREE: ("nothing found", 0.0),
+NO_ESTIMATE, BEYOND_SPEED = 30, 31
+"""Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
+
+REASONS: dict[int, tuple[str, float]] = {
+    kernel.FREE: ("", 0.0),
     kernel.MISSING: ("{channel} is not measured", 0.0),
     kernel.FROZEN: ("{channel} is frozen", 8.0),
     kernel.HELD: ("{channel} repeats its samples", 7.0),
@@ -86,19 +89,20 @@ _REASONS: dict[int, tuple[str, float]] = {
     kernel.LOCKED: ("locked wheel: {channel}", 9.0),
     kernel.DROPOUT: ("lost wheel: {channel}", 9.0),
     kernel.LATE: ("{channel} comes late", 4.0),
+    NO_ESTIMATE: ("there is no estimate", 0.0),
+    BEYOND_SPEED: ("the estimate exceeds what the speed allows", 0.0),
 }
 """Kind of a reason -> text, and priority over others: the most specific is given.
 
 A code is 10000 times the kind, 100 times the channel's number, and the partner's.
 """
-WORDS = {kind: text for kind, (text, _) in _REASONS.items()}
 
 
 def reason_in_words(code: float) -> str:
-    """Text of a reason's code."""
+    """Text of a reason's code; empty for 0."""
     kind, rest = divmod(round(code), 10_000)
     channel, partner = divmod(rest, 100)
-    return WORDS[kind].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
+    return REASONS[kind][0].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
 
 
 class Health(NamedTuple):
@@ -228,7 +232,7 @@ class HealthModel:
         for name in ("constant", "precision", "deviation", "usual", "speeds", "levels"):
             getattr(model, name)[:] = getattr(self, name)
         for k, statistic in enumerate(statistics):
-            model.kind[k], model.priority[k] = statistic.kind, _REASONS[statistic.kind][1]
+            model.kind[k], model.priority[k] = statistic.kind, REASONS[statistic.kind][1]
             model.accused[k] = names.index(statistic.channel)
             model.partner[k] = names.index(statistic.partner) if statistic.partner else -1
         return tables

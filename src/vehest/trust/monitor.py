@@ -8,9 +8,9 @@ from vehest.constants import FloatArray
 from vehest.estimators.base import Estimator
 from vehest.trust.bands import band_rows
 from vehest.trust.guard import Cleaned
-from vehest.trust.health import Health, health_rows
+from vehest.trust.health import NUMBERS, Health, health_rows
 from vehest.trust.record import Trust
-from vehest.trust.verdict import ROLLED_BACK_SECONDS, adapts, isolate_rows, numbers_of, starts_anew, verdict_rows, widen_rows
+from vehest.trust.verdict import ROLLED_BACK_SECONDS, isolate_rows, starts_anew, verdict_rows, widen_rows
 from vehest.trust.watch import Watched
 
 
@@ -28,11 +28,11 @@ class Monitor:
         self._bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
         self.has_bands = bands is not None
         self._farthest = bands.largest.get("vy", 0.0) if bands is not None else 0.0
-        self._numbers = numbers_of(estimator.channels)
+        self._numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
         self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
         self._needed = ~self._skippable
         self._starts_anew = starts_anew(estimator)
-        self._rollback = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if adapts(estimator) else 0
+        self._rollback = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if getattr(estimator, "adapts", False) else 0
         self._fault = np.zeros(2)
 
     def before(self, received: FloatArray, cleaned: Cleaned) -> Health:

@@ -13,18 +13,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE, WAIT
-from vehest.trust.health import DEGRADED, INVALID, NUMBERS, VALID
-from vehest.trust.health import reason_in_words as health_in_words
+from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, VALID
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
-
-NO_ESTIMATE, BEYOND_SPEED = 30, 31
-"""Further kinds of reasons: there is no estimate; it was beyond what the speed allows."""
 
 BAND_FACTORS = (1.0, 2.0, 4.0)
 """Factor of the band of a valid, a degraded, an invalid estimate."""
@@ -34,28 +29,10 @@ ROLLED_BACK_SECONDS = 1.0
 NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 """Kinds of reasons that accuse no sensor."""
 
-OWN_WORDS = {NO_ESTIMATE: "there is no estimate", BEYOND_SPEED: "the estimate exceeds what the speed allows"}
-
-
-def reason_in_words(code: float) -> str:
-    """Text of a reason's code; empty for 0."""
-    kind = round(code) // 10000
-    return OWN_WORDS[kind] if kind in OWN_WORDS else health_in_words(code) if code else ""
-
-
-def adapts(estimator: Estimator) -> bool:
-    """Whether an estimator has adapting states, such as tyres, friction or offsets, by its property ``adapts``."""
-    return bool(getattr(estimator, "adapts", False))
-
 
 def starts_anew(estimator: Estimator) -> bool:
     """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
-    return estimator.warm_up_steps == 0 and not adapts(estimator)
-
-
-def numbers_of(channels: tuple[str, ...]) -> NDArray[np.int64]:
-    """Numbers of channels in codes of reasons, (C,)."""
-    return np.array([NUMBERS[name] for name in channels], np.int64)
+    return estimator.warm_up_steps == 0 and not getattr(estimator, "adapts", False)
 
 
 @entry(nogil=True)
