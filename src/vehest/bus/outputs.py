@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from vehest.bus.messages import dbc_text
 from vehest.data.errors import ConfigurationError
@@ -29,71 +29,58 @@ def output_files(path: Path | None) -> list[Path]:
 
 
 class Output:
-    """Nothing is written."""
+    """Writes the files of ``path``.
+
+    A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and ``sampled``, the instant of the sample. A log
+    has the frames of estimates as they came off the bus.
+
+    Raises:
+        MissingError: a file cannot be written.
+    """
+
+    def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
+        self._names = [*FIRST, *(name for name in names if name not in FIRST + LAST), *(name for name in LAST[:2] if name in names)]
+        self._path = path or Path()
+        self._table: TextIO | None = None
+        self._log: Any = None
+        if path is not None and path.suffix.lower() == ".csv":
+            with writing(path):
+                self._table = path.open("w", encoding="utf-8", newline="", buffering=1)
+            self._row(["time", "sampled", *self._names, *LAST[2:]])
+        elif path is not None:
+            from can.io.asc import ASCWriter
+
+            write_dbc(path.with_suffix(".dbc"), first_id)
+            with writing(path):
+                self._log = ASCWriter(path)
 
     def estimate(self, time: float, sampled: float, values: Mapping[str, float]) -> None:
         """Write an estimate that holds for ``time``, of the sample at ``sampled``, on the bus's clock [s]."""
+        if self._table is not None:
+            numbers = [values.get(name, math.nan) for name in self._names]
+            cells = ["" if math.isnan(number) else f"{number:.9g}" for number in numbers]
+            health = [str(int(values["health"])), reason_in_words(values["health_reason"])]
+            self._row([f"{time:.6f}", f"{sampled:.6f}", *cells, *health])
+
+    def _row(self, cells: list[str]) -> None:
+        assert self._table is not None
+        with writing(self._path):
+            csv.writer(self._table, lineterminator="\n").writerow(cells)
 
     def frame(self, frame: Any) -> None:
         """Write a frame of an estimate."""
+        if self._log is not None:
+            frame.channel = 0
+            with writing(self._path):
+                self._log.on_message_received(frame)
 
     def close(self) -> None:
-        """Close the file."""
-
-
-class TableOutput(Output):
-    """A row an estimate, with the columns of ``vehest estimate`` for ``names``, all that estimates hold, and ``sampled``."""
-
-    def __init__(self, path: Path, names: Sequence[str]) -> None:
-        self._path = path
-        self._names = [*FIRST, *(name for name in names if name not in FIRST + LAST), *(name for name in LAST[:2] if name in names)]
-        with writing(path):
-            self._file = path.open("w", encoding="utf-8", newline="", buffering=1)
-            self._writer = csv.writer(self._file, lineterminator="\n")
-            self._writer.writerow(["time", "sampled", *self._names, *LAST[2:]])
-
-    def estimate(self, time: float, sampled: float, values: Mapping[str, float]) -> None:
-        """Write a row."""
-        numbers = [values.get(name, math.nan) for name in self._names]
-        cells = ["" if math.isnan(number) else f"{number:.9g}" for number in numbers]
-        health = [str(int(values["health"])), reason_in_words(values["health_reason"])]
+        """Close the files."""
         with writing(self._path):
-            self._writer.writerow([f"{time:.6f}", f"{sampled:.6f}", *cells, *health])
-
-    def close(self) -> None:
-        """Close the table."""
-        with writing(self._path):
-            self._file.close()
-
-
-class LogOutput(Output):
-    """The frames of estimates as they came off the bus, beside them the DBC that describes them."""
-
-    def __init__(self, path: Path, first_id: int) -> None:
-        from can.io.asc import ASCWriter
-
-        self._path = path
-        write_dbc(path.with_suffix(".dbc"), first_id)
-        with writing(path):
-            self._writer = ASCWriter(path)
-
-    def frame(self, frame: Any) -> None:
-        """Write a frame."""
-        frame.channel = 0
-        with writing(self._path):
-            self._writer.on_message_received(frame)
-
-    def close(self) -> None:
-        """Close the log."""
-        with writing(self._path):
-            self._writer.stop()
-
-
-def open_output(path: Path | None, names: Sequence[str], first_id: int) -> Output:
-    """Output to a file by its ending; raises `MissingError` where it cannot be written."""
-    if path is None:
-        return Output()
-    return TableOutput(path, names) if path.suffix.lower() == ".csv" else LogOutput(path, first_id)
+            if self._table is not None:
+                self._table.close()
+            if self._log is not None:
+                self._log.stop()
 
 
 def write_dbc(path: Path, first_id: int) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from vehest.bus.mapping import BusSignals
 from vehest.bus.messages import EstimateFrames
-from vehest.bus.outputs import open_output
+from vehest.bus.outputs import Output
 from vehest.bus.receiver import Receiver, warmed_up
 from vehest.bus.sampling import Timing, timing_of
 from vehest.bus.view import Figures, View
@@ -138,7 +138,7 @@ class Replay:
         names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
         with (
             self.bus.ends(self.signals.database.messages) as (self.sender, self.unit),
-            closing(open_output(out, names, self.frames.identifiers[0])) as self.output,
+            closing(Output(out, names, self.frames.identifiers[0])) as self.output,
             view,
             _undisturbed(),
         ):
