@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from vehest.bus.messages import dbc_text
 from vehest.data.errors import ConfigurationError
@@ -41,7 +41,7 @@ class Output:
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:
         self._names = [*FIRST, *(name for name in names if name not in FIRST + LAST), *(name for name in LAST[:2] if name in names)]
         self._path = path or Path()
-        self._table: TextIO | None = None
+        self._table: Any = None
         self._log: Any = None
         if path is not None and path.suffix.lower() == ".csv":
             with writing(path):
@@ -63,7 +63,6 @@ class Output:
             self._row([f"{time:.6f}", f"{sampled:.6f}", *cells, *health])
 
     def _row(self, cells: list[str]) -> None:
-        assert self._table is not None
         with writing(self._path):
             csv.writer(self._table, lineterminator="\n").writerow(cells)
 

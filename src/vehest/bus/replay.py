@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import math
+import resource
 import sys
 import threading
 import time
@@ -23,18 +24,18 @@ import numpy as np
 from vehest.bus.mapping import BusSignals
 from vehest.bus.messages import EstimateFrames
 from vehest.bus.outputs import Output
-from vehest.bus.receiver import Receiver, warmed_up
-from vehest.bus.sampling import Timing, timing_of
+from vehest.bus.sampling import Sample, Sampler, Timing, timing_of
 from vehest.bus.view import Figures, View
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.text_files import first_line
-from vehest.sources.can import decoded, is_on, never_occurs
+from vehest.sources.can import channel_values, channels_by_message, decoded, is_on, never_occurs
 from vehest.sources.can.logs import Frames
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0
 LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
+MEMORY_EVERY = 100  # samples
 SWITCH_SECONDS = 2e-4  # that another thread of Python may go on when the receiver has something to do
 
 
@@ -101,7 +102,7 @@ class Bus:
 
 
 class Replay:
-    """A log, replayed onto a bus.
+    """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it hears there.
 
     Args:
         log: frames to send.
@@ -121,86 +122,82 @@ class Replay:
         for identifier in frames.identifiers:
             if (identifier, False) in signals.database.taken:
                 raise ConfigurationError(f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id")
-        self.log, self.signals, self.timing, self.bus, self.frames, self.stopped = log, signals, timing, bus, frames, stopped
-        self.first, self.speed = timing.first, bus.speed or 1.0
+        self.log, self.signals, self.bus, self.frames, self.stopped = log, signals, bus, frames, stopped
+        self.timing, self.first, self.sampler, self.figures = timing, timing.first, Sampler(timing), Figures()
+        self.channels_of = channels_by_message(signals.wanted)
+        self.speed = bus.speed or 1.0
         self.begin = 0.0  # time of the clock on the wall at the first frame [s]
-        self.last = math.inf  # time of the last frame, once it was sent [s]
+        self.last = self.first  # time of the last frame that was sent [s]
+        self.over = threading.Event()  # all frames were sent, or it was stopped
         self.failure: BaseException | None = None
-        self.over = threading.Event()
+        self.resident = 0  # memory at first [bytes]
 
     def run(self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View) -> Figures:
-        """Estimate from the frames; the first stepper is for warming up.
+        """Estimate at the rate of the samples; the first stepper is for warming up.
 
         Raises:
             DataError: the log is damaged.
             MissingError: the bus cannot be opened, or ``out`` not be written.
         """
         names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
+        self.stepper, self.view = make_stepper(), view
+        horizon = self.stepper.horizon_steps / self.stepper.estimator.settings.rate_hz
+        self.ahead = horizon - self.stepper.delay - self.timing.offset
         with (
             self.bus.ends(self.signals.database.messages) as (self.sender, self.unit),
             closing(Output(out, names, self.frames.identifiers[0])) as self.output,
             view,
             _undisturbed(),
         ):
-            now = None if self.bus.speed is None else lambda: self._on_bus(time.time())
-            receiver = Receiver(self.signals, self.timing, make_stepper(), self._send, view, now)
+            frames = (frame for frame in self.log if frame.timestamp >= self.first and is_on(frame, self.signals.bus))
             if self.bus.speed is None:
-                self._as_fast_as_possible(receiver)
+                self._as_fast_as_possible(frames)
             else:
-                self._in_real_time(receiver)
+                self._in_real_time(frames)
             self._drain_sender()
-        return receiver.figures
+        return self.figures
 
-    def _on_bus(self, wall: float) -> float:
-        """Time of the bus at a time of the clock on the wall [s]."""
-        return self.first + (wall - self.begin) * self.speed
-
-    def _frames(self) -> Iterator[Any]:
-        """Frames of the log, those before the first that is wanted and those of other buses left out."""
-        return (frame for frame in self.log if frame.timestamp >= self.first and is_on(frame, self.signals.bus))
-
-    def _as_fast_as_possible(self, receiver: Receiver) -> None:
-        last = self.first
-        for frame in self._frames():
+    def _as_fast_as_possible(self, frames: Iterable[Any]) -> None:
+        for frame in frames:
             if self.stopped():
                 return
-            self.sender.send(frame)
-            receiver.figures.frames_sent += 1
-            last = frame.timestamp
-            while (received := self.unit.recv(0)) is not None:
-                receiver.frame(received, received.timestamp)
-            self._drain_sender()
-        receiver.advance(last + receiver.sampler.cycle)
+            self._send(frame)
+            while (heard := self.unit.recv(0)) is not None:
+                self._receive(heard, heard.timestamp)
+        self._advance(self.last + self.sampler.cycle)
 
-    def _in_real_time(self, receiver: Receiver) -> None:
-        frames = self._frames()
+    def _in_real_time(self, frames: Iterator[Any]) -> None:
         head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
-        given = (chain([head] if head else [], frames), receiver.figures)
-        thread = threading.Thread(target=self._send_in_time, args=given, name="sender", daemon=True)
+        every = chain([head] if head else [], frames)
+        thread = threading.Thread(target=self._send_in_time, args=(every,), name="sender", daemon=True)
         thread.start()
-        sampler = receiver.sampler
         try:
             while not self.stopped():
-                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + sampler.cycle
-                wait = self.begin + (sampler.next_time - self.first) / self.speed - time.time()
-                frame = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
-                if frame is not None:
-                    receiver.frame(frame, self._on_bus(frame.timestamp))
+                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + self.sampler.cycle
+                wait = self.begin + (self.sampler.next_time - self.first) / self.speed - time.time()
+                heard = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
+                if heard is not None:
+                    self._receive(heard, self._on_bus(heard.timestamp))
                 elif ended:  # and nothing is left that a late receiver has not taken
-                    receiver.advance(self.last + sampler.cycle)
+                    self._advance(self.last + self.sampler.cycle)
                     break
                 else:
-                    receiver.advance(self._on_bus(time.time()))
+                    self._advance(self._on_bus(time.time()))
         finally:
             self.over.set()
             thread.join(timeout=5.0)
         if self.failure is not None:
             raise self.failure
 
-    def _send_in_time(self, frames: Iterable[Any], figures: Figures) -> None:
-        """The sender's thread: each frame at its time; between them estimates are taken off the bus."""
-        last = self.first
+    def _on_bus(self, wall: float) -> float:
+        """Time of the bus at a time of the clock on the wall [s]."""
+        return self.first + (wall - self.begin) * self.speed
+
+    # The car
+
+    def _send_in_time(self, frames: Iterable[Any]) -> None:
+        """The car's thread: each frame at its time."""
         try:
             for frame in frames:
                 due = self.begin + (frame.timestamp - self.first) / self.speed
@@ -208,28 +205,92 @@ class Replay:
                     time.sleep(min(left, PATIENCE))
                 if self.over.is_set():
                     return
-                self.sender.send(frame)
-                figures.frames_sent += 1
-                last = frame.timestamp
-                self._drain_sender()
+                self._send(frame)
         except BaseException as error:
             self.failure = error
         finally:
-            self.last = last
             self.over.set()
 
+    def _send(self, frame: Any) -> None:
+        self.sender.send(frame)
+        self.figures.frames_sent += 1
+        self.last = frame.timestamp
+        self._drain_sender()
+
     def _drain_sender(self) -> None:
-        """Write the frames of estimates that the sender hears."""
+        """Write the frames of estimates that the car hears."""
         while (heard := self.sender.recv(0)) is not None:
             if heard.arbitration_id in self.frames.identifiers and not heard.is_extended_id:
                 if self.bus.speed is not None:
                     heard.timestamp = self._on_bus(heard.timestamp)
                 self.output.frame(heard)
 
-    def _send(self, held: float, sampled: float, values: Any) -> None:
-        for frame in self.frames(values, sampled):
-            self.unit.send(frame)
-        self.output.estimate(held, sampled, values)
+    # The control unit
+
+    def _receive(self, frame: Any, stamp: float) -> None:
+        """Take a frame that was stamped [s]; samples whose instant lies before are dealt with first."""
+        message = self.signals.database.messages.get((frame.arbitration_id, frame.is_extended_id))
+        if message is None or frame.is_error_frame or frame.is_remote_frame:
+            return
+        self._advance(stamp)
+        self.figures.frames_received += 1
+        try:
+            values = channel_values(message.decode(frame.data), self.channels_of[message.name], self.signals.wanted)
+        except DataError:
+            self.figures.frames_too_short += 1
+            return
+        self.sampler.take({name: value * self.signals.factors[name] for name, value in values.items()}, stamp)
+
+    def _advance(self, now: float) -> None:
+        """Deal with the samples whose instant lies before now [s]."""
+        while self.sampler.next_time < now:
+            sample, started = self.sampler.sample(), time.perf_counter()
+            self._estimate(sample)
+            took = time.perf_counter() - started if self.bus.speed is None else self._on_bus(time.time()) - sample.time
+            self._count(sample, took)
+            self.view.show(self.figures, self.stepper.last, sample.time - self.first)
+
+    def _estimate(self, sample: Sample) -> None:
+        last = self.stepper.last
+        values = self.stepper.step(sample.values or None)
+        if values is not last:
+            self.figures.estimates += 1
+            for frame in self.frames(values, sample.time):
+                self.unit.send(frame)
+            self.output.estimate(sample.time + self.ahead, sample.time, values)
+
+    def _count(self, sample: Sample, took: float) -> None:
+        figures, cycle = self.figures, self.sampler.cycle
+        figures.seconds = figures.samples * cycle
+        figures.samples += 1
+        figures.latest_ms = max(figures.latest_ms, 1e3 * took)
+        figures.deadlines_missed += took > cycle
+        figures.samples_lost += bool(sample.missing)
+        for name in sample.missing:
+            figures.missing[name] = figures.missing.get(name, 0) + 1
+        if figures.samples % MEMORY_EVERY == 0:
+            now = resident_bytes()
+            self.resident = self.resident or now
+            figures.memory_growth_mb = max(figures.memory_growth_mb, (now - self.resident) / 1e6)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process; where the system does not tell, the most that it ever was."""
+    try:
+        return int(Path("/proc/self/statm").read_bytes().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]) -> list[str]:
+    """Step until everything is compiled and loaded; returns the names of what the steps returned, in their order."""
+    model = stepper.estimator
+    names: dict[str, None] = {}
+    for k in range(math.ceil((model.warm_up_steps / model.settings.rate_hz + 1.0) * rate_hz)):
+        ripple = 0.01 * math.sin(0.7 * k)
+        sample = {name: (20.0 if name in ("vx", "motor_speed") or name.startswith("wheel_speed") else 0.0) + ripple for name in channels}
+        names |= dict.fromkeys(stepper.step(sample))
+    return list(names)
 
 
 @contextmanager
