@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -28,14 +29,14 @@ from vehest.estimators.base import Estimator, Stepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
 from vehest.trust.health import Health
-from vehest.trust.monitor import Monitor
 from vehest.trust.record import Trust
-from vehest.trust.verdict import starts_anew
+from vehest.trust.verdict import Monitor, starts_anew
 from vehest.trust.watch import Watch, Watched
 
 FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
 """Failures of an estimator on senseless samples; it then starts anew."""
 
+NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
 MOTION = ("vx", "yaw_rate", "ay")
 RATE_INTERVALS, RATE_TOLERANCE = 20, 0.2
 """Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
@@ -271,10 +272,14 @@ class GuardedStepper(Stepper):
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
         row: FloatArray | None = self._row
-        try:
-            self._row[0] = [sample[name] for name in self._channels] if sample is not None else math.nan
-        except (KeyError, TypeError, ValueError, OverflowError):
-            self._row[0] = [_number(sample.get(name)) if sample is not None else math.nan for name in self._channels]
+        self._row[0] = math.nan
+        if sample is not None:
+            try:
+                self._row[0] = [sample[name] for name in self._channels]
+            except NO_NUMBER:
+                for column, name in enumerate(self._channels):
+                    with suppress(*NO_NUMBER):
+                        self._row[0, column] = sample[name]
         if self._front is not None:
             row = self._front(self._row)
         if row is not None:
@@ -344,10 +349,3 @@ class _Clock:
         if len(self._gaps) == RATE_INTERVALS and middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
             found = f"{1.0 / middle:.3g}"
             warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
-
-
-def _number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -50,7 +50,7 @@ def write_trust(trust: Trust, folder: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    content = _plain({"format": FORMAT, **asdict(trust)})
+    content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     (folder / TRUST).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
@@ -67,10 +67,3 @@ def read_trust(folder: Path) -> Trust:
         raise DataError(f"'{path}' does not say how far a model can be trusted; calibrate it again")
     check_format(content.pop("format"), FORMAT, f"'{path}'")
     return validated(Trust, content, f"'{path}'")
-
-
-def _plain(value: Any) -> Any:
-    """The same value with lists for tuples, as YAML has them."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value
