@@ -185,19 +185,16 @@ class FaultedChannel:
         """The first samples, a share of the size."""
         return np.arange(len(self.inside)) < max(round(self.size * len(self.inside)), 1)
 
-    def singles(self, share: float) -> NDArray[np.bool_]:
-        """Single samples, at least one."""
-        return self._drawn(len(self.inside), share)
+    def drawn(self, share: float, number: int | None = None) -> NDArray[np.bool_]:
+        """A share of single samples, or of a ``number`` of pieces, at least one."""
+        found = np.zeros(len(self.inside) if number is None else number, np.bool_)
+        found[self.random.permutation(len(found))[: max(round(share * len(found)), 1)]] = True
+        return found
 
     def pieces(self) -> NDArray[np.bool_]:
-        """Pieces of `PIECE_SECONDS`, at least one."""
+        """Samples in pieces of `PIECE_SECONDS`."""
         length = max(round(PIECE_SECONDS * self.rate_hz), 1)
-        return np.repeat(self._drawn(math.ceil(len(self.inside) / length), self.size), length)[: len(self.inside)]
-
-    def _drawn(self, number: int, share: float) -> NDArray[np.bool_]:
-        drawn = np.zeros(number, np.bool_)
-        drawn[self.random.permutation(number)[: max(round(share * number), 1)]] = True
-        return drawn
+        return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[: len(self.inside)]
 
     def earlier(self, samples: int) -> FloatArray:
         """The channel so many samples before; its first value before that."""
@@ -210,7 +207,7 @@ def _held(at: FaultedChannel) -> FloatArray:
 
 
 def _huge(at: FaultedChannel) -> FloatArray:
-    return np.where(at.singles(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
+    return np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
 
 
 def _saturation(at: FaultedChannel) -> FloatArray:
@@ -246,14 +243,14 @@ KINDS: dict[str, Kind] = {
     "scale": Kind((0.05, 0.2, 0.5), ANY, lambda at: at.inside * (1.0 + at.size)),  # factor less 1
     "frozen": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)),  # of the duration
     "dropout": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), 0.0, at.inside)),  # share of the samples
-    "spikes": Kind(10.0, ANY, lambda at: at.inside + at.size * at.signs() * at.singles(SPIKE_SHARE)),
+    "spikes": Kind(10.0, ANY, lambda at: at.inside + at.size * at.signs() * at.drawn(SPIKE_SHARE)),
     "noise": Kind(1.0, POSITIVE, lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside))),
     "delay": Kind((0.05, 0.2, 0.5), POSITIVE, lambda at: at.earlier(max(round(at.size * at.rate_hz), 1))),  # s, at least one sample
     "saturation": Kind((0.8, 0.5, 0.2), SHARE, _saturation),  # of the channel's largest size
     "sign": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), -at.inside, at.inside)),  # of the duration
     "unit": Kind(None, ANY, lambda at: at.inside * at.size),
     "nan": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), np.nan, at.inside)),  # share of the samples
-    "inf": Kind((0.01, 0.1, 1.0), SHARE, lambda at: np.where(at.singles(at.size), at.signs() * np.inf, at.inside)),  # at least one
+    "inf": Kind((0.01, 0.1, 1.0), SHARE, lambda at: np.where(at.drawn(at.size), at.signs() * np.inf, at.inside)),  # at least one
     "huge": Kind((10.0, 1e4, 1e200), POSITIVE, _huge),  # times the channel's physical range
     "held": Kind((0.1, 0.25, 0.5), POSITIVE, _held),  # s, at least two samples
     "lost_wheel": Kind((math.nan, 1.5, 0.0), FACTOR, _lost_wheel),  # factor of the speed; NaN: drops out

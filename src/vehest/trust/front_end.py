@@ -58,7 +58,6 @@ class FrontEnd:
     def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
         if not (math.isfinite(bus_rate_hz) and bus_rate_hz >= rate_hz * (1 - SLACK)):
             raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz")
-        self.channels = tuple(channels)
         usual = usual_limits(channels, bus_rate_hz).channels  # jumps are those of another rate; ranges are the same
         merged = {name: replace(own, jump=max(usual[name].jump, own.jump)) for name, own in (limits.channels or usual).items()}
         self._guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)

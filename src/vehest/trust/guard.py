@@ -191,12 +191,12 @@ class Guard:
     def __init__(
         self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float, *, remembers: bool = False
     ) -> None:
-        self.channels, self.rate_hz = tuple(channels), rate_hz
+        self.rate_hz = rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
         self._limits = np.array([(row.low, row.high, row.jump, run, *row.stops) for row, run in zip(rows, runs, strict=True)])
         self._skippable = np.array([name in skippable for name in channels])
-        places = [self.channels.index(name) if name in self.channels else -1 for name in ("vx", "yaw_rate")]
+        places = [channels.index(name) if name in channels else -1 for name in ("vx", "yaw_rate")]
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
         self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64)
         self.state = np.zeros((len(channels) + 1, 6))
