@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord, Trial

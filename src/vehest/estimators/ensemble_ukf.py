@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord, Trial

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording

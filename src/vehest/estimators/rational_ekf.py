@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord, Trial, rate

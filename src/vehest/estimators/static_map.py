@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.declared import fitted
+from vehest.declared import fitted
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import Trial

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.data.errors import ConfigurationError
 from vehest.training.noise_tuning import NoiseTuningSettings
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import optimize
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.data.errors import MissingError
 from vehest.training.context import FitContext, Progress
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint

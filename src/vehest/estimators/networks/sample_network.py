@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
