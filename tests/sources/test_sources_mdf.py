@@ -147,7 +147,7 @@ def test_a_signal_faster_than_the_raster_is_not_folded_into_it(drive: Path) -> N
 def test_a_name_in_several_groups_needs_its_group(drive: Path) -> None:
     without = {**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h"}}
     message = refusal(drive, channels=without)
-    assert "signal 'VehSpd' stands in several groups: 0 'Powertrain', 1 'Gateway'; say which" in message
+    assert "signal 'VehSpd' stands 2 times, in group 0 'Powertrain', 1 'Gateway'; say which" in message
     by_number = read(drive, channels={**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h", "group": 1}})
     np.testing.assert_allclose(by_number["vx"], read(drive)["vx"] * 3.7 / 3.6, rtol=1e-4)
     for group in ("Getaway", 7, 2):

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.clocks import clock_fault
-from vehest.sources.limited import Reading, read_limited, require_package
+from vehest.sources.limited import read_limited, require_package
 from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
 Wanted = Mapping[str, tuple[str, int | str | None]]
@@ -64,25 +64,19 @@ def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signa
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)
-    unusable = _unusable_clocks(reading)
     signals, skipped = {}, list(reading.summary["skipped"])
+    groups = {place["group"] for place in reading.summary["signals"].values()}
+    faults = {group: clock_fault(reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out") for group in groups}
     for key, place in reading.summary["signals"].items():
-        reason = unusable.get(place["group"])
+        reason = faults[place["group"]]
         where = f"signal '{place['name']}' of group {place['title']}"
-        if reason is None:
+        if not reason:
             signals[key] = Signal(f"group {place['title']}", reading.arrays[f"stamps {place['group']}"], reading.arrays[key], place["unit"])
         elif wanted is not None:
             raise DataError(f"'{file}': {where}: {reason}")
         else:
             skipped.append(f"{where}: {reason}")
     return signals, skipped, reading.summary
-
-
-def _unusable_clocks(reading: Reading) -> dict[int, str]:
-    """Group -> what is wrong with its time stamps."""
-    groups = {place["group"] for place in reading.summary["signals"].values()}
-    faults = {group: clock_fault(reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out") for group in groups}
-    return {group: fault for group, fault in faults.items() if fault}
 
 
 SOURCE = MdfSource
