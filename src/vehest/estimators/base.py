@@ -59,13 +59,13 @@ class Trial(NamedTuple):
     """A family in the first comparison on a car that nobody has trained on (`vehest new`).
 
     Attributes:
-        place: among the trials of all families, the most promising and cheap first; families of one place are one sweep.
+        place: among the trials of all families, the most promising and cheap first; those that differ in place alone are one sweep.
         about: text for people.
         overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
             family's settings have.
     """
 
-    place: int
+    place: float
     about: str
     overrides: str = ""
 
