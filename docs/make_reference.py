@@ -298,7 +298,7 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
             yield from _declared(value, f"{above}{field.name}.")
         elif declared is not None:
             default = "fitted" if declared.is_fitted else "[…]" if is_dataclass(value) else f"`{_as_yaml(value)}`"
-            yield f"`{above}{field.name}`", default, declared.unit, declared.doc.replace("|", "\\|")
+            yield f"`{above}{field.name}`", default, declared.unit, declared.doc
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
