@@ -98,6 +98,8 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
     assert len(scored) == 1
     (folder,) = (examples.folder / "outputs" / "train").iterdir()
     assert read_artefact(folder).status == "complete"
+    (trust,) = (examples.folder / "outputs" / "calibrate").glob("*/trust.yaml")
+    assert {"bands", "guard", "health"} <= {key for key, value in yaml.safe_load(trust.read_text()).items() if value}
     model, again = vehest.load_model(folder), vehest.load_model(folder)
     drive = drive_for(name)
     (batch,) = (vehest.estimate(model, drive),)

@@ -56,7 +56,7 @@ class FitRecord:
 
 
 class Trial(NamedTuple):
-    """A family in the first comparison on a car that nobody has trained on (`vehest new`).
+    """A family in the first comparison on a car without a trained model (`vehest new`).
 
     Attributes:
         place: among the trials of all families, the most promising and cheap first; those that differ in place alone are one sweep.
@@ -109,7 +109,7 @@ class Estimator(ABC):
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         slow_kernel: module of a compiled function ``_transition`` that takes tens of seconds to compile; empty: none.
         trials: in the first comparison on a new car; none: it is left out.
-        notice: lines for whoever uses the method, such as a patent.
+        notice: lines for users of the method, such as a patent.
         template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
         version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
         preparation: how recordings are brought to its rate before it sees them (method, transforms).

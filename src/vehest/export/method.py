@@ -21,7 +21,7 @@ class MethodSource:
     Args:
         header: vehest_method.h.
         source: vehest_method.c.
-        notes: lines for whoever uses it, such as a patent.
+        notes: lines for its users, such as a patent.
     """
 
     header: str
