@@ -155,7 +155,7 @@ MALFORMED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut in a row": (cut_in_row, r"Row #\d+: Expected 55 columns, got \d+.* is it truncated"),
     "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in data row 488"),
     "blank after the head": (with_cell(500, "vyCG", ""), r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s"),
-    "no time": (with_cell(500, "time", ""), "time stamp of sample 450 is not a number"),
+    "no time": (with_cell(500, "time", ""), "time stamp of sample 450 is nan s"),
     "no units": (without_lines(12, 12), "line 12 should hold units of the 55 columns"),
     "UTF-16": (lambda content: content.decode("latin-1").encode("utf-16"), "line 11 should name the columns and has no 'time'"),
 }
