@@ -13,7 +13,6 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-import pooch
 import pytest
 import yaml
 from refusals import refusal
@@ -134,13 +133,10 @@ def assert_only(folder: Path, content: bytes = BYTES) -> None:
     assert files(folder) == {"a.csv": content, CHECKSUMS: f"a.csv {sha256(content)}\n".encode()}
 
 
-def test_a_file_arrives_byte_for_byte_and_is_recorded_as_pooch_and_sha256sum_would(server: Server, tmp_path: Path) -> None:
+def test_a_file_arrives_byte_for_byte_and_is_recorded(server: Server, tmp_path: Path) -> None:
     (outcome,) = fetch(download(server, tmp_path / "new" / "folder"))
     assert outcome == Outcome("a.csv", "fetched", sha256(BYTES), SIZE)
     assert_only(tmp_path / "new" / "folder")
-    registry = pooch.create(tmp_path, "")
-    registry.load_registry(tmp_path / "new" / "folder" / CHECKSUMS)
-    assert registry.registry == {"a.csv": pooch.file_hash(str(tmp_path / "new" / "folder" / "a.csv"))}
     assert server.asked == [("/a.csv", None, None)]
 
 
@@ -184,12 +180,6 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
     assert server.asked[1][2] == '"one"'
 
 
-def test_a_server_without_a_trusted_connection_is_one_line_and_not_tried_again(server: Server, tmp_path: Path) -> None:
-    message = refused(Download(tmp_path, server.url.replace("http:", "https:"), ("a.csv",)))
-    assert "SSLError" in message
-    assert server.asked == []
-
-
 def test_two_processes_do_not_fetch_into_one_folder(server: Server, tmp_path: Path) -> None:
     descriptor = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -214,9 +204,8 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
 
-@pytest.mark.parametrize("text", [b"a.csv", b"\xff\xfe\x00"])
-def test_a_damaged_record_is_refused(server: Server, tmp_path: Path, text: bytes) -> None:
-    (tmp_path / CHECKSUMS).write_bytes(text)
+def test_a_damaged_record_is_refused(server: Server, tmp_path: Path) -> None:
+    (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
     assert CHECKSUMS in refused(download(server, tmp_path), DataError)
     assert server.asked == []
 
@@ -265,15 +254,12 @@ def test_an_entry_says_address_files_and_checksums() -> None:
     ("entry", "said"),
     [
         ({"url": "https://example.org"}, "files must list"),
-        ({**ENTRY, "md5": {}}, "dataset.download.md5 is not an option"),
         ({**ENTRY, "url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
-        ({**ENTRY, "files": "a.csv"}, "dataset.download.files must be a list"),
         ({**ENTRY, "files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
         *(
             ({**ENTRY, "files": [name]}, "is not the name of a file in one folder")
             for name in ("../a.csv", ".hidden", CHECKSUMS, "a\n.csv")
         ),
-        ({**ENTRY, "sha256": {"a.csv": "123"}}, "dataset.download.sha256.a.csv: string should match pattern"),
         ({**ENTRY, "sha256": {"../a.csv": "a" * 64}}, "is not the name of a file"),
     ],
 )
