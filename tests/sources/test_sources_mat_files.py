@@ -21,19 +21,12 @@ def refused(file: Path) -> str:
     return refusal(lambda: read_mat_columns(file, ["vxCG"], Column("time", "s")))
 
 
-@pytest.mark.parametrize(("dtype", "compressed"), [("f8", False), ("u8", True)])
-def test_numbers_of_every_type_come_back_as_doubles(tmp_path: Path, dtype: str, compressed: bool) -> None:
-    long = np.arange(1000).astype(dtype)
-    channels = {
-        "column": {"value": long[:, None], "time": np.arange(1000.0)[:, None]},
-        "one": {"value": np.ones((1, 1), dtype), "time": np.zeros((1, 1))},
-    }
-    savemat(tmp_path / "a.mat", {"s": channels}, do_compression=compressed)
-    arrays, summary = read_channels(tmp_path / "a.mat", ["column", "s.one"], "time")
-    assert summary["names"] == {"column": "s.column", "s.one": "s.one"}
-    np.testing.assert_array_equal(arrays["column.value"], long.astype(float))
-    np.testing.assert_array_equal(arrays["s.one.value"], [1.0])
-    assert all(values.dtype == np.float64 for values in arrays.values())
+def test_whole_numbers_come_back_as_doubles(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"s": {"one": {"value": np.arange(9, dtype="u8")[:, None], "time": np.arange(9.0)[:, None]}}})
+    arrays, summary = read_channels(tmp_path / "a.mat", ["one"], "time")
+    assert summary["names"] == {"one": "s.one"}
+    np.testing.assert_array_equal(arrays["one.value"], np.arange(9.0))
+    assert arrays["one.value"].dtype == np.float64
 
 
 @pytest.mark.parametrize(
